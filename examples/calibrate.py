@@ -12,7 +12,9 @@ true = crane.load("patu655", changes=truth, lock=held)  # which nobody knows
 # the log, every 20 ms: signals of the valve, stroke, pressures; with noise of 0.2 mm, 0.2 bar
 time = np.array([0.0, 0.3, 0.5, 1.2, 1.4, 1.8, 2.0, 2.6, 2.8])  # [s]
 volts = np.array([5.8, 5.8, 4.5, 4.5, 5.8, 5.8, 6.9, 6.9, 5.8])
-run = crane.simulate(true, crane.Signals(true, time, {"X_lift": volts}), duration=4.0, step=0.02)
+run = crane.simulate(
+    true, crane.ValveSignals(true, time, {"X_lift": volts}), duration=4.0, step=0.02
+)
 columns = ["time", "voltage_X_lift", "X_lift", "pressure_X_lift_a", "pressure_X_lift_b"]
 noise = np.random.default_rng(0).normal(size=(len(run.time), 5)) * [0, 0, 2e-4, 2e4, 2e4]
 table = np.column_stack([run.columns()[name] for name in columns]) + noise
@@ -22,6 +24,9 @@ np.savetxt("log.csv", table, delimiter=",", header=heads, comments="")
 
 found = crane.calibrate(described, "log.csv", list(truth), train=(0.0, 3.0))  # the rest judges
 print(found.to_text())
-for one in found.fitted:
-    print(f"{one.name} is {one.value:.1f} +- {one.interval:.1g} and not {one.before:g}")
-    assert abs(one.value - truth[one.name]) < 2 * one.interval
+for one in found.parameters:
+    print(
+        f"{one.name} is {one.value:.1f} +- {one.interval_half_width:.1g} and not "
+        f"{one.initial_value:g}"
+    )
+    assert abs(one.value - truth[one.name]) < 2 * one.interval_half_width

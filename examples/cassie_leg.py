@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 import crane
-from crane.description.sources import example_root
+from crane.description.machine_lookup import example_root
 
 warnings.simplefilter("ignore", crane.CraneWarning)  # of what its file for Gazebo leaves open
 

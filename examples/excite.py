@@ -10,7 +10,7 @@ motion = crane.excite(machine, period=5.0, harmonics=3, periods=2, starts=1)
 print(motion.to_text())
 motion.to_csv("motion.csv")  # what to play; motion.trajectory for a simulation
 
-gain = motion.after.logdet - motion.before.logdet
+gain = motion.optimized_information.logdet - motion.initial_information.logdet
 print(f"it tells exp({gain:.1f}) times as much as a random motion within the same limits")
 time, q, v, a, tau = motion.motion()
 used = np.ptp(q) / (machine.upper - machine.lower)[0]

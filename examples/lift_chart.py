@@ -24,7 +24,10 @@ picture.savefig("chart.png", dpi=150)
 row = int(np.argmin(np.abs(chart.heights - 1.0)))
 for radius in (3.0, 4.0, 5.0):
     column = int(np.argmin(np.abs(chart.radii - radius)))
-    load, why = loads[row, column], chart.causes[chart.cause[0, row, column]]
+    load, why = (
+        loads[row, column],
+        chart.limiting_factors[chart.limiting_factor_index[0, row, column]],
+    )
     print(f"{load:.0f} kg at {radius} m, 1 m above the ground: {why}")
 
     # there and with that load the lift cylinder needs all the pressure that the pump has

@@ -8,12 +8,12 @@ import numpy as np
 
 import crane
 from crane.view.live import Session
-from crane.view.live.serve import serve
+from crane.view.live.live_server import serve_live_view
 
 machine = crane.load("patu655")
 session = Session(machine)
 posture = session.move("X_lift", 0.3)  # what a slider does [m]
-session.load(200.0)  # [kg] at the tip
+session.set_payload(200.0)  # [kg] at the tip
 print(f"the tip is {session.posture.tip[2]:.2f} m high, loops closed to {posture.residual:.0e} m")
 lift = machine.active.index("X_lift")
 print(f"the lift cylinder holds {session.posture.gravity[lift] / 1e3:.1f} kN")
@@ -24,5 +24,5 @@ assert np.allclose(session.posture.gravity, expected, rtol=1e-9)
 
 # Ctrl+C ends a live view; here a timer presses it after three seconds
 threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT)).start()
-serve(session)  # prints the address to open
+serve_live_view(session)  # prints the address to open
 print("the live view has ended")

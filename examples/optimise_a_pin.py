@@ -14,12 +14,12 @@ found = crane.design(
 )
 for solution in found.solutions:
     x, y = solution.values
-    print(f"pin at ({1e3 * x:.0f}, {1e3 * y:.0f}) mm: {solution.goals[0]:.0f} kg")
-print(f"before: {found.before.goals[0]:.0f} kg")
+    print(f"pin at ({1e3 * x:.0f}, {1e3 * y:.0f}) mm: {solution.objectives[0]:.0f} kg")
+print(f"before: {found.initial.objectives[0]:.0f} kg")
 
 # the machine of the best pin, asked anew
 better = found.variant()
 chart = crane.capacity(better, radii=[5.0], heights=[1.0])
-assert abs(chart.loads.item() - found.solutions[0].goals[0]) < 1e-3
-assert chart.loads.item() > found.before.goals[0]
+assert abs(chart.loads.item() - found.solutions[0].objectives[0]) < 1e-3
+assert chart.loads.item() > found.initial.objectives[0]
 crane.write_machine(better, "better")

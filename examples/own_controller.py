@@ -19,17 +19,17 @@ def feedback(t, q_a, v_a):
     return weight + KP * (trajectory.position(t) - q_a) - KD * v_a
 
 
-class Feedback(crane.Law):
+class Feedback(crane.ControlLaw):
     """The same in formulas, from which machine code is made."""
 
     def references(self, times):
         """What depends on time alone."""
         return trajectory.position(times)
 
-    def law(self, at):
+    def law(self, inputs):
         """Forces and the rates of states, of which there are none."""
-        error = np.array(at.reference) - np.array(at.q_a)
-        return weight + KP * error - KD * np.array(at.v_a), ()
+        error = np.array(inputs.reference) - np.array(inputs.q_a)
+        return weight + KP * error - KD * np.array(inputs.v_a), ()
 
 
 def timed(controller):

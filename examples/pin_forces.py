@@ -10,7 +10,9 @@ machine = crane.load("excavator")
 q_a = machine.home[machine.closure.active]
 q = machine.closure.solve(q_a)
 reactions = crane.Reactions(machine)
-found = dict(zip(reactions.names, reactions.at(q, wrenches={"bucket_lip": LOAD}), strict=True))
+found = dict(
+    zip(reactions.names, reactions.joint_wrenches(q, wrenches={"bucket_lip": LOAD}), strict=True)
+)
 for pin in ("boom", "arm", "bucket"):
     print(f"pin of the {pin}: {np.linalg.norm(found[pin][:3]) / 1e3:.0f} kN")
 

@@ -11,7 +11,7 @@ if __name__ == "__main__":  # several processes import this file
     )
     print(found.to_text())
     found.to_csv("study.csv")
-    best = found.best("peak_X2")
+    best = found.best_row("peak_X2")
     print(f"best: pin at {1e3 * best['link3_G.x']:.0f} mm, {best['peak_X2']:.2f} N at most")
 
     # the same of one variant by hand: inverse dynamics along the task

@@ -7,7 +7,7 @@ import numpy as np
 from measuring import Call, measure, table
 
 import crane
-from crane.simulation.integration.rosenbrock import TOLERANCE
+from crane.simulation.integration.rosenbrock import ROSENBROCK_TOLERANCE
 
 _SAMPLES = 2000
 _MINUTE = 60.0  # of levers [s]
@@ -48,11 +48,11 @@ def at_work(rounds: int) -> str:
     first = next(iter(stacks.values()))
     minutes = [
         measure({name: _minute(one, tolerance) for name, one in machines.items()}, rounds)
-        for tolerance in (TOLERANCE, _COARSE)
+        for tolerance in (ROSENBROCK_TOLERANCE, _COARSE)
     ]
     head = "", "forward dynamics of a stack [us]", "ratio", *(
         f"a minute on its valves, tolerance {tolerance:g}: times faster than real time"
-        for tolerance in (TOLERANCE, _COARSE)
+        for tolerance in (ROSENBROCK_TOLERANCE, _COARSE)
     )  # fmt: skip
     rows = [
         (name, f"{1e6 * one / _SAMPLES:.2f}", f"{one / first:.2f}")

@@ -18,13 +18,13 @@ import mechanisms
 import numpy as np
 from scipy.optimize import least_squares
 
-from crane.closure.anywhere import Residual, Search
-from crane.closure.equations import LoopEquations
-from crane.closure.exactness import DIGITS
-from crane.closure.home import settle
+from crane.closure.constraint_tolerances import FILE_PRECISION
+from crane.closure.home_search import find_home
+from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import ClosureResidual, MultiStartSearch
 from crane.common.errors import MechanismError
-from crane.formats.machine_file.read import read
-from crane.machine.assemble import assemble
+from crane.formats.machine_file.machine_reader import read_machine_spec
+from crane.machine.machine_assembly import assemble_tree
 
 CLOSED = 1e-9  # [rad], or share of the machine's size: largest residual of what scipy closes
 
@@ -43,14 +43,14 @@ class Task:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "mechanism.urdf"
             path.write_text(self.mechanism.urdf(self.said))
-            spec = read(path)
-        self.equations = LoopEquations(assemble(spec), spec.loops)
+            spec = read_machine_spec(path)
+        self.equations = LoopEquations(assemble_tree(spec), spec.loops)
         coordinates = self.equations.coordinates
         self.start = np.array([self.said[name] for name in coordinates.names])
         driven = [name in self.mechanism.active for name in coordinates.names]
         self.active, self.passive = np.flatnonzero(driven), np.flatnonzero(~np.array(driven))
         self.lower, self.upper = coordinates.lower, coordinates.upper
-        self.residual = Residual(self.equations)
+        self.residual = ClosureResidual(self.equations)
 
     def within(self, q: np.ndarray) -> bool:
         """Whether a posture keeps the limits."""
@@ -59,7 +59,7 @@ class Task:
     def by_search(self) -> np.ndarray | None:
         """Home as a file gets it; None where it is refused or outside of limits."""
         try:
-            structure, _ = settle(
+            structure, _ = find_home(
                 self.equations, self.active, self.passive, self.start, range(len(self.start))
             )
         except MechanismError:
@@ -68,9 +68,9 @@ class Task:
 
     def by_descent(self) -> np.ndarray | None:
         """One descent of the search, without a second start."""
-        search = Search(self.equations, self.start, np.arange(len(self.start)))
-        q, gap = search.descend(self.start, self.passive, self.passive[:0])
-        return q if gap <= DIGITS * 1e-4 else None
+        search = MultiStartSearch(self.equations, self.start, np.arange(len(self.start)))
+        q, gap = search.minimize_residual(self.start, self.passive, self.passive[:0])
+        return q if gap <= FILE_PRECISION * 1e-4 else None
 
     def by_scipy(self, start: np.ndarray | None = None) -> np.ndarray | None:
         """Scipy's trust region method on the passive joints, within limits."""

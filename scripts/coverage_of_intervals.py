@@ -17,10 +17,10 @@ import numpy as np
 from identify_mini_forwarder import BANDWIDTH, SLOW, rig, terms
 
 import crane
-from crane.identification.excitation.excite import excite
+from crane.identification.excitation.periodic_excitation import excite
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import METHODS, identify
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.terms import default_terms
+from crane.identification.mechanics.term_selection import default_terms
 
 
 def main() -> None:
@@ -36,7 +36,7 @@ def main() -> None:
     machine = crane.load("mini_forwarder")
     given = terms if options.tuned else default_terms
     settings = {"slow": SLOW, "bandwidth": BANDWIDTH} if options.tuned else {}
-    path = excite(machine, Model(machine, terms(machine)), seed=0).trajectory
+    path = excite(machine, IdentificationModel(machine, terms(machine)), seed=0).trajectory
     found: dict[str, list[tuple[float, bool]]] = {}
     shares = []
     for seed in range(options.first, options.first + options.rigs):
@@ -44,7 +44,9 @@ def main() -> None:
         result = identify(
             machine, virtual.run(path), method=options.method, terms=given(machine), **settings
         )
-        truth = result.base.values(Model(virtual.plant, given(virtual.plant)).nominal)
+        truth = result.base.values(
+            IdentificationModel(virtual.plant, given(virtual.plant)).nominal
+        )
         low, high = result.interval().T
         covered = (low <= truth) & (truth <= high)
         z = (result.values - truth) / result.std

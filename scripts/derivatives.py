@@ -6,7 +6,7 @@ from measuring import Call, measure, table
 from subject import Array, FormulaLoop
 
 import crane
-from crane.dynamics.compiled import SLOPES
+from crane.dynamics.compiled_dynamics import DERIVATIVES_OF
 
 _STATES, _AGAIN = 100, 10  # results that stay in a cache, as one that is used does
 
@@ -37,7 +37,7 @@ def derivatives(rounds: int) -> str:
         dynamics = crane.Dynamics(machine)
         q, v_a, tau = _states(machine)
         once = FormulaLoop(dynamics, q, v_a, tau)
-        every = FormulaLoop(dynamics, q, v_a, tau, SLOPES + "forward")
+        every = FormulaLoop(dynamics, q, v_a, tau, DERIVATIVES_OF + "forward")
         calls: dict[str, Call] = {"once": _again(once.run), "every": _again(every.run)}
         if not machine.closure.equations.loops:
             model, data = machine.model, machine.model.createData()

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from subject import START, Array, Runner
 
 import crane
-from crane.control import Free
+from crane.control import ZeroForce
 from crane.motion.kinematics import Kinematics
 from crane.simulation.integration import Chart, PythonStepper
 
@@ -22,25 +22,27 @@ def engines_of(machine: crane.Machine) -> dict[str, Engine]:
     q_a, v_a = START
     q = machine.closure.solve(q_a)
     v, nq = machine.closure.gamma(q) @ v_a, machine.model.nq
-    kinematics, free, peer = Kinematics(machine), Free(machine), ConstraintDynamics(machine)
+    kinematics, free, peer = Kinematics(machine), ZeroForce(machine), ConstraintDynamics(machine)
     fast = Runner(machine, free, q_a, v_a)
-    slow = PythonStepper(Chart.of(crane.Dynamics(machine, backend="pinocchio")), free, 0)
+    slow = PythonStepper(
+        Chart.from_dynamics(crane.Dynamics(machine, backend="pinocchio")), free, 0
+    )
     mujocos = {(name, h): MuJoCo(machine, h, name) for name in INTEGRATORS for h in STEPS}
 
     def ours(step: float) -> Tip:
         state = fast.run(step, round(DURATION / step))
-        return lambda: kinematics.position_at(state[:nq])
+        return lambda: kinematics.position_at_configuration(state[:nq])
 
     def pinocchio_backend(step: float) -> Tip:
         state = np.concatenate([q, v_a, np.zeros(2)])
         for i in range(round(DURATION / step)):
             rate, _ = slow.observe(i * step, state)
             state = slow.advance(i * step, state, rate, step)
-        return lambda: kinematics.position_at(state[:nq])
+        return lambda: kinematics.position_at_configuration(state[:nq])
 
     def constraints(step: float) -> Tip:
         end = peer.run(q, v, step, round(DURATION / step))
-        return lambda: kinematics.position_at(end)
+        return lambda: kinematics.position_at_configuration(end)
 
     def mujoco(name: str) -> Engine:
         def run(step: float) -> Tip:

@@ -11,8 +11,8 @@ from peers import INTEGRATORS, ConstraintDynamics, MuJoCo
 from subject import START, FormulaLoop, Runner, along
 
 import crane
-from crane.control import PI, ComputedTorque, Free, Law, ValveDrive, ValvePD
-from crane.motion.trajectories import task_trajectory
+from crane.control import PI, ComputedTorque, ControlLaw, ValveDrive, ValvePD, ZeroForce
+from crane.motion.task_trajectories import task_trajectory
 
 
 def agree(machine: crane.Machine) -> str:
@@ -61,7 +61,7 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
     q = machine.closure.solve(q_a)
     ours, slow = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
     samples = list(zip(q_a, v_a, tau, strict=True))
-    rates = (ours.at("rates", *sample) for sample in zip(q, v_a, tau, strict=True))
+    rates = (ours.evaluate_closed("rates", *sample) for sample in zip(q, v_a, tau, strict=True))
     states = [(x, rate[: machine.model.nv]) for x, rate in zip(q, rates, strict=True)]
     formula = FormulaLoop(ours, q, v_a, tau)
     peer, force = ConstraintDynamics(machine), np.zeros(machine.model.nv)
@@ -122,7 +122,7 @@ def one_step(mini: crane.Machine, bare: crane.Machine, rounds: int) -> str:
     """One step of each integrator at 1 ms."""
     path = task_trajectory(mini, "lift")
     start = path(0.0)
-    full, plain = Runner(mini, PI(mini, path), *start[:2]), Runner(bare, Free(bare), *START)
+    full, plain = Runner(mini, PI(mini, path), *start[:2]), Runner(bare, ZeroForce(bare), *START)
     q = bare.closure.solve(START[0])
     v = bare.closure.gamma(q) @ START[1]
     engines = {name: MuJoCo(bare, 1e-3, name) for name in INTEGRATORS}
@@ -150,7 +150,7 @@ def task(mini: crane.Machine, rounds: int) -> str:
     def driven() -> ValveDrive:
         return ValveDrive(valves, ValvePD(valves, push))
 
-    cases: dict[str, tuple[crane.Machine, Callable[[], Law], crane.Trajectory]] = {
+    cases: dict[str, tuple[crane.Machine, Callable[[], ControlLaw], crane.Trajectory]] = {
         "`mini_forwarder` lifts, `PI`": (mini, lambda: PI(mini, lift), lift),
         "the same, `ComputedTorque`": (mini, lambda: ComputedTorque(mini, lift), lift),
         "`patu655` pushes on its valves, `ValvePD`": (valves, driven, push),

@@ -27,14 +27,19 @@ def gradients() -> str:
 
     def back(by: list[str] | None) -> crane.Gradient:
         return crane.gradient(
-            machine, levers, None, 10.0, of=lambda _, y: (0.5 * np.sum(y**2), y), by=by,
+            machine,
+            levers,
+            None,
+            10.0,
+            functional=lambda _, y: (0.5 * np.sum(y**2), y),
+            parameters=by,
             outputs=_OUTPUTS,
-        )  # fmt: skip
+        )
 
     def forwards(by: list[str]) -> object:
-        return crane.sensitivities(machine, levers, None, 10.0, by=by, outputs=_OUTPUTS)
+        return crane.sensitivities(machine, levers, None, 10.0, parameters=by, outputs=_OUTPUTS)
 
-    every = list(back(None).by)
+    every = list(back(None).parameters)
     rows = []
     for count in (6, 50, 200, len(every)):
         some = every[:: len(every) // count][:count]

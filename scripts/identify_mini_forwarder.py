@@ -17,25 +17,25 @@ import numpy as np
 from rig import Converter, Rig, Tolerances, default_sensors
 
 import crane
-from crane.identification.excitation.excite import excite
-from crane.identification.mechanics.friction import friction
+from crane.identification.excitation.periodic_excitation import excite
+from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertias import Inertial
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.term import Term
+from crane.identification.mechanics.inertial_terms import InertialTerm
+from crane.identification.mechanics.model_term import ModelTerm
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic
 PRIOR = {"*": "30 %", "bodies": "10 %"}  # of the model that predicts: the description's tolerances
 
 
-def terms(machine: crane.Machine) -> list[Term]:
+def terms(machine: crane.Machine) -> list[ModelTerm]:
     """Bodies and friction, with a sign that jumps: rows where it does not are left out."""
     passive = [joint for joint in machine.joints if joint not in machine.active]
     return [
-        Inertial(machine),
-        *(friction(machine, joint, smoothing=0.0) for joint in machine.active),
-        *(friction(machine, joint, ("viscous",)) for joint in passive),
+        InertialTerm(machine),
+        *(friction_term(machine, joint, smoothing=0.0) for joint in machine.active),
+        *(friction_term(machine, joint, ("viscous",)) for joint in passive),
     ]
 
 
@@ -66,7 +66,9 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore", crane.CraneWarning)
     machine = crane.load("mini_forwarder")
-    learn, judge = (excite(machine, Model(machine, terms(machine)), seed=k) for k in (0, 1))
+    learn, judge = (
+        excite(machine, IdentificationModel(machine, terms(machine)), seed=k) for k in (0, 1)
+    )
     print(learn.to_text())
     print(
         "rig  rank  covered  error [% of force: q1, X1, X2]  held out      ... of the noise floor"
@@ -77,7 +79,9 @@ def main() -> None:
         one, other = (virtual.run(reference.trajectory) for reference in (learn, judge))
         settings = {"terms": terms(machine), "slow": SLOW, "bandwidth": BANDWIDTH}
         result = identify(machine, one, **settings)
-        truth = result.base.values(Model(virtual.plant, terms(virtual.plant)).nominal)
+        truth = result.base.values(
+            IdentificationModel(virtual.plant, terms(virtual.plant)).nominal
+        )
         low, high = result.interval().T
         covered.append(float(np.mean((low <= truth) & (truth <= high))))
         model = identify(machine, one, other, prior=PRIOR, **settings)
@@ -86,7 +90,7 @@ def main() -> None:
                          bandwidth=BANDWIDTH)  # fmt: skip
         ratio = model.validation.rmse / exact.training.rmse
         floors.append(ratio)
-        shares = [" ".join(f"{100 * x:5.2f}" for x in fit.relative)
+        shares = [" ".join(f"{100 * x:5.2f}" for x in fit.relative_error)
                   for fit in (result.training, model.validation)]  # fmt: skip
         print(
             f"{seed:3d}  {result.base.rank:4d}  {100 * covered[-1]:5.1f} %  {shares[0]}"

@@ -99,7 +99,7 @@ def compare(machine: crane.Machine, dynamics: crane.Dynamics, rounds: int) -> di
     calls: dict[str, Call] = {
         "one": lambda: [ours(*sample) for sample in samples],
         "stack": lambda: ours(q_a, v_a, tau_a),
-        "given": lambda: dynamics.at("forward", q, v_a, tau_a),
+        "given": lambda: dynamics.evaluate_closed("forward", q, v_a, tau_a),
         "theirs": lambda: [peer.forward(*sample) for sample in full],
     }
     times = {name: np.array(spent) / count for name, spent in turns(calls, rounds).items()}

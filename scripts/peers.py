@@ -99,8 +99,8 @@ class ConstraintDynamics:
             a4 = self.acceleration(q + step * v3, v4)
             q = q + step / 6 * (v + 2 * (v2 + v3) + v4)
             v = v + step / 6 * (a1 + 2 * (a2 + a3) + a4)
-            q = closure.solve(q[active], guess=q)
-            v = dynamics.at("rates", q, v[active], rest)[: len(v)]  # gamma v_A, fast
+            q = closure.solve(q[active], initial_guess=q)
+            v = dynamics.evaluate_closed("rates", q, v[active], rest)[: len(v)]  # gamma v_A, fast
         return q
 
 

@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from crane.view.plots.recording import INK, RECORDED, STYLE
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, RECORDED_COLOUR
 
 Tip = Callable[[], np.ndarray | None]  # its position (3,) [m], None if unstable
 Engine = Callable[[float], Tip]  # runs with a step [s]
@@ -15,7 +15,7 @@ Curves = dict[str, list[tuple[float, float, float]]]  # (step [s], tip error [m]
 
 DURATION = 2.4  # [s], a whole number of each step
 LOOKS = {
-    "compiled backend": (RECORDED, "o"),
+    "compiled backend": (RECORDED_COLOUR, "o"),
     "Pinocchio backend": ("#7fb0e0", "s"),
     "constraintDynamics": ("#3c8c4a", "^"),
     "MuJoCo Euler": ("#b9b9b9", "v"),
@@ -61,7 +61,7 @@ def ratios(curves: Curves) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 def draw(curves: Curves, path: Path) -> None:
     """The curves as a picture."""
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(7.2, 4.4), layout="constrained")
         axes = figure.add_subplot()
         for name, points in curves.items():
@@ -72,7 +72,7 @@ def draw(curves: Curves, path: Path) -> None:
         for step, error, t in first:
             axes.annotate(
                 f"{1e3 * step:g} ms", (1e3 * t, error), (-5, -3), textcoords="offset points",
-                ha="right", va="top", color=INK, fontsize=7,
+                ha="right", va="top", color=INK_COLOUR, fontsize=7,
             )  # fmt: skip
         axes.set(
             xlabel="CPU time [ms]",

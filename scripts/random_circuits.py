@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import crane
-from crane.control import Signals
+from crane.control import ValveSignals
 from crane.machine import Machine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -168,7 +168,7 @@ class _Draw:
         return out
 
 
-def drawn(seed: int, folder: Path) -> tuple[Machine, Signals]:
+def drawn(seed: int, folder: Path) -> tuple[Machine, ValveSignals]:
     """A machine, and signals of its valves."""
     draw = _Draw(seed)
     joints = ["x", "y", "z"][: int(draw.random.integers(1, 4))]
@@ -230,7 +230,7 @@ def drawn(seed: int, folder: Path) -> tuple[Machine, Signals]:
     wanted = {joint: draw.random.uniform(-1.1, 1.1, 7) for joint in joints}
     for joint in joints:
         wanted[joint][0] = 0.0
-    return machine, Signals(machine, times, wanted)
+    return machine, ValveSignals(machine, times, wanted)
 
 
 def run(seed: int) -> Outcome:

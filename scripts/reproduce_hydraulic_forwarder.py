@@ -16,8 +16,8 @@ from hydraulic_forwarder import figures, page
 from hydraulic_forwarder.results import Results, compute
 
 import crane
-from crane.common.output import replacing
-from crane.view.plots.hydraulics import sides_figure
+from crane.common.atomic_output import replace_file
+from crane.view.plots.hydraulics_figures import equation_sides_figure
 
 
 def draw(found: Results, folder: Path) -> None:
@@ -31,7 +31,7 @@ def draw(found: Results, folder: Path) -> None:
         figures.save(shown, folder / f"hydraulic_forwarder_{number + 2}.png")
     figures.save(figures.lifting(found.lifting), folder / "hydraulic_forwarder_8.png")
     titles = {f"recording {name}": both for name, both in found.held_out.items()}
-    figures.save(sides_figure(titles), folder / "hydraulic_forwarder_9.png")
+    figures.save(equation_sides_figure(titles), folder / "hydraulic_forwarder_9.png")
     shown = figures.valve_and_friction(found.valves["X_ext"], found.friction, found.law)
     figures.save(shown, folder / "hydraulic_forwarder_valve.png")
 
@@ -49,7 +49,7 @@ def main() -> None:
     if options.write is None:
         return
     draw(found, options.write.resolve().parents[1] / "images")
-    with replacing(options.write) as part:
+    with replace_file(options.write) as part:
         part.write_text(text, encoding="utf-8")
 
 

@@ -28,7 +28,7 @@ from forwarder.runs import (
 from rig import Rig
 
 import crane
-from crane.common.output import replacing
+from crane.common.atomic_output import replace_file
 
 SEED = 1  # of the virtual rig that is shown
 RIGS = 12  # how many in all
@@ -100,7 +100,7 @@ def main() -> None:
         for task in TASKS
     }
     figures.save(figures.scoreboard(rms, ranges), folder / "mini_forwarder_scoreboard.png")
-    with replacing(options.write) as part:
+    with replace_file(options.write) as part:
         part.write_text(text, encoding="utf-8")
 
 

@@ -16,10 +16,10 @@ from measuring import table
 
 import crane
 from crane.control import PI
-from crane.description import examples
-from crane.dynamics.compiled import QUANTITIES
-from crane.motion.trajectories import task_trajectory
-from crane.simulation.integration import Chart, CompiledStepper
+from crane.description import example_robots
+from crane.dynamics.compiled_dynamics import QUANTITIES
+from crane.motion.task_trajectories import task_trajectory
+from crane.simulation.integration import Chart, RungeKuttaStepper
 
 _MAIN = "import sys; sys.argv[0] = 'crane'; import crane.cli; crane.cli.main()"
 _FORWARD = (
@@ -32,7 +32,7 @@ _RUN = ("simulate", "mini_forwarder", "--task", "lift", "--force", "--out", "run
 def _processes() -> Iterator[tuple[str, tuple[str, ...]]]:
     """What is started, and Python's arguments; the robot's file goes by its full path."""
     yield "`crane --help`", (_MAIN, "--help")
-    yield "`crane check ur5_robot.urdf`", (_MAIN, "check", str(examples()["ur5_robot"]))
+    yield "`crane check ur5_robot.urdf`", (_MAIN, "check", str(example_robots()["ur5_robot"]))
     yield "`crane simulate mini_forwarder --task lift`", (_MAIN, *_RUN)
     yield '`crane.Dynamics(crane.load("mini_forwarder")).forward(...)`', (_FORWARD,)
 
@@ -87,16 +87,16 @@ def _compiling() -> Iterator[tuple[str, float]]:
     warnings.simplefilter("ignore", crane.CraneWarning)
     mini = crane.load("mini_forwarder")
     start = time.perf_counter()
-    _ = mini.closure.fast
+    _ = mini.closure.compiled_closure
     yield "closing the loops", time.perf_counter() - start
     dynamics, q, zero = crane.Dynamics(mini), mini.home, np.zeros(3)
     for quantity in QUANTITIES:
         start = time.perf_counter()
-        dynamics.at(quantity, q, zero, zero)
+        dynamics.evaluate_closed(quantity, q, zero, zero)
         yield quantity, time.perf_counter() - start
     control = PI(mini, task_trajectory(mini, "lift"))
     start = time.perf_counter()
-    CompiledStepper(Chart.of(dynamics), control, 3)
+    RungeKuttaStepper(Chart.from_dynamics(dynamics), control, 3)
     yield "the simulation's loop with PI control", time.perf_counter() - start
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 import crane
 from crane.common.samples import Array
-from crane.control import Free
+from crane.control import ZeroForce
 from crane.machine import Machine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -68,7 +68,7 @@ def problems(folder: Path) -> dict[str, Problem]:
         )
     )
     hit = mini.replace(end_stops=(crane.EndStop("X1", 1e9, 0.5),))
-    law = Free
+    law = ZeroForce
     return {
         "flyball governor, 10 s": (
             flyballs, lambda: law(flyballs),

@@ -7,12 +7,12 @@ import pinocchio as pin
 
 import crane
 from crane.codegen import Program
-from crane.control import Law, ValveDrive
+from crane.control import ControlLaw, ValveDrive
 from crane.simulation.integration import (
     Chart,
-    ControlledSteps,
-    Steps,
-    StiffStepper,
+    ErrorControlledIntegrator,
+    FixedStepIntegrator,
+    RosenbrockStepper,
     row_layout,
 )
 
@@ -62,14 +62,14 @@ class Runner:
         v_a: (n,).
     """
 
-    def __init__(self, machine: crane.Machine, control: Law, q_a: Array, v_a: Array):
+    def __init__(self, machine: crane.Machine, control: ControlLaw, q_a: Array, v_a: Array):
         own = control.start(q_a)
         self._start = np.concatenate([machine.closure.solve(q_a), v_a, own, np.zeros(2)])
-        chart = Chart.of(crane.Dynamics(machine))
+        chart = Chart.from_dynamics(crane.Dynamics(machine))
         self._way = (
-            ControlledSteps(chart, control, len(own), StiffStepper)
+            ErrorControlledIntegrator(chart, control, len(own), RosenbrockStepper)
             if isinstance(control, ValveDrive)
-            else Steps(chart, control, len(own))
+            else FixedStepIntegrator(chart, control, len(own))
         )
         self._columns = row_layout(machine, control, len(own)).size
 
@@ -106,23 +106,23 @@ class FormulaLoop:
         tau: Array,
         quantity: str = "forward",
     ):
-        formula = dynamics._formula(quantity)
+        formula = dynamics._compiled_quantity(quantity)
         self.out = np.empty((len(q), formula.size))
         self._q, self._x = q, np.hstack([v_a, tau])
         program = Program()
         names = ("geometry", "numbers", "q", "x", "out")
         arguments = {"counts": ("count",), "functions": ("formula",), "arrays": names}
-        with program.routine("loop", **arguments) as r:
+        with program.add_routine("loop", **arguments) as r:
             with r.loop(r.count) as i:
                 rows = r.q.row(i, q.shape[1]), r.x.row(i, self._x.shape[1])
                 r.call("formula", r.geometry, r.numbers, *rows, r.out.row(i, formula.size))
-            r.give(r.count)
+            r.return_value(r.count)
         program.compile()
-        constants = formula._fast.geometry.numbers, formula._numbers
-        address = formula._program.address("formula")
-        self._loop = program.bound("loop", len(q), address, *constants, q, self._x, self.out)
+        constants = formula._compiled_closure.geometry.constants, formula._formula_constants
+        address = formula._program.function_address("formula")
+        self._loop = program.bind("loop", len(q), address, *constants, q, self._x, self.out)
         self._each = [
-            formula._program.bound("formula", *constants, *rows)
+            formula._program.bind("formula", *constants, *rows)
             for rows in zip(q, self._x, self.out, strict=True)
         ]
 

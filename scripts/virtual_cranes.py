@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import crane
-from crane.formats.loading import Variants
+from crane.formats.machine_loading import MachineVariants
 from crane.recordings import timeseries
 
 HELD, FILE = {"X_ext": 0.3, "slew": 0.0}, {"payload.mass": 150.0}
@@ -64,7 +64,7 @@ def recorded(machine, values, true, seed, path):
     times, random = np.arange(0, 20.0, 0.01), np.random.default_rng(seed)
     levers = crane.joystick(machine, LEVERS).references(times)
     signals = dict(zip(machine.hydraulics.joints, levers.T, strict=True))
-    drive = crane.Signals(crane_, times, signals)
+    drive = crane.ValveSignals(crane_, times, signals)
     run = crane.simulate(crane_, drive, [0.15, 0.3], 19.99, 0.01, tolerance=1e-9)
     columns, units, read = run.columns(), {"time": "s"}, [times]
     for joint, signal in signals.items():
@@ -75,14 +75,14 @@ def recorded(machine, values, true, seed, path):
             noisy = columns[name] + NOISE[name[0]] * random.normal(size=len(times))
             units[name] = "m" if name == joint else "Pa"
             read.append(noisy if name == joint else np.maximum(noisy, 0.0))
-    timeseries.write(path, timeseries.Table(units, np.column_stack(read), {}))
+    timeseries.write_table(path, timeseries.Table(units, np.column_stack(read), {}))
 
 
 def main():
     """Print a line per crane, and how many numbers lie within their intervals."""
     warnings.simplefilter("ignore")
     machine = crane.load("patu655", changes=FILE, lock=HELD)
-    values, inside, total = Variants(machine).values, 0, 0
+    values, inside, total = MachineVariants(machine).values, 0, 0
     folder = Path(tempfile.mkdtemp())
     for seed in range(int(sys.argv[1]) if len(sys.argv) > 1 else 20):
         true, path = truth_of(values, seed), folder / f"{seed}.csv"
@@ -91,8 +91,10 @@ def main():
         begun = time.process_time()
         found = crane.calibrate(machine, path, fit, train=(0.0, 12.0))
         took = time.process_time() - begun
-        far = {x.name: abs(x.value - true[x.name]) / x.interval for x in found.fitted}
-        held = [x.rms(x.after, False) / NOISE[x.name[0]] for x in found.sensors]
+        far = {
+            x.name: abs(x.value - true[x.name]) / x.interval_half_width for x in found.parameters
+        }
+        held = [x.rms(x.simulated_after, False) / NOISE[x.name[0]] for x in found.channels]
         inside, total = inside + sum(x <= 1 for x in far.values()), total + len(far)
         worst = max(far, key=far.get)
         print(

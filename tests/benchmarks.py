@@ -50,7 +50,11 @@ def load(folder, name, parts, home, active):
         f'<group_state name="home">{states}</group_state></robot>'
     )
     machine = crane.load(path, active=[next(iter(home))])
-    return machine if active == machine.active[0] else machine.seen_from(machine.home, (active,))
+    return (
+        machine
+        if active == machine.active[0]
+        else machine.with_home_configuration(machine.home, (active,))
+    )
 
 
 # Andrews' squeezing mechanism: seven bodies, one freedom (Schiehlen 1990; Hairer and Wanner,
@@ -139,7 +143,7 @@ def governor(folder):
         ]
         home[f"arm_{side}"], home[f"link_{side}"] = -sign * lean, 2 * sign * lean
     machine = load(folder, "governor", parts, home, "spin")
-    machine = machine.driven_by(("spin", "collar"))
+    machine = machine.with_active_joints(("spin", "collar"))
     stiff = crane.ForceElement("collar", 8e5, -np.cos(lean), 4e4)
     return machine.replace(forces=(stiff,))
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crane.hydraulics import Circuit
+from crane.hydraulics import CircuitEquations
 
 
 def circuit_of(machine):
@@ -12,7 +12,7 @@ def circuit_of(machine):
         0.0 if machine.hydraulics.cylinders[joint].motor else machine.upper[i] - machine.lower[i]
         for joint, i in zip(joints, which, strict=True)
     ]
-    return Circuit(machine.hydraulics, strokes)
+    return CircuitEquations(machine.hydraulics, strokes)
 
 
 def now(machine, signals=(0.0,), x=0.2, v=0.0, **states):
@@ -26,17 +26,17 @@ def now(machine, signals=(0.0,), x=0.2, v=0.0, **states):
         states: By name, pressures from a vacuum; those that are not given are 1e5 Pa, and 0.
     """
     circuit = circuit_of(machine)
-    state = np.zeros(circuit.size)
+    state = np.zeros(circuit.state_count)
     vapour = machine.hydraulics.oil.vapour_pressure
-    for i, name in enumerate(circuit.states):
+    for i, name in enumerate(circuit.state_units):
         pressure = name.startswith("pressure_")
         state[i] = states.pop(name, 1e5 if pressure else 0.0) - vapour * pressure
     assert not states, states
     m = len(circuit.joints)
-    found = circuit.at(
-        circuit.numbers.tolist(), [x] * m, [v] * m, state.tolist(), list(signals), []
+    found = circuit.evaluate(
+        circuit.constants.tolist(), [x] * m, [v] * m, state.tolist(), list(signals), []
     )
-    return found, dict(zip(circuit.states, found.rates, strict=False))
+    return found, dict(zip(circuit.state_units, found.state_rates, strict=False))
 
 
 def flow(instant, through, source=None, target=None):
@@ -44,5 +44,5 @@ def flow(instant, through, source=None, target=None):
     return sum(
         x.rate
         for x in instant.flows
-        if x.through == through and source in (None, x.source) and target in (None, x.target)
+        if x.path == through and source in (None, x.source) and target in (None, x.target)
     )

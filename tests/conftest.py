@@ -11,9 +11,9 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import crane  # noqa: E402
-from crane.codegen import package  # noqa: E402
-from crane.codegen.llvm import engine  # noqa: E402
-from crane.common import cache  # noqa: E402
+from crane.codegen import package_digest  # noqa: E402
+from crane.codegen.llvm import machine_code  # noqa: E402
+from crane.common import file_cache  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 
@@ -26,7 +26,7 @@ def pytest_configure(config):
     """Fast tests translate without optimising, in a sixth of the time: they compile hundreds of
     programs that run for milliseconds. Slow ones, and all other processes, do as users do."""
     if config.option.markexpr == "not slow and not long":
-        engine._SPEED = 0
+        machine_code._OPTIMIZATION_LEVEL = 0
 
 
 @pytest.fixture(scope="session")
@@ -64,14 +64,14 @@ def place(tmp_path, monkeypatch):
     """A folder of its own for programs, in a process that has just loaded the package."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(crane, "LOADED", time.time() + 60.0)
-    package._digest.cache_clear()
-    monkeypatch.setattr(engine, "_SPEED", 1)  # as another process has it
-    engine.settings.cache_clear()
-    if tmp_path not in cache.folder().parents:
+    package_digest._files_digest.cache_clear()
+    monkeypatch.setattr(machine_code, "_OPTIMIZATION_LEVEL", 1)  # as another process has it
+    machine_code.compiler_settings.cache_clear()
+    if tmp_path not in file_cache.cache_folder().parents:
         pytest.skip("folders of the user are elsewhere here")
-    yield cache.folder()
-    package._digest.cache_clear()
-    engine.settings.cache_clear()
+    yield file_cache.cache_folder()
+    package_digest._files_digest.cache_clear()
+    machine_code.compiler_settings.cache_clear()
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 from hydraulic_rig import AREA_A, AREA_B, HOSE, rig
 
-from crane.hydraulics.components import Counterbalance, Cylinder, Hydraulics, Oil, Valve
-from crane.hydraulics.elements import Accumulator, Element, Line
-from crane.hydraulics.sources import Engine, Supply
+from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
+from crane.hydraulics.components import CounterbalanceValve, Cylinder, Hydraulics, Oil, Valve
+from crane.hydraulics.supply_and_engine import Engine, Supply
 
 SENSING = Supply(
     2.8e7, flow=3e-3, control="load-sensing", margin=2e6, standby=2.5e6, relief=3.2e7, power=9e4
@@ -18,7 +18,7 @@ POSITIVE = Supply(3.4e7, flow=4e-3, control="positive", relief=3.6e7)
 FIXED = Supply(2e7, flow=1e-3, control="fixed", relief=2.1e7)
 PLAIN = Supply(2e7)
 ENGINE = Engine(188.0, 800.0, 2.0)
-HELD = Counterbalance(2.5e7, 4.0, 2e6, 1e-6)
+HELD = CounterbalanceValve(2.5e7, 4.0, 2e6, 1e-6)
 
 
 def cylinder(joint, **more):
@@ -74,18 +74,20 @@ def network(folder):
         {"regeneration": 1e-6, "supply": "third", "centre": 1e-6},
     ]
     elements = {
-        "filter": Element("orifice", "back", "tank", coefficient=1e-6),
-        "bypass": Element("check", "back", "tank", coefficient=1e-6, pressure=2e5),
-        "charge": Element("check", "supply", "store", coefficient=1e-6),
-        "ride": Element("orifice", "X1.a", "store", coefficient=1e-7, joints=("X1",), side="out"),
-        "cross": Element("relief", "X3.a", "X3.b", gain=1e-9, pressure=2e7),
-        "drain": Element("leak", "X3.b", "tank", gain=1e-13),
-        "unload": Element("relief", "store", "tank", gain=1e-9, pressure=2.5e7),
-        "anti": Element("check", "tank", "back", coefficient=1e-6),
+        "filter": CircuitElement("orifice", "back", "tank", coefficient=1e-6),
+        "bypass": CircuitElement("check", "back", "tank", coefficient=1e-6, pressure=2e5),
+        "charge": CircuitElement("check", "supply", "store", coefficient=1e-6),
+        "ride": CircuitElement(
+            "orifice", "X1.a", "store", coefficient=1e-7, joints=("X1",), side="out"
+        ),
+        "cross": CircuitElement("relief", "X3.a", "X3.b", gain=1e-9, pressure=2e7),
+        "drain": CircuitElement("leak", "X3.b", "tank", gain=1e-13),
+        "unload": CircuitElement("relief", "store", "tank", gain=1e-9, pressure=2.5e7),
+        "anti": CircuitElement("check", "tank", "back", coefficient=1e-6),
     }
     return circuit(
         folder, SENSING, cylinders, valves, supplies={"second": POSITIVE, "third": FIXED},
-        engine=ENGINE, lines={"back": Line(2e-3)}, elements=elements,
+        engine=ENGINE, lines={"back": CircuitLine(2e-3)}, elements=elements,
         accumulators={"store": Accumulator(2.5e-3, 8e6)},
     )  # fmt: skip
 
@@ -95,21 +97,26 @@ def long_names(folder):
     first = "boom_swing_cylinder_of_the_$left$_side_1"
     last = "accumulator_of_the_boom_suspension"
     return circuit(
-        folder, SENSING, [EVERYTHING] * 2, [{"sharing": True}, {"supply": "C"}],
+        folder,
+        SENSING,
+        [EVERYTHING] * 2,
+        [{"sharing": True}, {"supply": "C"}],
         name="boom_swing_cylinder_of_the_$left$_side_{}",
         supplies={"C": POSITIVE, "pump_of_the_slewing_gear_motor": FIXED},
         accumulators={last: Accumulator(1e-3, 8e6)},
         elements={
-            "ride_control_of_the_boom_on_roads": Element(
+            "ride_control_of_the_boom_on_roads": CircuitElement(
                 "orifice", f"{first}.a", last, coefficient=1e-7, joints=(first,)
             ),
-            "to": Element("check", "pump_of_the_slewing_gear_motor", "supply", coefficient=1e-6),
+            "to": CircuitElement(
+                "check", "pump_of_the_slewing_gear_motor", "supply", coefficient=1e-6
+            ),
         },
-    )  # fmt: skip
+    )
 
 
 def everything_tapped(folder):
     """Whatever stands beside a chamber's line that leads down, with unequal flows."""
     valves = [{"sharing": True, "regeneration": 1e-6, "c1": 8.1e-6, "c4": 4.56e-6}]
-    between = Element("orifice", "X1.a", "X1.b", coefficient=1e-7)
+    between = CircuitElement("orifice", "X1.a", "X1.b", coefficient=1e-7)
     return circuit(folder, SENSING, [EVERYTHING], valves, elements={"between": between})

@@ -25,7 +25,7 @@ from work import TooMuchWorkError, at_most  # noqa: E402
 
 import crane  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402
-from crane.formats import read  # noqa: E402
+from crane.formats import read_machine_spec  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 MOST = 250_000  # lines of the package for one file; a search for home in vain takes 211,000
@@ -295,14 +295,14 @@ def judge(kind, seed, folder):
     """None if all is well, or what is wrong."""
     main, files = make(kind, folder)
     known = {f.name: vocabulary(f.read_bytes()) for f in files if f.suffix != ".yaml"}
-    original = None if kind == "xacro" else said(files, known), got(read(main))
+    original = None if kind == "xacro" else said(files, known), got(read_machine_spec(main))
     file = files[seed % len(files)]
     file.write_bytes(mutated(file.read_bytes(), seed))
     problem = None
     try:
         with at_most(MOST):
             machine = crane.load(main)
-            spec = read(main)
+            spec = read_machine_spec(main)
     except CraneError as error:
         line = str(error)
         problem = None if line.isprintable() and line else f"message {line!r}"

@@ -28,13 +28,13 @@ import numpy as np  # noqa: E402
 import crane  # noqa: E402
 from crane.cli.runs import read_run  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402
-from crane.control import controller, joystick  # noqa: E402
+from crane.control import joystick, make_controller  # noqa: E402
 from crane.formats.check import check  # noqa: E402
 from crane.identification.mechanics.identify import identify  # noqa: E402
-from crane.motion.trajectories import task_trajectory  # noqa: E402
-from crane.simulation.replays import replay  # noqa: E402
+from crane.motion.task_trajectories import task_trajectory  # noqa: E402
+from crane.simulation.recording_replay import replay  # noqa: E402
 from crane.view.page import report  # noqa: E402
-from crane.view.plots.recording import plot_recording  # noqa: E402
+from crane.view.plots.recording_figure import plot_recording  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SECONDS, MEMORY = 20, 2 << 30  # of computing per case, bytes
@@ -240,7 +240,7 @@ def prepare_recordings(both):
     """Machines, and a valid recording of each: of angles, and of valves with pressures."""
     global MACHINES, RECORDINGS
     bar = crane.load(DATA / "four_bar.yaml")
-    swing = controller("pi", bar, task_trajectory(bar, "swing"))
+    swing = make_controller("pi", bar, task_trajectory(bar, "swing"))
     runs = [crane.simulate(bar, swing, duration=1.0, step=0.01, label="swing")]
     MACHINES, RECORDINGS = [bar], []
     if both:  # whose formulas take ten seconds

@@ -34,13 +34,13 @@ from typer.main import get_command  # noqa: E402
 import crane  # noqa: E402
 import crane.cli.entry as entry  # noqa: E402
 import crane.studies  # noqa: E402
-import crane.view.live.serve  # noqa: E402
-import crane.view.page.build  # noqa: E402
-import crane.view.plots.recording  # noqa: E402
+import crane.view.live.live_server  # noqa: E402
+import crane.view.page.report_page  # noqa: E402
+import crane.view.plots.recording_figure  # noqa: E402
 from crane.common.errors import CraneWarning  # noqa: E402
 from crane.description import parameters
-from crane.formats import read  # noqa: E402
-from crane.identification.excitation.fourier import Fourier  # noqa: E402
+from crane.formats import read_machine_spec  # noqa: E402
+from crane.identification.excitation.fourier_trajectory import FourierTrajectory  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SECONDS = 60  # of computing, on a slow machine: this ends what hangs
@@ -197,7 +197,7 @@ def prepare(folder):
     (folder / "slider.yaml").write_text(SLIDER)
     machine = crane.load(folder / "slider.yaml")
     for name, w in (("motion", 3.0), ("other", 2.3)):
-        path = Fourier([[1.4], [0.9], [0.5], [0.6], [-0.2]], 2 * np.pi / w)
+        path = FourierTrajectory([[1.4], [0.9], [0.5], [0.6], [-0.2]], 2 * np.pi / w)
         run = crane.simulate(machine, crane.ComputedTorque(machine, path), duration=4.0, step=5e-3)
         rng = np.random.default_rng(1)
         noisy = run.tau + 0.02 * rng.normal(size=run.tau.shape)
@@ -238,7 +238,7 @@ def names(folder):
     found = {}
     for name in ("slider.yaml", "rig.yaml"):
         machine = crane.load(folder / name)
-        found[name] = [*machine.joints, *parameters(read(folder / name))]
+        found[name] = [*machine.joints, *parameters(read_machine_spec(folder / name))]
     return found
 
 
@@ -325,7 +325,7 @@ def begin(words, place):
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
     sys.argv = ["crane", *words]
-    crane.view.live.serve._take = lambda *_: None  # serving ends at once
+    crane.view.live.live_server._take_requests = lambda *_: None  # serving ends at once
     show = entry._show_warning
     entry._show_warning = lambda message, category, *rest: (
         show(message) if issubclass(category, CraneWarning) else entry.say(f"LEAK {message}")

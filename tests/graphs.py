@@ -278,7 +278,7 @@ def judge(kind, seed, folder):
         return str(error)
     except Exception:
         return traceback.format_exc()
-    found = [str(finding) for finding in report.findings if finding.error]
+    found = [str(finding) for finding in report.findings if finding.is_error]
     if bool(told) != bool(found):
         return f"load says {told}, check {found}"
     if not sound and not found:

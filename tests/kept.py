@@ -24,7 +24,7 @@ def toy(factor=3.0, built=None):
         if built is not None:
             built.append(factor)
         tape = Tape()
-        x, y = tape.loads(0, 0, 2)
+        x, y = tape.load_vector(0, 0, 2)
         total = factor * x
         for _ in range(LONG // 2):
             total = y + total * 0.5
@@ -34,7 +34,7 @@ def toy(factor=3.0, built=None):
                 r.call("formula", r.x.row(i, 2), r.out.row(i, 3))
             r.give(r.count)
 
-    return Program.kept(("toy", factor), build)
+    return Program.from_cache(("toy", factor), build)
 
 
 def value(program):

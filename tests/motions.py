@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 import crane
-from crane.identification.signals.motion import Motion
+from crane.identification.signals.signal_processing import Motion
 
 NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
 

@@ -51,7 +51,7 @@ def _load(folder, parts, home, active):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", crane.common.errors.CraneWarning)
         machine = crane.load(path, active=[next(iter(home))])
-        return machine.seen_from(machine.home, (active,))
+        return machine.with_home_configuration(machine.home, (active,))
 
 
 def slider_crank(folder, active, crank=1.0, rod=1.0):

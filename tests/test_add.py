@@ -14,7 +14,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.adding.steel import PRESSURE, SteelCylinder
+from crane.formats.additions.steel_cylinder import RELIEF_PRESSURE, SteelCylinder
 
 ZX200 = Path(__file__).parents[2] / "shared/data/third_party/zx200/zx200.xacro"
 
@@ -65,9 +65,9 @@ def energy_of(run):
 def test_masses_are_those_of_the_shapes(retracted):
     """Cut into thin slices along x, whichever part they belong to."""
     bore, rod, stroke = 0.12, 0.085, 1.26
-    steel = SteelCylinder.of(bore, rod, stroke, retracted)
+    steel = SteelCylinder.from_dimensions(bore, rod, stroke, retracted)
     e = min(bore, (retracted - stroke) / 4)
-    assert steel.part == pytest.approx(e, rel=1e-15)
+    assert steel.part_length == pytest.approx(e, rel=1e-15)
     x = (np.arange(40_000) + 0.5) * retracted / 40_000
     area, second = np.zeros((2, 2, x.size))  # of barrel and rod, per slice
     for body, (start, end, inner, outer) in (
@@ -78,7 +78,9 @@ def test_masses_are_those_of_the_shapes(retracted):
         inside = (x > start) & (x < end)
         area[body] += inside * np.pi / 4 * (outer**2 - inner**2)
         second[body] += inside * np.pi / 64 * (outer**4 - inner**4)
-    for body, (found, eye) in enumerate(((steel.barrel, 0.0), (steel.piston_rod, retracted))):
+    for body, (found, eye) in enumerate(
+        ((steel.barrel_inertial, 0.0), (steel.rod_inertial, retracted))
+    ):
         line = 7850.0 * area[body] * (x[1] - x[0])
         com = line @ x / line.sum()
         across = line @ (x - com) ** 2 + 7850.0 * second[body].sum() * (x[1] - x[0])
@@ -89,12 +91,14 @@ def test_masses_are_those_of_the_shapes(retracted):
         assert found.tensor[0] == pytest.approx(about, rel=2e-3)
     # the piston runs from the cap to the gland
     assert 2 * e + stroke <= retracted - 2 * e + 1e-12
-    assert steel.effort == pytest.approx(PRESSURE * np.pi / 4 * bore**2)
+    assert steel.max_force == pytest.approx(RELIEF_PRESSURE * np.pi / 4 * bore**2)
 
 
 def test_a_cylinder_is_as_long_as_it_is_said():
-    assert SteelCylinder.of(0.12, 0.085, 1.26).retracted == pytest.approx(1.26 + 4 * 0.12)
-    assert SteelCylinder.of(0.12, 0.085, 1.26, 1.6).retracted == 1.6
+    assert SteelCylinder.from_dimensions(0.12, 0.085, 1.26).retracted_length == pytest.approx(
+        1.26 + 4 * 0.12
+    )
+    assert SteelCylinder.from_dimensions(0.12, 0.085, 1.26, 1.6).retracted_length == 1.6
 
 
 # --- machines ----------------------------------------------------------------------------------
@@ -185,7 +189,7 @@ def test_without_weight_it_is_the_open_machine(tmp_path):
             tmp_path / before, given["between"], 1e-5, 5e-6, given["stroke"],
             name=name, dead_length=length, out=tmp_path / "a.yaml", force=True,
         )  # fmt: skip
-    again = crane.load(tmp_path / "a.yaml").driven_by(["lift", "fold"])
+    again = crane.load(tmp_path / "a.yaml").with_active_joints(["lift", "fold"])
     q_a = np.random.default_rng(0).uniform([-0.4, 0.6], [0.2, 1.8], (20, 2))
     one, two = crane.Dynamics(first), crane.Dynamics(again)
     v, a = 0.3 * q_a, 1 - q_a
@@ -224,9 +228,9 @@ def test_in_space_the_barrel_has_a_universal_joint(tmp_path):
 def test_two_cylinders_on_one_boom_share_its_load(tmp_path):
     path = planar(tmp_path)
     one = crane.add_cylinder(path, name="left", out=tmp_path / "d.yaml", **LIFT)
-    assert one.joint == "lift" and not one.shares
+    assert one.joint == "lift" and not one.shares_load
     two = crane.add_cylinder(one.path, name="right", out=tmp_path / "d2.yaml", **LIFT)
-    assert two.joint == "left" and two.shares
+    assert two.joint == "left" and two.shares_load
     assert str(two).startswith("right shares the load on left from 0 to 0.9 m")
     machine = crane.load(two.path)
     assert machine.active == ("left", "fold")
@@ -288,8 +292,8 @@ def test_of_two_joints_it_drives_the_one_it_moves_best(tmp_path):
     assert added.notes[0] == "fold stays driven: of them and lift the cylinder drives lift best"
     machine = crane.load(added.path)
     assert machine.active == ("cylinder", "fold")
-    other = machine.driven_by(["cylinder", "lift"])  # the choice that was not taken
-    conditions = [float(m.closure.condition(m.home)) for m in (machine, other)]
+    other = machine.with_active_joints(["cylinder", "lift"])  # the choice that was not taken
+    conditions = [float(m.closure.condition_number(m.home)) for m in (machine, other)]
     assert conditions[0] < conditions[1]
 
 
@@ -320,11 +324,13 @@ def test_its_ends_are_where_the_stroke_ends(tmp_path):
         angle = value + np.arctan2(0.8, 0.6) + np.arctan2(0.3, 1.9)
         return a * b * np.sin(angle) / np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(angle))
 
-    low, high = added.covered
+    low, high = added.driven_range
     assert low == pytest.approx(-lift(2.2), abs=1e-8) and high == 0.2
-    assert added.strokes[0] == 0.9 and 0 < added.strokes[1] < 0.9
+    assert added.stroke_range[0] == 0.9 and 0 < added.stroke_range[1] < 0.9
     values = -np.linspace(low, high, 20001)
-    assert added.lever == pytest.approx((lever(values).min(), lever(values).max()), rel=1e-5)
+    assert added.lever_arm_range == pytest.approx(
+        (lever(values).min(), lever(values).max()), rel=1e-5
+    )
     assert f"drives it from {low:.4g} to {high:.4g}: its eyes" in told[0]
 
 
@@ -337,7 +343,7 @@ def test_its_ends_are_dead_centres_where_these_come_first(tmp_path, along):
         crane.add_cylinder, planar(tmp_path), eyes, out=tmp_path / "d.yaml", **steel
     )
     dead = -np.arctan2(along, 1.0)
-    assert dead in [pytest.approx(x, abs=1e-6) for x in added.covered]
+    assert dead in [pytest.approx(x, abs=1e-6) for x in added.driven_range]
     assert f"with a dead centre at {dead:.4g}: its" in told[0]
 
 
@@ -350,10 +356,10 @@ def test_its_ends_are_where_the_machine_closes(tmp_path):
     eyes = ["base:-0.5,0,0.3", "slider"]
     steel = {"bore": 0.05, "rod": 0.03, "stroke": 0.3, "dead_length": 0.65}
     added = crane.add_cylinder(tmp_path / "s.yaml", eyes, out=tmp_path / "d.yaml", **steel)
-    assert added.covered == pytest.approx((0.15, reach), abs=1e-6)
+    assert added.driven_range == pytest.approx((0.15, reach), abs=1e-6)
     assert added.limits[1] == pytest.approx(reach, abs=1e-8)
-    assert added.strokes == pytest.approx((0.0, reach - 0.15), abs=1e-6)
-    assert added.lever == pytest.approx((1.0, 1.0))
+    assert added.stroke_range == pytest.approx((0.0, reach - 0.15), abs=1e-6)
+    assert added.lever_arm_range == pytest.approx((1.0, 1.0))
 
 
 def test_strokes_beyond_a_dead_centre_are_told(tmp_path):
@@ -398,7 +404,7 @@ def test_a_joint_without_limits_takes_those_of_its_cylinder(tmp_path):
     a, b, length = np.linalg.norm(foot), np.linalg.norm(eye), np.array([1.3, 2.2])
     angle = np.arccos((a**2 + b**2 - length**2) / (2 * a * b))  # by the law of cosines
     assert abs(lift[1] - lift[0]) == pytest.approx(angle[1] - angle[0])
-    assert added.length[0] < length[0] and added.length[1] > length[1]
+    assert added.length_range[0] < length[0] and added.length_range[1] > length[1]
 
 
 def test_what_belonged_to_the_joint_is_left_out(tmp_path):

@@ -48,14 +48,14 @@ def test_loops_that_were_removed_are_proposed(name, tmp_path):
     report = check(opened(name, tmp_path))
     found = [one.loop for one in report.proposals]
     assert joined(found) == joined(whole.closure.equations.loops)
-    assert yaml.safe_load("\n".join(report.proposed))["loops"] == [
+    assert yaml.safe_load("\n".join(report.proposed_loop_lines))["loops"] == [
         {
             "name": one.name, "type": one.type, "predecessor": one.predecessor,
             "successor": one.successor, "axis": [0, 0, 1],
         }
         for one in found
     ]  # fmt: skip
-    assert report.next == f"crane add loops {tmp_path / name}.yaml"
+    assert report.next_command == f"crane add loops {tmp_path / name}.yaml"
 
 
 @pytest.mark.parametrize("loop", ["A1_eye", "A2_eye", "J", "K"])
@@ -90,7 +90,7 @@ def test_the_gap_is_that_of_the_frames(tmp_path):
 def test_the_machine_with_the_proposed_loops_is_the_whole_one(tmp_path):
     added = crane.add_loops(opened("mini_forwarder", tmp_path), out=tmp_path / "closed.yaml")
     closed, whole = crane.load(added.path), crane.load("mini_forwarder")
-    assert closed.active == whole.active and added.freedom == 3
+    assert closed.active == whole.active and added.mobility == 3
     rng = np.random.default_rng(0)
     home = whole.home[whole.closure.active]
     q_a = home + rng.uniform(-1, 1, (20, 3)) * [1, 0.003, 0.003]
@@ -111,9 +111,9 @@ def test_frames_without_names_that_meet(mass, tmp_path):
     (tmp_path / "bars.urdf").write_text(text)
     (proposal,) = check(tmp_path / "bars.urdf").proposals
     assert (proposal.loop.type, proposal.loop.axis) == ("revolute", (0, 0, 1))
-    assert proposal.gap == pytest.approx(0, abs=1e-15) and not proposal.by_name
+    assert proposal.gap == pytest.approx(0, abs=1e-15) and not proposal.is_named
     added = crane.add_loops(tmp_path / "bars.urdf", out=tmp_path / "bars.yaml")
-    assert added.freedom == 2
+    assert added.mobility == 2
 
 
 HUNG = """<link name="{0}"><inertial><origin xyz="0.3 0 0"/><mass value="5"/><inertia ixx="0.01"
@@ -153,8 +153,8 @@ def test_a_barrel_and_a_rod_that_hang_on_two_bodies_slide_in_each_other(tmp_path
 def test_open_machines_have_no_proposals(tmp_path):
     assert check("tx40").proposals == ()
     report = check(planar(tmp_path))
-    assert report.proposals == () and report.proposed == []
-    assert report.next.startswith("crane simulate ")
+    assert report.proposals == () and report.proposed_loop_lines == []
+    assert report.next_command.startswith("crane simulate ")
 
 
 @pytest.mark.parametrize("name", ["5bar_linkage_iso6d", "robot_delta", "wl16_like"])

@@ -9,7 +9,7 @@ from oracles import COMPLEX_STEP, GRAVITY, angle
 from scipy.signal import butter, sosfiltfilt
 
 import crane
-from crane.description.estimation import Estimation
+from crane.description.estimation_settings import EstimationSettings
 from crane.recordings.logs import read_log
 
 RECORDINGS = Path(__file__).parents[1] / ".." / "shared" / "data"
@@ -327,19 +327,19 @@ def test_the_tx40_predicts_the_part_it_has_not_seen(tx40):
     """The reference's own residual is 5.26 %, its plain friction predicts to 7.4 %."""
     (log,) = logs("tx40", "tx40_recording.npz")
     first, rest = log.between(0.0, 5.4), log.between(5.4, 9.0)
-    plain = tx40.replace(estimation=Estimation())
+    plain = tx40.replace(estimation=EstimationSettings())
     rotors = {"q*.rotor_inertia": (), "q*.viscous_offset": None, "q5+q6.rotor_inertia": (),
               "q5+q6.coulomb": (), "q5+q6.viscous": ()}  # fmt: skip
     least = crane.identify(
         plain, log, method="ols", terms=rotors, bandwidth=20.0, slow={"q*": 0.05}
     )
     assert len(least.values) == 61
-    assert least.training.stacked <= 0.051
+    assert least.training.overall_relative_error <= 0.051
 
     better = crane.identify(tx40, first, rest, feasible=True)
     slow = [0.05009, 0.05009, 0.07505, 0.07156, 0.05585, 0.12217]
     _, error = judged(better, rest.time, rest.q, rest.tau, slow, (100.0, 20.0), trim=400)
-    assert better.validation.stacked <= 0.0528
+    assert better.validation.overall_relative_error <= 0.0528
     assert error <= 0.0558
 
 
@@ -351,7 +351,7 @@ def test_the_kr300_predicts_the_other_recording(kr300):
     a, b = logs("kr300", "kr300_A.npz", "kr300_B.npz")
     found = crane.identify(kr300, a, b, feasible=True)
     errors, stacked = judged(found, b.time, b.q, b.tau, np.deg2rad(1.0), (20.0, 5.0))
-    assert found.validation.relative.mean() <= 0.0618
+    assert found.validation.relative_error.mean() <= 0.0618
     assert errors.mean() <= 0.0618 and stacked <= 0.0261
     assert errors[1] <= 0.03
     scale = found.parameters[found.model.names.index("stroke.gas_scale")]
@@ -360,4 +360,4 @@ def test_the_kr300_predicts_the_other_recording(kr300):
     terms = {name: kind for name, kind in kr300.estimation.terms.items() if "stroke" not in name}
     bare = kr300.replace(gas_springs=(), estimation=replace(kr300.estimation, terms=terms))
     without = crane.identify(bare, a, b, prior={"bodies": "0.2 %"}, feasible=True)
-    assert without.validation.relative[1] >= 5 * found.validation.relative[1]
+    assert without.validation.relative_error[1] >= 5 * found.validation.relative_error[1]

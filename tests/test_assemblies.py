@@ -12,9 +12,9 @@ from typed import typed
 from work import at_most
 
 import crane
-from crane.closure.assemblies import ambiguities
+from crane.closure.assembly_modes import find_alternative_assembly_modes
 from crane.common.errors import CraneError, CraneWarning
-from crane.description import bundled
+from crane.description import bundled_machines
 from crane.formats.check import check
 
 STROKES = np.arange(0.14, 0.96, 0.02).round(2).tolist()
@@ -65,7 +65,7 @@ def test_the_line_names_the_other_and_how_to_choose_it(tmp_path):
     now, _ = assembly(bucket.write(tmp_path, 0.25), 0.25)
     reached = set()
     for finding in report.findings:
-        for k, choice in enumerate(CHOICES.search(finding.what).groups()):
+        for k, choice in enumerate(CHOICES.search(finding.message).groups()):
             path = bucket.write(tmp_path, 0.25, home=lines(choice))
             which, _ = assembly(path, 0.25)
             assert (which == now) == (k == 1)
@@ -83,7 +83,7 @@ def test_a_file_that_says_what_is_meant_gets_it_without_a_word(which, tmp_path):
         ))  # fmt: skip
         path = bucket.write(tmp_path, stroke, home=said)
         assert assembly(path, stroke) == (which, [])
-        told = [one.what for one in check(path).findings]
+        told = [one.message for one in check(path).findings]
         assert [line for line in told if "of the strokes within" not in line] == []
 
 
@@ -109,7 +109,9 @@ def test_a_guess_far_from_all_is_told(tmp_path):
         for joint, a, b in zip(bucket.PASSIVE, one, two, strict=True)
     ))  # fmt: skip
     path = bucket.write(tmp_path, 0.25, home=middle)
-    assert any("'eye' can be assembled another way" in line.what for line in check(path).findings)
+    assert any(
+        "'eye' can be assembled another way" in line.message for line in check(path).findings
+    )
 
 
 def test_limits_decide(tmp_path):
@@ -120,7 +122,7 @@ def test_limits_decide(tmp_path):
         assert not low <= rockers[wide] <= high
         limits = f'<limit lower="{low:.3f}" upper="{high:.3f}" effort="1e9" velocity="1e9"/>'
         path = bucket.write(tmp_path, 0.25, limits=limits)
-        told = [finding.what for finding in check(path).findings]
+        told = [finding.message for finding in check(path).findings]
         eye = [what for what in told if what.startswith("loop 'eye'")]
         outside = [what for what in told if "outside of its limits" in what]
         assert len(eye) == len(outside)
@@ -156,19 +158,25 @@ def test_all_others_are_found(tmp_path):
         four = bucket.assemblies(float(stroke), zero)
         at_home = [apart(a, machine.home[columns]) < 1e-9 for a in four].index(True)
         guess = machine.home + np.pi / 2  # which says nothing
-        found = ambiguities(machine.closure, guess, np.zeros(0, dtype=np.intp), 6)
+        found = find_alternative_assembly_modes(
+            machine.closure, guess, np.zeros(0, dtype=np.intp), 6
+        )
         others = [[apart(a, x.q[columns]) < 1e-9 for a in four].index(True) for x in found]
         assert [x.loops for x in found] == [("eye",), ("pin",)]
         assert others[0] // 2 != at_home // 2  # the other triangle
         assert others[1] // 2 == at_home // 2 and others[1] != at_home
 
 
-@pytest.mark.parametrize("name", [*bundled(), *sorted(path.name for path in DATA.glob("*.urdf"))])
+@pytest.mark.parametrize(
+    "name", [*bundled_machines(), *sorted(path.name for path in DATA.glob("*.urdf"))]
+)
 def test_machines_that_say_so_cost_no_search(name):
-    path = name if name in bundled() else DATA / name
+    path = name if name in bundled_machines() else DATA / name
     machine = crane.load(path)
     with at_most(6_000):  # lines; one block of the linkage above takes 2,000
-        again = ambiguities(machine.closure, machine.home, np.zeros(0, dtype=np.intp), 100)
+        again = find_alternative_assembly_modes(
+            machine.closure, machine.home, np.zeros(0, dtype=np.intp), 100
+        )
     assert again == []
 
 
@@ -177,8 +185,10 @@ def test_a_urdf_says_it_in_its_own_words(tmp_path):
     path = copy_machine(LOOPED, tmp_path)
     swap('rpy="0 0 1.4"', 'rpy="0 0 0"', LOOPED).apply(tmp_path)
     (finding,) = check(path).findings
-    assert finding.what.startswith("loop 'pin' can be assembled another way at home")
-    chosen = re.search(r'in <group_state name="home"> write (<.+?/>) for the other', finding.what)
+    assert finding.message.startswith("loop 'pin' can be assembled another way at home")
+    chosen = re.search(
+        r'in <group_state name="home"> write (<.+?/>) for the other', finding.message
+    )
     before = home_of(path)
     swap(
         "</robot>",
@@ -241,5 +251,5 @@ def test_machines_without_masses_are_told_of_other_assemblies(tmp_path):
     path = bucket.write(tmp_path, 0.25)
     urdf = tmp_path / "bucket_linkage.urdf"
     urdf.write_text(re.sub(r"<inertial>.*?</inertial>", "", urdf.read_text()))
-    told = [finding.what for finding in check(path).findings]
+    told = [finding.message for finding in check(path).findings]
     assert sum("can be assembled another way" in what for what in told) == 2

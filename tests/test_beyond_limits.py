@@ -11,10 +11,10 @@ from scipy.optimize import brentq
 
 import crane
 from crane.common.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
-from crane.control import Sampled, ValvePD
-from crane.description.spec import PIGains
-from crane.motion.curves import polynomial
-from crane.motion.limits import beyond_limits, carried_beyond
+from crane.control import SampledCommand, ValvePD
+from crane.description.specification import PIGains
+from crane.motion.limit_violations import limit_violation_message, passive_limit_violation_message
+from crane.motion.trajectory import polynomial
 
 SLIDER = Path(__file__).parent / "data" / "slider_crank.yaml"
 # 10 u^3 - 15 u^4 + 6 u^5 = 1 / 31 at u = 0.1609
@@ -105,7 +105,9 @@ def test_an_end_stop_holds_what_the_reference_asks_for(mini):
 
 def test_only_what_is_simulated_of_a_path_counts(mini):
     path = to(0.06, 2.0)
-    assert not beyond_limits(mini, path, 0.1) and beyond_limits(mini, path, 2.0)
+    assert not limit_violation_message(mini, path, 0.1) and limit_violation_message(
+        mini, path, 2.0
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)
         crane.simulate(mini, crane.PI(mini, path), duration=0.1)
@@ -117,11 +119,11 @@ def test_short_excursions_are_found(mini):
     def peak(top):
         return polynomial([[0.0], [top - 0.1234**2, 2 * 0.1234, -1.0], [0.0108]], 0.25)
 
-    told = beyond_limits(mini, peak(0.03001))
+    told = limit_violation_message(mini, peak(0.03001))
     assert "'X1' goes to 0.03001 m at t = 0.1234 s" in told
     half = np.sqrt(1e-5)
     assert f"from t = {0.1234 - half:.4g} to {0.1234 + half:.4g} s" in told
-    assert not beyond_limits(mini, peak(0.03))
+    assert not limit_violation_message(mini, peak(0.03))
 
 
 def test_passive_joints_are_looked_at_too():
@@ -146,10 +148,10 @@ def test_velocities_are_looked_at_too():
     """1.875 times way over time is the fastest of a motion from rest to rest."""
     machine = crane.load(SLIDER)
     path = crane.point_to_point([1.4], [0.6], 0.12)
-    told = carried_beyond(machine, path)
+    told = passive_limit_violation_message(machine, path)
     assert f"moves 'theta' with up to {1.875 * 0.8 / 0.12:.4g} rad/s at t = 0.06 s" in told
     assert "its limit is 10 rad/s (crank.urdf:15), from t = " in told
-    assert not carried_beyond(machine, crane.point_to_point([1.4], [0.6], 0.1501))
+    assert not passive_limit_violation_message(machine, crane.point_to_point([1.4], [0.6], 0.1501))
 
 
 def test_a_task_beyond_the_limits_is_an_error(tmp_path):
@@ -235,7 +237,7 @@ def test_programs_that_ask_where_no_posture_is(unstopped):
         return [5.8] * 4
 
     with pytest.raises(SimulationError, match=r"at t = 0\.06 s: loop 'lift_eye' cannot be closed"):
-        crane.simulate(unstopped, Sampled(ahead, unstopped), duration=0.2)
+        crane.simulate(unstopped, SampledCommand(ahead, unstopped), duration=0.2)
 
 
 def test_a_start_that_does_not_close_is_a_simulation_error():

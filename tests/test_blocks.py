@@ -12,15 +12,20 @@ import pytest
 
 import crane
 from crane.identification.estimation import estimators, regressor
-from crane.identification.estimation.estimators import huber, instrumental, least_squares, weighted
-from crane.identification.mechanics import equations
-from crane.identification.mechanics.equations import Equations
-from crane.identification.mechanics.friction import Presliding
-from crane.identification.mechanics.identify import equations_of, identify
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.terms import default_terms
-from crane.identification.signals import smoother
-from crane.identification.signals.motion import Motion, filter_rows
+from crane.identification.estimation.estimators import (
+    huber,
+    instrumental_variables,
+    least_squares,
+    weighted_least_squares,
+)
+from crane.identification.mechanics import regression_equations
+from crane.identification.mechanics.friction_terms import PreslidingFriction
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identify import build_equations, identify
+from crane.identification.mechanics.regression_equations import RegressionEquations
+from crane.identification.mechanics.term_selection import default_terms
+from crane.identification.signals import kalman_smoother
+from crane.identification.signals.signal_processing import Motion, filter_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
@@ -44,16 +49,18 @@ def rows(seed=0, count=3000):
     return W[kept], (W @ [1, -2, 3, 0.5, 0] + noise)[kept], groups[kept], samples[kept]
 
 
-@pytest.mark.parametrize("estimator", [least_squares, weighted, huber, instrumental])
+@pytest.mark.parametrize(
+    "estimator", [least_squares, weighted_least_squares, huber, instrumental_variables]
+)
 @pytest.mark.parametrize("prior", [None, (np.ones(5), np.array([0.1, np.inf, 1, 1e3, 0.01]))])
 def test_estimates_do_not_depend_on_the_blocks(estimator, prior, monkeypatch):
     W, y, groups, samples = rows()
     parts = [W, W + 0.1 * np.random.default_rng(1).normal(size=W.shape)]
-    parts = parts if estimator is instrumental else parts[:1]
+    parts = parts if estimator is instrumental_variables else parts[:1]
     whole = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
-    stored = regressor.Stored.__init__.__defaults__
-    monkeypatch.setattr(regressor.Stored.__init__, "__defaults__", (50,))
-    monkeypatch.setattr(estimators, "_WAITING", 7)
+    stored = regressor.StoredRegressor.__init__.__defaults__
+    monkeypatch.setattr(regressor.StoredRegressor.__init__, "__defaults__", (50,))
+    monkeypatch.setattr(estimators, "_GAP_BLOCK", 7)
     found = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     assert stored == (8192,)  # what the first call had: all rows in one block
     for key in ("values", "covariance", "residuals", "noise", "effective", "freedom", "condition"):
@@ -65,13 +72,13 @@ def test_covariance_is_that_of_all_rows_at_once():
     """Q^T C Q by a dense C = (a^-1 a^-T) of one group with missing rows."""
     from scipy.linalg import toeplitz
 
-    from crane.identification.estimation.noise import Noise
+    from crane.identification.estimation.noise_model import NoiseModel
 
     W, y, groups, samples = (x[rows()[2] == 1] for x in rows())
     found = least_squares(W, y, groups - 1, samples)
-    noise = Noise.of(found.residuals / found.noise, samples)
+    noise = NoiseModel.fit(found.residuals / found.noise, samples)
     impulse = np.eye(1, 2000)
-    answer, _ = noise.pass_on(impulse, noise.at_rest(1))
+    answer, _ = noise.apply_filter(impulse, noise.zero_state(1))
     lags = np.correlate(answer[0], answer[0], "full")[1999:]
     C = toeplitz(lags)[samples][:, samples]
     inverse = np.linalg.inv(W.T @ W)
@@ -88,11 +95,11 @@ def test_covariance_is_that_of_all_rows_at_once():
 def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
     """With a term that depends on the past; none of the blocks is held."""
     given = motion(mini, duration=10.0)
-    terms = [*default_terms(mini), Presliding(mini, "X1", 1e-3)]
+    terms = [*default_terms(mini), PreslidingFriction(mini, "X1", 1e-3)]
     settings = {"prior": 0.3, "bandwidth": bandwidth, "terms": terms}
     whole = identify(mini, given, motion(mini, duration=8.0, seed=1), **settings)
-    monkeypatch.setattr(equations, "_BLOCK", 3 << 20)
-    monkeypatch.setattr(equations, "_HELD", 0)
+    monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 3 << 20)
+    monkeypatch.setattr(regression_equations, "_CACHE_BYTES", 0)
     found = identify(mini, given, motion(mini, duration=8.0, seed=1), **settings)
     for fit in ("training", "validation"):
         for key in ("measured", "modelled"):
@@ -104,9 +111,9 @@ def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
 
 def test_the_equations_are_those_of_one_filter(mini, monkeypatch):
     """Against the whole regressor through the filter at once."""
-    monkeypatch.setattr(equations, "_BLOCK", 1 << 19)
-    given, model = motion(mini, duration=8.0), Model(mini)
-    found, _ = equations_of(model, [given], bandwidth=10.0)
+    monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 1 << 19)
+    given, model = motion(mini, duration=8.0), IdentificationModel(mini)
+    found, _ = build_equations(model, [given], bandwidth=10.0)
     assert len(list(found.blocks())) > 2
     at = model.samples(given.q, given.v, given.a)
     W = model.regressor(at)[:, :, found.base.independent]
@@ -117,25 +124,27 @@ def test_the_equations_are_those_of_one_filter(mini, monkeypatch):
 
 
 def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
-    monkeypatch.setattr(equations, "_BLOCK", 1 << 21)
-    monkeypatch.setattr(equations, "_HELD", 1 << 20)
-    unfiltered, sizes = Equations._unfiltered, []
+    monkeypatch.setattr(regression_equations, "_BLOCK_BYTES", 1 << 21)
+    monkeypatch.setattr(regression_equations, "_CACHE_BYTES", 1 << 20)
+    unfiltered, sizes = RegressionEquations._unfiltered_block, []
 
     def spied(*arguments):
         out = unfiltered(*arguments)
         sizes.append(out.nbytes)
         return out
 
-    monkeypatch.setattr(Equations, "_unfiltered", spied)
+    monkeypatch.setattr(RegressionEquations, "_unfiltered_block", spied)
     given = motion(mini, duration=3.0)
     for copies in (2, 5):
         parts = (np.tile(x, (copies, 1)) for x in (given.q, given.v, given.a, given.tau))
         time = 2e-3 * np.arange(copies * len(given.time))
-        rows, base = equations_of(Model(mini), [Motion(time, *parts)], bandwidth=100.0)
-        columns = rows.columns(rows.selection(base))
+        rows, base = build_equations(
+            IdentificationModel(mini), [Motion(time, *parts)], bandwidth=100.0
+        )
+        columns = rows.projected_regressor(rows.column_selection(base))
         assert len(list(columns.blocks())) >= copies
         assert max(sizes) < 1.5 * (1 << 21)  # with what the filter needs around
-        assert sum(W.nbytes for W in rows._held.values()) <= 1 << 20
+        assert sum(W.nbytes for W in rows._block_cache.values()) <= 1 << 20
     assert len(sizes) > 10
 
 
@@ -143,7 +152,7 @@ LONG = """
 import resource, sys, numpy as np, crane
 from test_blocks import motion
 from crane.identification.mechanics.identify import identify
-from crane.identification.signals.motion import Motion
+from crane.identification.signals.signal_processing import Motion
 machine = crane.load("mini_forwarder")
 one = motion(machine, duration=10.0, step=1e-3)
 parts = [np.tile(x, (30, 1)) for x in (one.q, one.v, one.a, one.tau)]
@@ -167,9 +176,9 @@ def test_five_minutes_at_a_kilohertz_unthinned():
 def test_smoothing_does_not_depend_on_the_blocks(monkeypatch):
     rng = np.random.default_rng(0)
     y = np.sin(0.01 * np.arange(3000)) + 1e-3 * rng.normal(size=3000)
-    whole = smoother.smooth(y, 0.01)
-    monkeypatch.setattr(smoother, "_AT_ONCE", 101)
-    for one, other in zip(smoother.smooth(y, 0.01), whole, strict=True):
+    whole = kalman_smoother.kalman_smooth(y, 0.01)
+    monkeypatch.setattr(kalman_smoother, "_BLOCK_SAMPLES", 101)
+    for one, other in zip(kalman_smoother.kalman_smooth(y, 0.01), whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-9 * np.abs(other).max())
 
 

@@ -11,13 +11,13 @@ from test_reactions import BEAM, load
 import crane
 from crane import Buckling, Dynamics
 from crane.common.errors import CraneError, InputError
-from crane.dynamics.buckling import STEEL, Column
-from crane.dynamics.frames import FrameJacobians
+from crane.dynamics.buckling import YOUNGS_MODULUS_STEEL, CylinderColumn
+from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.hydraulics.components import Cylinder, Hydraulics, Oil, Valve
-from crane.hydraulics.sources import Supply
+from crane.hydraulics.supply_and_engine import Supply
 
-SHAPE = {"joint": "x", "count": 1, "start": np.array([0.8, 0, 0]), "axis": np.array([1.0, 0, 0]),
-         "lower": 0.0, "upper": 0.6}  # fmt: skip
+SHAPE = {"joint": "x", "count": 1, "pin_offset": np.array([0.8, 0, 0]), "slide_axis": np.array([1.0, 0, 0]),
+         "lower_limit": 0.0, "upper_limit": 0.6}  # fmt: skip
 
 
 def inertia(outer, inner=0.0):
@@ -49,28 +49,35 @@ def by_elements(parts, each=30):
     [(0.1, 0.056, 0.12), (0.14, 0.1, 0.168), (0.1, 0.02, 0.3), (0.05, 0.049, 0.051)],
 )
 def test_the_stepped_column_is_that_of_finite_elements(bore, rod, tube):
-    column = Column(bore=bore, rod=rod, tube=tube, **SHAPE)
+    column = CylinderColumn(bore=bore, rod=rod, tube=tube, **SHAPE)
     strokes = np.array([0.0, 0.2, 0.45, 0.6])
-    out = column.length(strokes) - column.tube_length
+    out = column.pin_distance(strokes) - column.tube_length
     assert out[0] == pytest.approx(min(bore, 0.05))
     wanted = [
-        by_elements([(STEEL * inertia(tube, bore), column.tube_length), (STEEL * inertia(rod), x)])
+        by_elements(
+            [
+                (YOUNGS_MODULUS_STEEL * inertia(tube, bore), column.tube_length),
+                (YOUNGS_MODULUS_STEEL * inertia(rod), x),
+            ]
+        )
         for x in out
     ]
-    assert np.allclose(column.load(strokes), wanted, rtol=1e-6)
+    assert np.allclose(column.buckling_load(strokes), wanted, rtol=1e-6)
     if inertia(tube, bore) > inertia(rod):
-        assert (column.euler(strokes) < column.load(strokes)).all()
+        assert (column.euler_load(strokes) < column.buckling_load(strokes)).all()
 
 
 def test_a_tube_as_stiff_as_the_rod_is_eulers_column():
     bore, rod = 0.1, 0.06
     tube = (bore**4 + rod**4) ** 0.25
-    column = Column(bore=bore, rod=rod, tube=tube, **SHAPE)
-    assert np.allclose(column.load([0.1, 0.5]), column.euler([0.1, 0.5]), rtol=1e-12)
-    assert column.euler(0.2) == pytest.approx(np.pi**2 * STEEL * inertia(rod), rel=1e-12)  # 1 m
+    column = CylinderColumn(bore=bore, rod=rod, tube=tube, **SHAPE)
+    assert np.allclose(column.buckling_load([0.1, 0.5]), column.euler_load([0.1, 0.5]), rtol=1e-12)
+    assert column.euler_load(0.2) == pytest.approx(
+        np.pi**2 * YOUNGS_MODULUS_STEEL * inertia(rod), rel=1e-12
+    )  # 1 m
     unknown = replace(column, tube=0.0)
-    assert np.array_equal(unknown.load([0.1, 0.5]), unknown.euler([0.1, 0.5]))
-    assert np.allclose(replace(column, count=3).load(0.3), 3 * column.load(0.3))
+    assert np.array_equal(unknown.buckling_load([0.1, 0.5]), unknown.euler_load([0.1, 0.5]))
+    assert np.allclose(replace(column, count=3).buckling_load(0.3), 3 * column.buckling_load(0.3))
 
 
 EYES = {
@@ -85,7 +92,7 @@ def test_pins_of_a_machine_lie_where_its_frames_are(name):
     machine = crane.load(name)
     buckling = Buckling(machine)
     assert list(buckling.columns) == list(EYES[name])
-    assert buckling.left_out["slew"] == "it turns its joint"
+    assert buckling.unsupported["slew"] == "it turns its joint"
     rng = np.random.default_rng(0)
     span = 0.1 * (machine.upper - machine.lower) * rng.uniform(-1, 1, (5, len(machine.active)))
     q_a = machine.home[machine.closure.active] + span
@@ -94,9 +101,11 @@ def test_pins_of_a_machine_lie_where_its_frames_are(name):
     for slide, (barrel, eye) in EYES[name].items():
         column = buckling.columns[slide]
         links = machine.tree.joints[barrel].child, successors[eye]
-        one, two = np.moveaxis(FrameJacobians(machine).places(q, links), 1, 0)
+        one, two = np.moveaxis(FrameJacobians(machine).frame_origins(q, links), 1, 0)
         wanted = np.linalg.norm(two - one, axis=1)
-        assert np.allclose(column.length(q_a[:, machine.active.index(slide)]), wanted, rtol=1e-9)
+        assert np.allclose(
+            column.pin_distance(q_a[:, machine.active.index(slide)]), wanted, rtol=1e-9
+        )
         cylinder = machine.hydraulics.cylinders[slide]
         assert (column.bore, column.rod) == (cylinder.bore, cylinder.rod)
     diameters = {x: (round(c.bore, 6), round(c.rod, 6)) for x, c in buckling.columns.items()}
@@ -130,10 +139,10 @@ def test_margin_of_a_beams_cylinder(tmp_path, reversed_):
     force = Dynamics(beam).gravity(q_a)
     assert (sign * force > 0).all()
     rod = np.sqrt(4 / np.pi * 2e-3)
-    wanted = 2 * np.pi**2 * STEEL * inertia(rod) / length**2 / np.abs(force[:, 0])
-    assert np.allclose(buckling.margins(q_a, force)[:, 0], wanted, rtol=1e-9)
-    assert np.isinf(buckling.margins(q_a, -force)).all()
-    assert buckling.margins(q_a[0], force[0]) == pytest.approx(wanted[0])
+    wanted = 2 * np.pi**2 * YOUNGS_MODULUS_STEEL * inertia(rod) / length**2 / np.abs(force[:, 0])
+    assert np.allclose(buckling.buckling_margins(q_a, force)[:, 0], wanted, rtol=1e-9)
+    assert np.isinf(buckling.buckling_margins(q_a, -force)).all()
+    assert buckling.buckling_margins(q_a[0], force[0]) == pytest.approx(wanted[0])
 
 
 def test_what_is_no_column_is_told(tmp_path):
@@ -142,10 +151,10 @@ def test_what_is_no_column_is_told(tmp_path):
         Buckling(beam)
     driven = beam.replace(hydraulics=circuit())
     with pytest.raises(InputError, match=r"shapes \(2, 1\) and \(1,\), give the same"):
-        Buckling(driven).margins([[1.0], [1.1]], [5.0])
+        Buckling(driven).buckling_margins([[1.0], [1.1]], [5.0])
     same = replace(circuit().cylinders["stroke"], area_b=1e-2)
     found = Buckling(beam.replace(hydraulics=replace(circuit(), cylinders={"stroke": same})))
-    assert "its rod is not known" in found.left_out["stroke"]
+    assert "its rod is not known" in found.unsupported["stroke"]
     for place, reason in (("0 0 0.2", "more than one pin"), ("0 0 0", "")):
         second = BEAM.replace(
             '<link name="end"/>',
@@ -155,7 +164,7 @@ def test_what_is_no_column_is_told(tmp_path):
         )
         other = load(tmp_path, second, active=["stroke"], free=["arm"])
         found = Buckling(other.replace(hydraulics=circuit()))
-        assert reason in found.left_out.get("stroke", "")
+        assert reason in found.unsupported.get("stroke", "")
         assert ("stroke" in found.columns) == (not reason)
 
 

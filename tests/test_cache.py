@@ -8,35 +8,35 @@ import numpy as np
 import pytest
 
 from crane.codegen import Program, Tape
-from crane.codegen.llvm import engine
-from crane.common import cache
+from crane.codegen.llvm import machine_code
+from crane.common import file_cache
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     folder = tmp_path / "objects"
-    monkeypatch.setattr(cache, "folder", lambda: folder)
+    monkeypatch.setattr(file_cache, "cache_folder", lambda: folder)
     return folder
 
 
 @pytest.fixture
 def translated(monkeypatch):
     """Texts that were translated."""
-    texts, translate = [], engine._translated
+    texts, translate = [], machine_code._compile_to_object_code
 
     def counted(text, target):
         texts.append(text)
         return translate(text, target)
 
-    monkeypatch.setattr(engine, "_translated", counted)
+    monkeypatch.setattr(machine_code, "_compile_to_object_code", counted)
     return texts
 
 
 def square_sum(factor=3.0):
     """x y + factor x of a compiled program."""
     tape, program = Tape(), Program()
-    x, y = tape.loads(0, 0, 2)
-    program.add("formula", 1, [x * y + factor * x])
+    x, y = tape.load_vector(0, 0, 2)
+    program.add_formula("formula", 1, [x * y + factor * x])
     program.compile()
     out = np.empty(1)
     program.call("formula", np.array([2.0, 5.0]), out)
@@ -60,7 +60,7 @@ def test_another_process_reads_it(place, translated):
         "t.cache.folder = lambda: Path(sys.argv[2])\n"
         "def never(*_): raise AssertionError('translated')\n"
         "t.engine._translated = never\n"
-        f"t.engine._SPEED = {engine._SPEED}\n"
+        f"t.engine._SPEED = {machine_code._OPTIMIZATION_LEVEL}\n"
         "assert t.square_sum() == 16.0\n"
     )
     here = os.path.dirname(__file__)
@@ -94,30 +94,30 @@ def test_without_a_folder_nothing_is_kept(place, translated):
 
 
 def test_what_was_used_least_lately_makes_room(place, monkeypatch):
-    monkeypatch.setattr(cache, "MOST", 400)  # three of them
+    monkeypatch.setattr(file_cache, "MAX_CACHE_SIZE", 400)  # three of them
     for number, name in enumerate("abc"):
-        cache.object_code(name, lambda: b"x" * 100)
+        file_cache.cached_object_code(name, lambda: b"x" * 100)
         for file in place.iterdir():
             if file.stat().st_mtime > 1e9:
                 os.utime(file, (number, number))
-    first = cache.object_code("a", lambda: b"never")  # used now
-    cache.object_code("d", lambda: b"y" * 100)
+    first = file_cache.cached_object_code("a", lambda: b"never")  # used now
+    file_cache.cached_object_code("d", lambda: b"y" * 100)
     left = {file.read_bytes()[-1:] for file in place.iterdir()}
     assert first == b"x" * 100 and left == {b"x", b"y"}
-    assert cache.object_code("a", lambda: b"gone") == first
-    assert cache.object_code("b", lambda: b"gone") == b"gone"
+    assert file_cache.cached_object_code("a", lambda: b"gone") == first
+    assert file_cache.cached_object_code("b", lambda: b"gone") == b"gone"
 
 
 def test_the_folder_is_not_looked_through_each_time(place, monkeypatch):
-    looks, look = [], cache._files
+    looks, look = [], file_cache._cache_files
 
     def counted(folder):
         looks.append(folder)
         return look(folder)
 
-    monkeypatch.setattr(cache, "_files", counted)
-    monkeypatch.setattr(cache, "MOST", 64 * 132)  # with their digests
+    monkeypatch.setattr(file_cache, "_cache_files", counted)
+    monkeypatch.setattr(file_cache, "MAX_CACHE_SIZE", 64 * 132)  # with their digests
     for number in range(100):
-        cache.object_code(str(number), lambda: b"x" * 100)
+        file_cache.cached_object_code(str(number), lambda: b"x" * 100)
         assert len(list(place.iterdir())) == min(number + 1, 64 - (63 - number) % 4)
     assert len(looks) == 25

@@ -13,13 +13,13 @@ from typed import typed
 import crane
 from crane.cli.runs import write_calibration
 from crane.common.errors import CraneError, CraneWarning, InputError
-from crane.description.changes import parameters
+from crane.description.parameter_changes import parameters
 from crane.description.sensors import Sensor
-from crane.formats.loading import Variants
-from crane.identification.calibration.dependence import left_over
-from crane.identification.calibration.ends import found_by
-from crane.identification.calibration.problem import noise_of
-from crane.identification.calibration.unknowns import unknowns_of
+from crane.formats.machine_loading import MachineVariants
+from crane.identification.calibration.calibration_problem import noise_std
+from crane.identification.calibration.profile_likelihood import estimate_with_profiles
+from crane.identification.calibration.residual_dependence import residual_dependences
+from crane.identification.calibration.unknowns import build_unknowns
 from crane.recordings import timeseries
 
 pytestmark = pytest.mark.slow
@@ -48,7 +48,12 @@ def recorded(machine, path, seed, truth=None, offset=0.0, extra=()):
         warnings.simplefilter("ignore")
         true = crane.load(machine.path, changes=TRUTH if truth is None else truth)
         run = crane.simulate(
-            true, crane.Signals(true, time, {"x": voltage}), [0.2], 5.99, 0.01, tolerance=1e-10
+            true,
+            crane.ValveSignals(true, time, {"x": voltage}),
+            [0.2],
+            5.99,
+            0.01,
+            tolerance=1e-10,
         )
     random = np.random.default_rng(seed)
     names = ["x", "pressure_x_a", "pressure_x_b", *extra]
@@ -61,7 +66,7 @@ def recorded(machine, path, seed, truth=None, offset=0.0, extra=()):
         for name in names
     }
     table = timeseries.Table(units, np.column_stack([run.time, voltage, *values]), {})
-    timeseries.write(path, table)
+    timeseries.write_table(path, table)
     return path
 
 
@@ -109,12 +114,12 @@ def test_channels_count_by_what_is_left_of_them_in_the_end(tmp_path, monkeypatch
     path = recorded(machine, tmp_path / "run.csv", 1, truth)
     monkeypatch.setattr(
         "crane.identification.calibration.calibrate.found_by",
-        lambda search, count: searches.append(search) or found_by(search, count),
+        lambda search, count: searches.append(search) or estimate_with_profiles(search, count),
     )
     near = crane.load(machine.path, changes=truth | {friction: 2400.0})
     found = quiet(crane.calibrate, near, path, [friction], train=(0.0, 3.0))
-    for sensor, noise in zip(found.sensors, (2e-4, 2e4, 2e4), strict=True):
-        left = sensor.rms(sensor.after, True)
+    for sensor, noise in zip(found.channels, (2e-4, 2e4, 2e4), strict=True):
+        left = sensor.rms(sensor.simulated_after, True)
         assert left == pytest.approx(noise, rel=0.15), sensor.name  # of 301 samples
         size = searches[0].sizes[sensor.name]
         assert size == pytest.approx(max(left, sensor.noise), rel=0.05), sensor.name
@@ -124,10 +129,10 @@ def test_shocks_are_no_noise():
     """A channel that jumps by a hundred times its noise twice a second is no noisier."""
     random, time = np.random.default_rng(0), np.arange(0.0, 20.0, 0.01)
     x = 2e4 * random.normal(size=2000)
-    assert noise_of(x + 2e6 * (np.floor(2 * time) % 2)) == pytest.approx(2e4, rel=0.15)
+    assert noise_std(x + 2e6 * (np.floor(2 * time) % 2)) == pytest.approx(2e4, rel=0.15)
     few = np.zeros(2000)  # a sensor whose readings change by one digit now and then
     few[::50] = 1.0
-    assert noise_of(few) == pytest.approx(np.std(few), rel=0.05)
+    assert noise_std(few) == pytest.approx(np.std(few), rel=0.05)
 
 
 def test_what_is_fitted_can_be_loaded(fitted):
@@ -137,7 +142,7 @@ def test_what_is_fitted_can_be_loaded(fitted):
     _, comparison = quiet(crane.replay, again, path, 0.01)
     by_name = {channel.name: channel for channel in comparison.channels}
     assert by_name["pressure_x_a"].rms < 4e4
-    assert found.machine.changes == again.changes
+    assert found.machine.changes == again.parameter_changes
 
 
 @pytest.mark.long
@@ -148,16 +153,16 @@ def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
     found = quiet(crane.calibrate, machine, path, {"auto": None, "load_x.mass": None},
                   train=(0.0, 4.0))  # fmt: skip
     truth = TRUTH | {"sensor.x.zero": 4e-3}
-    told = {one.name: one for one in found.fitted}
+    told = {one.name: one for one in found.parameters}
     assert set(TRUTH) <= set(told)
     for name, one in told.items():
-        true = truth.get(name, one.before)
-        assert abs(one.value - true) < 2.0 * one.interval + 1e-9, one
+        true = truth.get(name, one.initial_value)
+        assert abs(one.value - true) < 2.0 * one.interval_half_width + 1e-9, one
     assert not found.machine.hydraulics.cylinders["x"].stiffness
-    assert found.left and not set(found.left) & {*told, *truth}
-    assert found.left[0] in found.to_text() and not found.worse
-    for sensor, noise in zip(found.sensors, (2e-4, 2e4, 2e4), strict=True):
-        assert sensor.rms(sensor.after, False) < 1.2 * noise, sensor.name
+    assert found.unobserved_parameters and not set(found.unobserved_parameters) & {*told, *truth}
+    assert found.unobserved_parameters[0] in found.to_text() and not found.degraded_channels
+    for sensor, noise in zip(found.channels, (2e-4, 2e4, 2e4), strict=True):
+        assert sensor.rms(sensor.simulated_after, False) < 1.2 * noise, sensor.name
 
 
 def test_what_is_chosen_takes_no_start(fitted):
@@ -173,7 +178,9 @@ def test_intervals_hold_the_truth(tmp_path):
     for seed in range(20):
         path = recorded(machine, tmp_path / f"run{seed}.csv", 500 + seed)
         found = quiet(crane.calibrate, machine, path, list(TRUTH))
-        shares.append([abs(x.value - TRUTH[x.name]) / x.interval for x in found.fitted])
+        shares.append(
+            [abs(x.value - TRUTH[x.name]) / x.interval_half_width for x in found.parameters]
+        )
     shares = np.array(shares)
     assert 0.90 <= (shares < 1.0).mean() <= 0.99
     assert (shares < 2.5).all()
@@ -185,10 +192,10 @@ def test_a_common_factor_and_delays(tmp_path):
     path = recorded(machine, tmp_path / "run.csv", 3, truth={
         "cylinder.x.hose_a": 1.5 * 1.9e-4, "cylinder.x.hose_b": 1.5 * 1.9e-4
     })  # fmt: skip
-    table = timeseries.read(path)
+    table = timeseries.read_table(path)
     late = table.values.copy()
     late[:, 2] = np.interp(late[:, 0] - 0.03, late[:, 0], late[:, 2])
-    timeseries.write(path, timeseries.Table(table.units, late, {}))
+    timeseries.write_table(path, timeseries.Table(table.units, late, {}))
     found = quiet(crane.calibrate, machine, path, ["cylinder.x.hose_*", "sensor.x.delay"])
     values = found.values
     assert values["cylinder.x.hose_*"] == pytest.approx(1.5, abs=0.1)
@@ -208,7 +215,9 @@ def test_what_the_recording_cannot_say_is_said(tmp_path):
         {"load_x.mass": None, "cylinder.x.area_a": None, "cylinder.x.leakage": (1e-16, 0.0, 1e-9)},
         train=(0.0, 0.55),
     )  # fmt: skip
-    pair = {name for name, *_ in found.coupled} | {name for _, name, _ in found.coupled}
+    pair = {name for name, *_ in found.correlated_pairs} | {
+        name for _, name, _ in found.correlated_pairs
+    }
     assert {"load_x.mass", "cylinder.x.area_a"} <= pair
     text = found.to_text()
     assert "Told apart badly" in text
@@ -298,10 +307,10 @@ inclination_tilt_boom [deg] = z2_deg
         some = ("payload.mass", "sensor.", "valve.X_lift.c", "valve.X_lift.dead_band")
         fit = {name: start for name, start in fit.items() if name.startswith(some)}
     found = quiet(crane.calibrate, machine, LIFTING, fit, columns=columns, train=(0.0, 10.0))
-    left = {sensor.name: sensor for sensor in found.sensors}
+    left = {sensor.name: sensor for sensor in found.channels}
     for name in ("X_lift", "pressure_X_lift_b", "pressure_X_tilt_a", "inclination_tilt_boom"):
-        assert left[name].rms(left[name].after, False) < 0.6 * left[name].rms(
-            left[name].before, False
+        assert left[name].rms(left[name].simulated_after, False) < 0.6 * left[name].rms(
+            left[name].simulated_before, False
         ), name
     if not whole:
         return
@@ -313,10 +322,12 @@ inclination_tilt_boom [deg] = z2_deg
         ("pressure_X_tilt_b", 0.3e5, 0.6e5), ("inclination_tilt_boom", 6e-3, 8e-3),
     ):  # fmt: skip
         sensor = left[name]
-        assert sensor.rms(sensor.after, True) < fitted, name
-        assert sensor.rms(sensor.after, False) < held_out, name
+        assert sensor.rms(sensor.simulated_after, True) < fitted, name
+        assert sensor.rms(sensor.simulated_after, False) < held_out, name
         if name != "pressure_X_lift_a":
-            assert sensor.rms(sensor.after, False) < sensor.rms(sensor.before, False), name
+            assert sensor.rms(sensor.simulated_after, False) < sensor.rms(
+                sensor.simulated_before, False
+            ), name
     ringing = left["pressure_X_lift_a"]
     some = (ringing.time > 3.0) & (ringing.time < 9.0)
 
@@ -324,7 +335,7 @@ inclination_tilt_boom [deg] = z2_deg
         return np.fft.rfft((x - np.polyval(np.polyfit(ringing.time[some], x[some], 2),
                                            ringing.time))[some])  # fmt: skip
 
-    measured, simulated = swings(ringing.measured), swings(ringing.after)
+    measured, simulated = swings(ringing.measured), swings(ringing.simulated_after)
     peak = int(np.abs(measured).argmax())
     assert abs(int(np.abs(simulated).argmax()) - peak) <= 1
     near = slice(peak - 3, peak + 4)
@@ -334,10 +345,10 @@ inclination_tilt_boom [deg] = z2_deg
 
 def test_numbers_keep_their_sign():
     """A piston that drives its joint backwards has a negative area."""
-    spec = Variants(crane.load("kr300")).spec
+    spec = MachineVariants(crane.load("kr300")).spec
     numbers = parameters(spec)
     names = ["gas_spring.stroke.area", "gas_spring.stroke.pressure", "link2_anchor.x"]
-    area, pressure, pin = unknowns_of(names, spec, numbers, {})
+    area, pressure, pin = build_unknowns(names, spec, numbers, {})
     assert area.start < area.high < 0 and area.low == -np.inf
     assert 0 < pressure.low < pressure.start and pressure.high == np.inf
     assert (pin.low, pin.high) == (-np.inf, np.inf)
@@ -351,12 +362,16 @@ def test_recordings_that_are_held_out_whole_and_several_that_are_fitted(tmp_path
     found = quiet(
         crane.calibrate, machine, paths[:2], list(TRUTH), validation=paths[2:], train=(0.0, 3.0)
     )
-    for one in found.fitted:
-        assert abs(one.value - TRUTH[one.name]) < 2.0 * one.interval, one
-    kept = [sensor for sensor in found.sensors if sensor.recording == "run2.csv"]
-    assert len(kept) == 3 and not any(sensor.train.any() for sensor in kept)
+    for one in found.parameters:
+        assert abs(one.value - TRUTH[one.name]) < 2.0 * one.interval_half_width, one
+    kept = [sensor for sensor in found.channels if sensor.recording == "run2.csv"]
+    assert len(kept) == 3 and not any(sensor.train_mask.any() for sensor in kept)
     for sensor, noise in zip(kept, (2e-4, 2e4, 2e4), strict=True):
-        assert sensor.rms(sensor.after, False) < 1.2 * noise < sensor.rms(sensor.before, False)
+        assert (
+            sensor.rms(sensor.simulated_after, False)
+            < 1.2 * noise
+            < sensor.rms(sensor.simulated_before, False)
+        )
     assert "run2.csv: pressure_x_a" in found.to_text()
 
 
@@ -410,20 +425,23 @@ def test_the_page_says_what_was_found(fitted, tmp_path):
 def test_what_is_left_tells_what_is_missing(fitted):
     """Nothing of the fitted one; of one whose pressure is 1 bar off, whichever way it goes."""
     machine, _, found = fitted
-    by_name = {one.name: one for one in left_over(found)}
+    by_name = {one.name: one for one in residual_dependences(found)}
     assert list(by_name) == ["x", "pressure_x_a", "pressure_x_b"]
-    assert all(max(one.shares.values()) < 0.1 for one in by_name.values())
+    assert all(max(one.correlation_ratios.values()) < 0.1 for one in by_name.values())
     one = by_name["pressure_x_b"]
-    assert (one.drive, one.chamber, one.rate, one.unit) == ("x", "b", "m/s", "Pa")
+    assert (one.drive, one.chamber, one.speed_unit, one.unit) == ("x", "b", "m/s", "Pa")
     assert len(one.residual) == 401 == len(one.motion["speed"])
     x = found.sensors[0]
     rate = np.gradient(x.after, x.time)[x.train]
     assert np.std(rate - one.motion["speed"]) < 0.05 * np.std(rate)
     side = np.sign(np.round(found.states["run.csv"]["x_velocity"], 3))
     off = [replace(x, after=x.after + 1e5 * side * (x.unit == "Pa")) for x in found.sensors]
-    worse = {one.name: one for one in left_over(replace(found, sensors=tuple(off)))}
-    shares = worse["pressure_x_a"].shares
-    assert shares["direction"] > 0.9 > shares["pressure"] and max(worse["x"].shares.values()) < 0.1
+    worse = {one.name: one for one in residual_dependences(replace(found, sensors=tuple(off)))}
+    shares = worse["pressure_x_a"].correlation_ratios
+    assert (
+        shares["direction"] > 0.9 > shares["pressure"]
+        and max(worse["x"].correlation_ratios.values()) < 0.1
+    )
 
 
 @pytest.mark.slow
@@ -432,17 +450,17 @@ def test_a_search_that_ended_in_the_wrong_minimum_goes_on(tmp_path):
     machine = simple(tmp_path)
     truth = {"valve.x.bandwidth": 250.0, "load_x.mass": 2050.0}
     path = recorded(machine, tmp_path / "run.csv", 2, truth)
-    table, random = timeseries.read(path), np.random.default_rng(9002)
+    table, random = timeseries.read_table(path), np.random.default_rng(9002)
     noisy = table.values.copy()
     for k, size in ((2, 2e-4), (3, 2e4), (4, 2e4)):
         noisy[:, k] += 8.0 * size * random.normal(size=len(noisy))
-    timeseries.write(path, timeseries.Table(table.units, noisy, {}))
+    timeseries.write_table(path, timeseries.Table(table.units, noisy, {}))
     fit = {"valve.x.bandwidth": (60.0, 5.0, 3000.0), "load_x.mass": None, "valve.x.neutral": None}
     found = quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0))
-    for one in found.fitted:
+    for one in found.parameters:
         wanted = truth.get(one.name, 5.8)
-        assert abs(one.value - wanted) < 1.5 * one.interval, one
-    assert found.lowest and found.values["valve.x.bandwidth"] > 200
+        assert abs(one.value - wanted) < 1.5 * one.interval_half_width, one
+    assert found.is_lowest_minimum and found.values["valve.x.bandwidth"] > 200
 
 
 @pytest.mark.slow
@@ -461,7 +479,11 @@ def test_one_orifice_of_a_compensated_valve_is_written(fitted, tmp_path):
 def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     """Of a raw log, with its columns; what is fitted is what was put on, a pressure of 3 bar."""
     machine, path, _ = fitted
-    table, log, columns = timeseries.read(path), tmp_path / "log.csv", tmp_path / "columns.txt"
+    table, log, columns = (
+        timeseries.read_table(path),
+        tmp_path / "log.csv",
+        tmp_path / "columns.txt",
+    )
     x = dict(zip(table.units, table.values.T, strict=True))
     raw = {
         "t_ms": 1e3 * x["time"], "U": x["voltage_x"], "s_mm": 1e3 * x["x"] + 3,
@@ -490,7 +512,9 @@ def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     np.testing.assert_allclose(by_name[name].measured, wanted, rtol=1e-12)
     assert by_name[name].rms < 5e4  # its noise is 2e4
     # from there on the search begins, and ends where it began
-    (second,) = quiet(crane.calibrate, again, log, fit, train=(0.5, 3.0), span=(0.5, 4.0)).fitted
+    (second,) = quiet(
+        crane.calibrate, again, log, fit, train=(0.5, 3.0), span=(0.5, 4.0)
+    ).parameters
     assert second.start == zero.value and abs(second.value - zero.value) < 0.1 * zero.interval
 
 
@@ -513,7 +537,7 @@ def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
     numbers = TRUTH | {f"sensor.pressure_x_{side}.noise": 1e8 for side in "ab"}
     wide, narrow = (
         quiet(crane.calibrate, crane.load(machine.path, changes=x), path, ["load_x.mass"],
-              train=(0.0, 2.0), span=(0.0, 2.0)).fitted[0].interval
+              train=(0.0, 2.0), span=(0.0, 2.0)).parameters[0].interval_half_width
         for x in (numbers, TRUTH)
     )  # fmt: skip
     assert wide > 5 * narrow
@@ -530,10 +554,13 @@ def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
     machine = crane.load(machine.path, changes=known)
     path = recorded(machine, tmp_path / "air.csv", 0, TRUTH | {air: gas})
     found = quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0))
-    missing = {one.name: one for one in found.lacking}
+    missing = {one.name: one for one in found.score_tests}
     # so does a hose that is wider
-    assert found.lacking[0].share > 0.2 and missing[air].share > 0.8 * found.lacking[0].share
+    assert (
+        found.score_tests[0].cost_reduction > 0.2
+        and missing[air].cost_reduction > 0.8 * found.score_tests[0].cost_reduction
+    )
     assert missing[air].value == pytest.approx(gas, rel=0.5)
     assert f"{air} at about" in found.to_text()
     path = recorded(machine, tmp_path / "none.csv", 0)
-    assert not quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0)).lacking
+    assert not quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0)).score_tests

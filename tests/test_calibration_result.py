@@ -3,28 +3,33 @@
 import numpy as np
 import pytest
 
-from crane.identification.calibration.dependence import groups, share
-from crane.identification.calibration.ends import Ends, Found, found_by, try_ends
-from crane.identification.calibration.result import Fitted
-from crane.identification.calibration.together import together
+from crane.identification.calibration.calibration_result import FittedParameter
+from crane.identification.calibration.correlated_parameters import correlated_directions
+from crane.identification.calibration.profile_likelihood import (
+    CalibrationEstimate,
+    ProfileEnds,
+    estimate_with_profiles,
+    evaluate_profile_ends,
+)
+from crane.identification.calibration.residual_dependence import correlation_ratio, group_samples
 
 
 class Fake:
     """A search whose residuals are a function, at minima that are given by their starts."""
 
     def __init__(self, left, minima, low=-np.inf, high=np.inf, prior=(0.0, 0.0)):
-        self.left, self._minima = left, minima
+        self.weighted_residuals, self._minima = left, minima
         self.low, self.high = (np.broadcast_to(x, 2).astype(float) for x in (low, high))
         self.prior, self.starts = np.array(prior), []
 
     def run(self):
-        return self.onward(None)
+        return self.nearest_minimum(None)
 
-    def onward(self, start):
+    def nearest_minimum(self, start):
         self.starts.append(start)
         z = np.array(self._minima(start), dtype=float)
-        columns = [self.left(z + 1e-20j * e).imag / 1e-20 for e in np.eye(2)]
-        self.jacobian, self.residual = np.array(columns).T, self.left(z)
+        columns = [self.weighted_residuals(z + 1e-20j * e).imag / 1e-20 for e in np.eye(2)]
+        self.jacobian, self.residual = np.array(columns).T, self.weighted_residuals(z)
         return z
 
     def covariance(self, z):
@@ -41,7 +46,7 @@ def test_ends_of_a_quadratic_are_as_derivatives_say():
     search = Fake(lambda z: A @ z - NOISE, lambda _: best)
     z = search.run()
     for widths in ([0.1, 0.2], [7.0, 9.0]):
-        ends, lower = try_ends(search, z, np.array(widths))
+        ends, lower = evaluate_profile_ends(search, z, np.array(widths))
         np.testing.assert_allclose(ends, 1.0, rtol=1e-9)
         assert lower is None
         assert not any(one.remark for one in ends)
@@ -51,11 +56,11 @@ def test_the_other_numbers_keep_their_bounds():
     """What is held by its bound leaves the first number alone: the cost rises faster."""
     best = np.linalg.lstsq(A, NOISE, rcond=None)[0]
     search = Fake(lambda z: A @ z - NOISE, lambda _: best, low=(-np.inf, best[1]))
-    (ends, other), _ = try_ends(search, search.run(), np.array([0.1, 0.2]))
+    (ends, other), _ = evaluate_profile_ends(search, search.run(), np.array([0.1, 0.2]))
     H = A.T @ A
     alone = np.sqrt(H[0, 0] * np.linalg.inv(H)[0, 0])
-    assert ends.low == pytest.approx(alone) == ends.high and alone > 1.5
-    assert np.isnan(other.low) and other.high > 0
+    assert ends.lower_rise == pytest.approx(alone) == ends.upper_rise and alone > 1.5
+    assert np.isnan(other.lower_rise) and other.upper_rise > 0
 
 
 def test_an_interval_that_reaches_farther_is_told():
@@ -65,14 +70,14 @@ def test_an_interval_that_reaches_farther_is_told():
         return np.concatenate([10.0 / (1.0 + z[:1]) - 10.0, z[1:]]) * np.ones(2)
 
     search = Fake(left, lambda _: (0.0, 0.0))
-    (ends, other), lower = try_ends(search, search.run(), np.array([0.8, 0.1]))
-    assert ends.high == pytest.approx(1 / 1.8) and ends.low == pytest.approx(1 / 0.2)
+    (ends, other), lower = evaluate_profile_ends(search, search.run(), np.array([0.8, 0.1]))
+    assert ends.upper_rise == pytest.approx(1 / 1.8) and ends.lower_rise == pytest.approx(1 / 0.2)
     assert ends.remark == "reaches farther up" and lower is None
     assert other == pytest.approx((1.0, 1.0))
-    one = Fitted("a", 1.0, 1.0, 0.8, False, True, ends=ends)
+    one = FittedParameter("a", 1.0, 1.0, 0.8, False, True, profile_ends=ends)
     assert one.remark == "not told by the recordings, reaches farther up"
-    assert Ends().remark == "" and Ends(0.9, 2.0).remark == ""
-    assert Ends(1.0, 4.0).remark == "derivatives do not hold over its interval"
+    assert ProfileEnds().remark == "" and ProfileEnds(0.9, 2.0).remark == ""
+    assert ProfileEnds(1.0, 4.0).remark == "derivatives do not hold over its interval"
 
 
 def test_the_search_goes_on_where_the_cost_is_lower():
@@ -85,8 +90,8 @@ def test_the_search_goes_on_where_the_cost_is_lower():
         return (0.0 if start is None else start[0], -4.0)
 
     search = Fake(left, minima)
-    found = found_by(search, 2)
-    assert isinstance(found, Found) and len(search.starts) > 1
+    found = estimate_with_profiles(search, 2)
+    assert isinstance(found, CalibrationEstimate) and len(search.starts) > 1
     cost = [0.5 * np.sum(left(z) ** 2) for z in (np.array([0.0, -4.0]), found.z)]
     assert cost[1] < 0.5 * cost[0]
     assert np.sum(left(np.array([search.starts[1][0], -4.0])) ** 2) < 2.0 * cost[0]
@@ -96,19 +101,19 @@ def test_numbers_that_go_together():
     """x and 2 x + y are known badly, z well: the direction holds the first two."""
     names, ends = ["mass", "area", "zero"], np.array([230.0, 9e-4, 0.1])
     R = np.array([[1.0, -0.99, 0.1], [-0.99, 1.0, 0.0], [0.1, 0.0, 1.0]])
-    (direction,) = together(names, R, ends)
+    (direction,) = correlated_directions(names, R, ends)
     assert list(direction) == ["mass", "area"]
     assert direction["mass"] == pytest.approx(230.0, rel=0.02)
     assert direction["area"] == pytest.approx(-9e-4, rel=0.02)
-    assert together(names, np.eye(3), ends) == []
-    assert together(names[:1], np.eye(1), ends[:1]) == []
+    assert correlated_directions(names, np.eye(3), ends) == []
+    assert correlated_directions(names[:1], np.eye(1), ends[:1]) == []
     mild = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    assert together(names, mild, ends) == []
+    assert correlated_directions(names, mild, ends) == []
     # three of which two tell the third, no pair of which is close: R = I in two dimensions
     s = np.sqrt(0.5)
     R = np.array([[1.0, 0.0, s], [0.0, 1.0, s], [s, s, 1.0]])
     R += 0.02 * (np.eye(3) - R)
-    (direction,) = together(names, R, ends)
+    (direction,) = correlated_directions(names, R, ends)
     assert set(direction) == set(names) and direction["zero"] == pytest.approx(0.1)
     assert direction["mass"] == pytest.approx(230.0 * s, rel=0.05)
 
@@ -117,21 +122,23 @@ def test_what_is_left_goes_with_what_it_is_made_of():
     random = np.random.default_rng(2)
     speed, noise = random.normal(size=4000), random.normal(size=4000)
     side = np.sign(speed) * (np.abs(speed) > 0.3)
-    assert share(noise, speed) < 0.01 and share(noise, side) < 0.01
-    assert share(side, side) == pytest.approx(1.0)
-    assert share(side + noise, side) == pytest.approx(side.var() / (side.var() + 1), abs=0.03)
-    assert 0.9 < share(2.0 * speed, speed) < 1.0
-    assert share(np.ones(9), np.arange(9.0)) == 0.0
-    assert sorted(np.concatenate(groups(speed)).tolist()) == list(range(4000))
-    assert [len(x) for x in groups(side)] == [(side == x).sum() for x in (-1, 0, 1)]
+    assert correlation_ratio(noise, speed) < 0.01 and correlation_ratio(noise, side) < 0.01
+    assert correlation_ratio(side, side) == pytest.approx(1.0)
+    assert correlation_ratio(side + noise, side) == pytest.approx(
+        side.var() / (side.var() + 1), abs=0.03
+    )
+    assert 0.9 < correlation_ratio(2.0 * speed, speed) < 1.0
+    assert correlation_ratio(np.ones(9), np.arange(9.0)) == 0.0
+    assert sorted(np.concatenate(group_samples(speed)).tolist()) == list(range(4000))
+    assert [len(x) for x in group_samples(side)] == [(side == x).sum() for x in (-1, 0, 1)]
 
 
 def test_comments_of_numbers():
-    one = Fitted("a.b", 1.0, 1.25, 0.03, False, False, "m", (("a.b", 1.1),))
-    assert one.notes == {"a.b": "fitted ±0.03, 95 % (was 1.1)"} and one.moved
-    shared = Fitted("a.*", 1.0, 0.5, 0.6, True, False, "", (("a.b", 1.1), ("a.c", 3.0)))
+    one = FittedParameter("a.b", 1.0, 1.25, 0.03, False, False, "m", (("a.b", 1.1),))
+    assert one.notes == {"a.b": "fitted ±0.03, 95 % (was 1.1)"} and one.changed_significantly
+    shared = FittedParameter("a.*", 1.0, 0.5, 0.6, True, False, "", (("a.b", 1.1), ("a.c", 3.0)))
     assert shared.notes == {
         "a.b": "fitted by a.* = 0.5 ±0.6, 95 %, on its bound (was 1.1)",
         "a.c": "fitted by a.* = 0.5 ±0.6, 95 %, on its bound (was 3)",
     }
-    assert shared.before == 1.0 and not shared.moved
+    assert shared.initial_value == 1.0 and not shared.changed_significantly

@@ -6,11 +6,11 @@ from free_bodies import balance, moment, places
 from scipy.optimize import root
 
 import crane
-from crane.dynamics.statics import Statics
-from crane.formats.loading import Variants
-from crane.ratings.cones import largest
-from crane.ratings.moments import torques
-from crane.ratings.places import Places
+from crane.dynamics.statics import StaticsEvaluator
+from crane.formats.machine_loading import MachineVariants
+from crane.ratings.configuration_search import ConfigurationSearch
+from crane.ratings.conic_limits import largest_feasible_magnitude
+from crane.ratings.lifting_torques import torques
 
 G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
@@ -58,14 +58,14 @@ def by_hand(machine, chart, q):
 def test_every_cell_is_what_statics_by_hand_give(excavator):
     """At the bucket's pin, by ISO 10567, over the front and over the side."""
     chart = crane.capacity(excavator, "bucket", rule="iso10567")
-    assert chart.raising == ("X_boom",) and len(chart.slews) == 2
+    assert chart.raising_joints == ("X_boom",) and len(chart.slews) == 2
     for cell in cells(chart, 40):
         s, b, a = cell
         found = by_hand(excavator, chart, excavator.closure.solve(chart.q_a[s, b, a]))
-        for k, cause in enumerate(chart.causes):
-            load = found.get(cause.what, np.inf)
+        for k, cause in enumerate(chart.limiting_factors):
+            load = found.get(cause.element, np.inf)
             if load < 1e9:  # what has no lever but that of rounding has no load
-                assert chart.each[s, b, a, k] == pytest.approx(load, rel=1e-9)
+                assert chart.values_by_factor[s, b, a, k] == pytest.approx(load, rel=1e-9)
         assert chart.loads[s, b, a] == pytest.approx(min(found.values()), rel=1e-9)
         tip = crane.Kinematics(excavator, "bucket").position(chart.q_a[s, b, a])
         away = [np.hypot(tip[0], tip[1]), tip[2]]
@@ -75,17 +75,21 @@ def test_every_cell_is_what_statics_by_hand_give(excavator):
 @pytest.mark.slow
 def test_every_cause_is_reached(excavator):
     chart = crane.capacity(excavator, slews=[0.0, np.pi / 2, np.pi], rule="iso10567", step=1.0)
-    ends = {str(chart.causes[k]) for k in chart.ends}
+    ends = {str(chart.limiting_factors[k]) for k in chart.active_factors}
     assert {"X_boom: working pressure", "X_arm: holding pressure"} <= ends
     assert {"tips over track_front_right to track_front_left",
             "tips over track_front_left to track_rear_left",
             "tips over track_rear_left to track_rear_right"} <= ends  # fmt: skip
     held = crane.capacity(excavator, raising=["X_boom", "X_arm"], step=1.0)
-    assert "X_bucket: holding pressure" in {str(held.causes[k]) for k in held.ends}
+    assert "X_bucket: holding pressure" in {
+        str(held.limiting_factors[k]) for k in held.active_factors
+    }
     slope = crane.capacity(
         crane.load("patu655", changes={"supply.pressure": 1.9e7}), slope=np.deg2rad(35), step=1.0
     )
-    assert "slew: working pressure" in {str(slope.causes[k]) for k in slope.ends}
+    assert "slew: working pressure" in {
+        str(slope.limiting_factors[k]) for k in slope.active_factors
+    }
 
 
 @pytest.mark.slow
@@ -111,9 +115,9 @@ def test_a_slope_is_the_worst_of_all_sides(excavator):
                     continue
                 end = strength(excavator, chart, joint, slope)
                 least = min(least, 0.87 * max((end - rest) / slope, 0.0))
-            for cause in chart.causes:
-                if cause.why == "tips":
-                    one, two = (at[name][:3, 3] for name in cause.what.split(" to "))
+            for cause in chart.limiting_factors:
+                if cause.reason == "tips":
+                    one, two = (at[name][:3, 3] for name in cause.element.split(" to "))
                     held = moment(excavator, q, g, 0.0, "bucket", one, two)
                     slope = moment(excavator, q, g, 1.0, "bucket", one, two) - held
                     if slope > 0:
@@ -166,14 +170,14 @@ def test_of_many_postures_it_is_the_one_that_carries_most(name, free):
 def test_friction_and_pressure_count(excavator):
     at = {"radii": [6.0], "heights": [1.5], "frame": "bucket", "raising": ["X_boom"]}
     free, rubbed = (crane.capacity(excavator, friction=x, **at) for x in (False, True))
-    k = [str(cause) for cause in free.causes].index("X_boom: working pressure")
+    k = [str(cause) for cause in free.limiting_factors].index("X_boom: working pressure")
     q = excavator.closure.solve(free.q_a[0, 0, 0])
     (none, _), (some, _) = (balance(excavator, q, G, m, "bucket") for m in (0.0, 1.0))
     slope = some["X_boom"] - none["X_boom"]
-    lost = free.each[0, 0, 0, k] - rubbed.each[0, 0, 0, k]
+    lost = free.values_by_factor[0, 0, 0, k] - rubbed.values_by_factor[0, 0, 0, k]
     assert lost == pytest.approx(20000.0 / slope, rel=1e-8)  # Coulomb and stiction of the file
     half = crane.capacity(crane.load("excavator", changes={"supply.pressure": PUMP / 2}), **at)
-    less = free.each[0, 0, 0, k] - half.each[0, 0, 0, k]
+    less = free.values_by_factor[0, 0, 0, k] - half.values_by_factor[0, 0, 0, k]
     assert less == pytest.approx(PUMP / 2 * 2.2619467e-2 / slope, rel=1e-9)
 
 
@@ -182,7 +186,7 @@ def test_cones_end_where_they_say():
     random = np.random.default_rng(0)
     a, b = -random.uniform(0.1, 3, 3000), random.normal(size=3000)
     c, d = 0.4 * random.normal(size=(3000, 3)), random.normal(size=(3000, 3))
-    x = largest(a, b, c, d)
+    x = largest_feasible_magnitude(a, b, c, d)
 
     def value(x):
         return a + b * x + np.linalg.norm(c + d * x[:, None], axis=1)
@@ -232,9 +236,12 @@ def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):
     """Every place once more with each number a little larger and smaller."""
     machine = crane.load(name)
     chart = crane.capacity(machine, frame, step=1.0, **given)
-    slopes = chart.slopes(numbers)
+    slopes = chart.derivatives(numbers)
     assert slopes.shape == (*chart.loads.shape, len(numbers))
-    beside, at = Variants(machine), {**given, "radii": chart.radii, "heights": chart.heights}
+    beside, at = (
+        MachineVariants(machine),
+        {**given, "radii": chart.radii, "heights": chart.heights},
+    )
     for k, number in enumerate(numbers):
         value = beside.values[number]
         step = 1e-4 * (value or 0.1)
@@ -244,7 +251,11 @@ def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):
         )
         with np.errstate(invalid="ignore"):
             difference = (more.loads - less.loads) / (2 * step)
-        same = (more.cause == chart.cause) & (less.cause == chart.cause) & (chart.cause >= 0)
+        same = (
+            (more.limiting_factor_index == chart.limiting_factor_index)
+            & (less.limiting_factor_index == chart.limiting_factor_index)
+            & (chart.limiting_factor_index >= 0)
+        )
         same &= (less.loads > 0) & np.isfinite(difference)
         assert same.sum() > 25 and np.abs(difference[same]).max() > 0
         gap = np.abs(difference - slopes[..., k])[same] / np.abs(difference[same]).max()
@@ -255,7 +266,7 @@ def test_slopes_do_not_turn_with_the_crane():
     """Loads that nothing but drives end are the same to all sides, across the home plane too."""
     machine, slews = crane.load("patu655"), [0.0, 1.0, np.pi / 2, -np.pi / 2, 3.0]
     chart = crane.capacity(machine, slews=slews, step=1.0)
-    slopes = chart.slopes(["lift_boom.mass", "lift_eye.x", "supply.pressure"])
+    slopes = chart.derivatives(["lift_boom.mass", "lift_eye.x", "supply.pressure"])
     there = np.isfinite(slopes[0]).all(axis=-1)
     assert there.sum() > 10 and (np.abs(slopes[0, there]) > 0).any(axis=0).all()
     size = np.abs(slopes[0, there]).max(axis=0)
@@ -265,20 +276,20 @@ def test_slopes_do_not_turn_with_the_crane():
 def test_slopes_refuse_what_moves_the_supports(excavator):
     chart = crane.capacity(excavator, "bucket", radii=[6.0], heights=[1.0])
     with pytest.raises(crane.CraneError, match="moves the supports"):
-        chart.slopes(["track_front_left.x"])
+        chart.derivatives(["track_front_left.x"])
     with pytest.raises(crane.CraneError, match="boom_eye"):
-        chart.slopes(["boom_ey.x"])
+        chart.derivatives(["boom_ey.x"])
 
 
 def test_lifting_torque_is_force_times_lever():
     """The lever by the places of three pins; net at 4 m no less than what a chart has there."""
     machine = crane.load("patu655", changes={"supply.pressure": 1.9e7})
     found = torques(machine)
-    assert (found.raising, found.pivot) == ("X_lift", "q2")
+    assert (found.raising_joint, found.pivot_joint) == ("X_lift", "q2")
     q_a = machine.home[machine.closure.active].copy()
     i = machine.active.index("X_lift")
     levers = []
-    for stroke in (*np.linspace(0.01, 0.52, 30), found.stroke):
+    for stroke in (*np.linspace(0.01, 0.52, 30), found.gross_stroke):
         q_a[i] = stroke
         at = places(machine, machine.closure.solve(q_a))
         pivot, base, eye = (at[x][:3, 3] for x in ("lift_boom", "lift_barrel", "lift_eye"))
@@ -287,13 +298,13 @@ def test_lifting_torque_is_force_times_lever():
         )
     cylinder, tank = machine.hydraulics.cylinders["X_lift"], 1.0e5
     force = 1.9e7 * cylinder.area_a - tank * cylinder.area_b
-    assert found.gross == pytest.approx(force * levers[-1], rel=1e-9)
+    assert found.gross_torque == pytest.approx(force * levers[-1], rel=1e-9)
     assert max(levers) == pytest.approx(levers[-1], rel=1e-12)
     chart = crane.capacity(machine, radii=[4.0], heights=np.linspace(-2, 6, 33))
     assert np.nanmax(chart.loads) <= found.load * (1 + 1e-9)
     assert np.nanmax(chart.loads) == pytest.approx(found.load, rel=0.01)
-    assert found.net == pytest.approx(found.load * 9.81 * 4.0)
-    assert found.slewing == pytest.approx((1.9e7 - tank) * 1.4137e-3)
+    assert found.net_torque == pytest.approx(found.load * 9.81 * 4.0)
+    assert found.slewing_torque == pytest.approx((1.9e7 - tank) * 1.4137e-3)
 
 
 def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
@@ -303,7 +314,7 @@ def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
         excavator, rule=crane.Rule("own", "", tipping=1 / 1.1), slope=np.deg2rad(5), **at
     )
     assert by_rule.loads[0, 0, 0] == by_hand.loads[0, 0, 0]
-    assert by_rule.causes[by_rule.cause[0, 0, 0]].why == "tips"
+    assert by_rule.limiting_factors[by_rule.limiting_factor_index[0, 0, 0]].why == "tips"
 
 
 def test_what_moves_straight_up_ends_on_a_slope_too(tmp_path):
@@ -346,11 +357,13 @@ def test_no_narrow_peak_is_missed(excavator):
     chart = crane.capacity(excavator, step=0.5, slews=[0.0])
     for place, strokes in NARROW.items():
         start = excavator.closure.solve(np.r_[0.0, strokes])[None]
-        q, _, there = chart.places.moved(start, np.array([place]), chart.places.pair)
+        q, _, there = chart.places.move_to_targets(
+            start, np.array([place]), chart.places.position_strokes
+        )
         assert there.all()
         load = min(by_hand(excavator, chart, q[0]).values())
         a, b = np.abs(chart.radii - place[0]).argmin(), np.abs(chart.heights - place[1]).argmin()
-        alone = chart.at_places([place[0]], [place[1]]).loads[0, 0, 0]
+        alone = chart.at_positions([place[0]], [place[1]]).loads[0, 0, 0]
         assert load <= chart.loads[0, b, a] * (1 + 1e-9) and load <= alone * (1 + 1e-9)
         assert load >= 0.995 * chart.loads[0, b, a]  # the same peak
 
@@ -360,11 +373,15 @@ def test_causes_that_end_a_load_together_are_all_told(excavator):
     chart = crane.capacity(excavator, step=0.5, slews=[0.0])
     reached = np.isfinite(chart.loads)
     with np.errstate(invalid="ignore"):
-        gaps = np.sort(np.nan_to_num(chart.each / chart.loads[..., None] - 1, nan=np.inf))[..., 1]
+        gaps = np.sort(
+            np.nan_to_num(chart.values_by_factor / chart.loads[..., None] - 1, nan=np.inf)
+        )[..., 1]
     both = chart.together.sum(axis=-1) > 1
     assert both.sum() > 150 and np.array_equal(both[reached], gaps[reached] < 1e-6)
     assert not np.any((gaps[reached] > 1e-6) & (gaps[reached] < 1e-5))  # nothing in between
-    assert np.array_equal(chart.cause[reached], chart.together[reached].argmax(axis=-1))
+    assert np.array_equal(
+        chart.limiting_factor_index[reached], chart.together[reached].argmax(axis=-1)
+    )
 
 
 @pytest.mark.parametrize(
@@ -390,16 +407,16 @@ def test_a_column_behind_the_axis_has_a_table():
 def test_places_at_folds_are_found():
     """Of a robot whose elbow goes through straight: each posture is among those of its place."""
     machine = crane.load("kr300", lock={"q4": 0.0, "q5": 0.0, "q6": 0.0})
-    places_ = Places(Statics(machine))
+    places_ = ConfigurationSearch(StaticsEvaluator(machine))
     random, closure = np.random.default_rng(0), machine.closure
     drawn = np.tile(closure.home[closure.active], (300, 1))
-    for i in places_.pair:
+    for i in places_.position_strokes:
         drawn[:, i] = random.uniform(places_.low[i], places_.high[i], 300)
     q = closure.solve(drawn)
-    where = places_.section.coordinates(places_.statics.at(q).tip)
+    where = places_.section.coordinates(places_.statics.evaluate(q).tip_positions)
     lost = 0
     for k in range(300):
-        found = places_.all((where[k, :1], where[k, 1:]))
+        found = places_.find_all((where[k, :1], where[k, 1:]))
         gaps = np.abs(found.q[:, closure.active] - drawn[k]).max(axis=1)
         lost += not len(gaps) or gaps.min() > 1e-6
     assert lost <= 3

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from test_capacity import G, cells
 
 import crane
-from crane.description.number_units import number_unit
+from crane.description.parameter_units import parameter_unit
 
 PINS = {"boom": 260e3, "boom_eye": 250e3, "X_arm": 30e3}
 
@@ -70,8 +70,8 @@ def test_pin_forces_and_margins_are_those_of_statics_by_hand(excavator, chart):
         for name, pin in pins.items():
             assert forces[name][cell] == pytest.approx(np.linalg.norm(pin[:3]), abs=1e-9 * most)
         for joint, column in loads.columns.items():
-            load = column.load(q[excavator.column(joint)])
-            pressed = column.pushes * drives[joint]
+            load = column.buckling_load(q[excavator.column(joint)])
+            pressed = column.compression_sign * drives[joint]
             margin = load / pressed if pressed > 0 else np.inf
             assert margins[joint][cell] == pytest.approx(float(margin), rel=1e-9)
     none = np.isnan(chart.loads)
@@ -98,8 +98,8 @@ def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
         way = [np.sin(slope) * np.cos(side), np.sin(slope) * np.sin(side), -np.cos(slope)]
         drives, _ = balance(bare, q, 9.81 * np.array(way), chart.loads[cell], "bucket")
         for joint, column in columns.items():
-            if (pressed := column.pushes * drives[joint]) > 0:
-                load = float(column.load(q[bare.column(joint)]))
+            if (pressed := column.compression_sign * drives[joint]) > 0:
+                load = float(column.buckling_load(q[bare.column(joint)]))
                 least[joint] = min(least[joint], load / pressed)
     for joint, margin in least.items():
         assert margins[joint][cell] == pytest.approx(margin, rel=1e-4)
@@ -112,29 +112,31 @@ def test_derivatives_are_left_out_where_a_pin_ends_the_load(excavator):
     more = {"pins.boom": 7e5, "pins.boom_eye": 9e5, "pins.X_arm": 9e5}
     machine, bare = crane.load(excavator.path, changes=more), crane.load("excavator")
     chart, without = (crane.capacity(x, "bucket", step=1.0, slews=[0.0]) for x in (machine, bare))
-    slopes, free = (x.slopes(["arm.mass"])[..., 0] for x in (chart, without))
-    pins = np.array([cause.why == "pin force" for cause in chart.causes] + [False])[chart.cause]
-    same = (chart.cause == without.cause) & (without.loads > 0)
+    slopes, free = (x.derivatives(["arm.mass"])[..., 0] for x in (chart, without))
+    pins = np.array([cause.reason == "pin force" for cause in chart.limiting_factors] + [False])[
+        chart.limiting_factor_index
+    ]
+    same = (chart.limiting_factor_index == without.limiting_factor_index) & (without.loads > 0)
     assert pins.sum() > 3 and np.isnan(slopes[pins]).all()
     assert same.sum() > 3 and slopes[same] == pytest.approx(free[same], rel=1e-9)
 
 
 def test_pins_are_read_written_and_changed(excavator, tmp_path):
-    assert dict(excavator.pins) == PINS
+    assert dict(excavator.pin_capacities) == PINS
     written = crane.write_machine(excavator, tmp_path / "written", {"pins.boom": "from a drawing"})
-    assert dict(crane.load(written).pins) == PINS
+    assert dict(crane.load(written).pin_capacities) == PINS
     assert re.search("boom: 260000.0 +# from a drawing", written.read_text())
     more = crane.load(excavator.path, changes={"pins.boom": 5e5})
-    assert dict(more.pins) == PINS | {"boom": 5e5}
-    assert "X_arm" not in crane.load(excavator.path, lock={"X_arm": 0.5}).pins
-    assert not crane.load("excavator").pins
+    assert dict(more.pin_capacities) == PINS | {"boom": 5e5}
+    assert "X_arm" not in crane.load(excavator.path, lock={"X_arm": 0.5}).pin_capacities
+    assert not crane.load("excavator").pin_capacities
 
 
 def test_pins_that_are_not_there_are_named(excavator):
-    odd = dataclasses.replace(excavator, pins={"bom": 1e5})
+    odd = dataclasses.replace(excavator, pin_capacities={"bom": 1e5})
     with pytest.raises(crane.CraneError, match="'bom' is no joint or loop, did you mean 'boom'"):
         crane.capacity(odd, "bucket", radii=[6.0], heights=[1.0])
-    assert number_unit(excavator.tree, "pins.boom") == "N"
+    assert parameter_unit(excavator.tree, "pins.boom") == "N"
 
 
 @pytest.mark.parametrize(

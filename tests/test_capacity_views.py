@@ -17,12 +17,12 @@ from matplotlib.path import Path
 from typed import typed
 
 import crane
-from crane.ratings.tables import load_table
-from crane.ratings.words import sides
-from crane.view.page.capacity import page_data, write_capacity_page
-from crane.view.plots.capacity import _draw_contours, capacity_figure, contours
-from crane.view.plots.capacity_sheet import sheet_figure
-from crane.view.sketch.outline import outline
+from crane.ratings.capacity_report import slew_labels
+from crane.ratings.load_tables import load_table
+from crane.view.page.capacity_page import capacity_page_data, write_capacity_page
+from crane.view.plots.capacity_figure import _draw_contours, capacity_figure, load_contours
+from crane.view.plots.capacity_sheet import capacity_sheet_figure
+from crane.view.sketch.machine_outline import machine_outline
 
 G = np.array([0.0, 0.0, -9.81])
 TANK = 3.0e5
@@ -62,25 +62,25 @@ def test_what_ends_a_load_is_at_its_pressure(excavator, given):
     """Without reserve, one chamber of the cylinder that ends a load has its limit."""
     chart = crane.capacity(excavator, "bucket", raising=["X_boom"], slews=[0.4], step=1.0, **given)
     pressures, seen = chart.pressures(), set()
-    for k in chart.ends:
-        cause = chart.causes[k]
-        if cause.why == "tips":
+    for k in chart.active_factors:
+        cause = chart.limiting_factors[k]
+        if cause.reason == "tips":
             continue
-        here = (chart.cause == k) & (chart.loads > 0)
-        limit = 3.5e7 if cause.what == "X_boom" else 3.7e7
-        highest = pressures[cause.what][here].max(axis=-1)
+        here = (chart.limiting_factor_index == k) & (chart.loads > 0)
+        limit = 3.5e7 if cause.element == "X_boom" else 3.7e7
+        highest = pressures[cause.element][here].max(axis=-1)
         assert highest == pytest.approx(np.full(here.sum(), limit), rel=1e-9)
-        seen.add(cause.what)
+        seen.add(cause.element)
     assert {"X_boom", "X_arm"} <= seen
 
 
 def test_the_table_has_the_cells_of_the_chart(chart):
     table = load_table(chart)
-    assert len(table.radii) >= 5 and len(table.heights) >= 8 and table.tips
+    assert len(table.radii) >= 5 and len(table.heights) >= 8 and table.can_tip
     assert np.diff(table.radii) == pytest.approx(1.5) and np.diff(table.heights) == pytest.approx(
         -1.5
     )
-    rows, starred = table.rows(), 0
+    rows, starred = table.format_rows(), 0
     for height, row in zip(table.heights, rows, strict=True):
         b = int(np.flatnonzero(chart.heights == height)[0])
         cells = [
@@ -93,7 +93,7 @@ def test_the_table_has_the_cells_of_the_chart(chart):
             assert text == ("" if math.isnan(load) else f"{math.floor(load)}{star}")
             starred += bool(star)
     assert 10 < starred < 60
-    for height, row, far in zip(table.heights, rows, table.far, strict=True):
+    for height, row, far in zip(table.heights, rows, table.max_radii, strict=True):
         there = chart.at_places([far, far + 0.02], [height])
         assert np.isfinite(there.loads[:, 0, 0]).all() and np.isnan(there.loads[:, 0, 1]).all()
         assert [int(x.rstrip("*")) for x in row[-3:-1]] == np.floor(there.loads[:, 0, 0]).tolist()
@@ -105,8 +105,8 @@ def test_the_table_has_the_cells_of_the_chart(chart):
 
 def test_where_nothing_tips_nothing_is_marked():
     table = load_table(crane.capacity(crane.load("mini_forwarder"), step=0.02))
-    assert not table.tips and table.drives.any()
-    words = [cell for row in table.rows() for cell in row if cell]
+    assert not table.can_tip and table.limited_by_drives.any()
+    words = [cell for row in table.format_rows() for cell in row if cell]
     assert not any("*" in word for word in words)
     assert max(float(word) for word in words) < 3 and "0.75" in words
 
@@ -114,19 +114,19 @@ def test_where_nothing_tips_nothing_is_marked():
 def test_slew_angles_are_named(excavator):
     at = {"frame": "bucket", "radii": [6.0], "heights": [1.0]}
     turned = crane.capacity(excavator, slews=np.deg2rad([0, 30, 90, 180, -90]), **at)
-    assert sides(turned) == ["front", "30°", "90°", "rear", "-90°"]
-    assert sides(crane.capacity(excavator, slews=[0.0], **at)) == [""]
+    assert slew_labels(turned) == ["front", "30°", "90°", "rear", "-90°"]
+    assert slew_labels(crane.capacity(excavator, slews=[0.0], **at)) == [""]
 
 
 def test_outlines_put_the_frame_where_the_load_hangs(excavator, chart):
     """At every slew angle; feet are as far apart as the tracks are long, or wide."""
     for s, b, a in some(chart, 20):
         q = excavator.closure.solve(chart.q_a[s, b, a])
-        seen = outline(excavator, "bucket", chart.section, q)
+        seen = machine_outline(excavator, "bucket", chart.section, q)
         corners = np.concatenate(seen.bodies)
         place = [chart.radii[a], chart.heights[b]]
         assert np.linalg.norm(corners - place, axis=1).min() < 1e-9
-        assert np.ptp(seen.standing[:, 0]) == pytest.approx([3.65, 2.38][s], abs=1e-9)
+        assert np.ptp(seen.stationary_hull[:, 0]) == pytest.approx([3.65, 2.38][s], abs=1e-9)
         for start, mouth, end in seen.cylinders:
             along, out = mouth - start, end - start
             assert abs(along[0] * out[1] - along[1] * out[0]) < 1e-9
@@ -138,9 +138,9 @@ def test_pictures_name_all_causes(chart):
     named = {text.get_text() for text in legend.get_texts()}
     assert named == {str(chart.causes[k]) for k in chart.ends}
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["front", "side"]
-    sheet = sheet_figure(chart)
+    sheet = capacity_sheet_figure(chart)
     words = {text.get_text() for text in sheet.texts}
-    assert {cell for row in load_table(chart).rows() for cell in row if cell} <= words
+    assert {cell for row in load_table(chart).format_rows() for cell in row if cell} <= words
     sheet.canvas.draw()
     page = sheet.bbox
     for text in sheet.texts:  # nothing runs off the page
@@ -156,7 +156,7 @@ def test_contours_run_to_the_edge(chart):
     b, a = np.nonzero(np.logical_not(loads))
     open_ = np.column_stack([chart.radii[a], chart.heights[b]])
     ends = 0
-    for _, lines in contours(chart, 0):
+    for _, lines in load_contours(chart, 0):
         for line in lines:
             away = np.abs(line[:, None] - reached).max(axis=2).min(axis=1)
             assert away.max() <= half + 1e-9
@@ -212,7 +212,7 @@ def test_names_are_drawn_as_they_are(chart, tmp_path):
     """No mathematics, no HTML."""
     odd = dataclasses.replace(chart.machine, name=r"$\bad$ <b>_crane", supports=())
     bare = dataclasses.replace(chart, machine=odd)
-    sheet = sheet_figure(bare)
+    sheet = capacity_sheet_figure(bare)
     sheet.canvas.draw()
     assert any(r"\$\bad\$ <b>_crane" in text.get_text() for text in sheet.texts)
     capacity_figure(bare).canvas.draw()
@@ -226,7 +226,7 @@ def test_the_page_holds_the_chart(chart, tmp_path):
     (inside,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     data = json.loads(inside)
     assert "http" not in text.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
-    assert data == json.loads(json.dumps(page_data(chart)))
+    assert data == json.loads(json.dumps(capacity_page_data(chart)))
     pressures = chart.pressures()
     for s in range(2):
         cells = {(cell[0], cell[1]): cell for cell in data["cells"][s]}

@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 
 import crane
-from crane.codegen.casadi_graph import expressions
-from crane.codegen.scalar import Tape, apply, dots, maximum, where_positive, with_sign_of
+from crane.codegen.casadi_expressions import casadi_expressions
+from crane.codegen.symbolic import (
+    Tape,
+    apply_function,
+    copysign,
+    dot_products,
+    maximum,
+    where_positive,
+)
 from crane.common.errors import CraneError
-from crane.control import Signals, ValveDrive
+from crane.control import ValveDrive, ValveSignals
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.rosenbrock import StiffStepper
+from crane.simulation.integration.rosenbrock import RosenbrockStepper
 
 ca = pytest.importorskip("casadi", reason="CasADi is not installed")
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -122,17 +129,20 @@ def test_a_rootfinder_closes_the_loops(log_crane):
 def test_the_simulation_s_rates_are_those_that_are_integrated(log_crane):
     machine = smooth(log_crane)
     function = crane.casadi_function(machine, "simulation")
-    drive = ValveDrive(machine, Signals(machine, [0.0], {}))
-    circuit, chart = drive.circuit, Chart.of(crane.Dynamics(machine))
-    stepper = StiffStepper(chart, drive, circuit.size)
-    rng, out = np.random.default_rng(1), np.empty(stepper._program.outputs("rate").size)
+    drive = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
+    circuit, chart = drive.circuit, Chart.from_dynamics(crane.Dynamics(machine))
+    stepper = RosenbrockStepper(chart, drive, circuit.state_count)
+    rng, out = np.random.default_rng(1), np.empty(stepper._program.formula_outputs("rate").size)
     for q, v, _ in states(machine):
-        own = drive.start(q[machine.closure.active]) * rng.uniform(0.7, 1.0, circuit.size)
-        own[: circuit.stiff] += 0.2 * rng.uniform(size=circuit.stiff)
+        own = drive.start(q[machine.closure.active]) * rng.uniform(0.7, 1.0, circuit.state_count)
+        own[: circuit.stiff_state_count] += 0.2 * rng.uniform(size=circuit.stiff_state_count)
         signals = rng.uniform(3.0, 8.0, len(circuit.joints))
         state = np.concatenate([q, 0.1 * v, own, [0.0, 0.0]])
-        stepper._program.call("rate", *stepper._arguments, signals, state, out)
-        found = [np.array(x).ravel() for x in function(q, 0.1 * v, own[: circuit.stiff], signals)]
+        stepper._program.call("rate", *stepper._common_arguments, signals, state, out)
+        found = [
+            np.array(x).ravel()
+            for x in function(q, 0.1 * v, own[: circuit.stiff_state_count], signals)
+        ]
         found = np.concatenate(found)
         wanted = out[: len(found)]
         assert found == pytest.approx(wanted, rel=1e-12, abs=1e-12)
@@ -143,10 +153,10 @@ def test_sundials_moves_the_crane_as_crane_does(log_crane):
     machine = smooth(log_crane)
     function = crane.casadi_function(machine, "simulation")
     signals = {"X_lift": 4.9, "X_ext": 6.6}
-    command = Signals(machine, [0.0], {joint: [x] for joint, x in signals.items()})
+    command = ValveSignals(machine, [0.0], {joint: [x] for joint, x in signals.items()})
     drive = ValveDrive(machine, command)
     run = crane.simulate(machine, command, duration=2.0, step=0.01)
-    stiff = drive.circuit.stiff
+    stiff = drive.circuit.stiff_state_count
     own = drive.start(machine.home[machine.closure.active])[:stiff]
     sizes = len(machine.home), len(machine.active), stiff
     scale = ca.vertcat(ca.DM.ones(sum(sizes[:2])), np.maximum(np.abs(own), 1.0))
@@ -164,7 +174,7 @@ def test_sundials_moves_the_crane_as_crane_does(log_crane):
     assert np.abs(active - run.q[-1]).max() < 1e-6
     assert np.abs(run.q[-1] - run.q[0]).max() > 0.05
     vapour = machine.hydraulics.oil.vapour_pressure
-    at = drive.circuit.starts[machine.hydraulics.joints.index("X_lift")]
+    at = drive.circuit.cylinder_state_starts[machine.hydraulics.joints.index("X_lift")]
     found = vapour + end[sizes[0] + sizes[1] + at]
     assert found == pytest.approx(run.channels["pressure_X_lift_a"][-1], rel=1e-4)
 
@@ -175,11 +185,17 @@ def test_operations_and_their_derivatives(a, b):
     tape = Tape()
     x, y = tape.load(0, 0), tape.load(0, 1)
     outputs = [
-        maximum(x, y), with_sign_of(x, y), where_positive(x, y, x * x), apply("abs", x), 2.0 / y,
-        apply("tanh", x) - y, -x, 3.0,
-    ]  # fmt: skip
+        maximum(x, y),
+        copysign(x, y),
+        where_positive(x, y, x * x),
+        apply_function("abs", x),
+        2.0 / y,
+        apply_function("tanh", x) - y,
+        -x,
+        3.0,
+    ]
     symbol = ca.SX.sym("x", 2)
-    found = ca.vertcat(*expressions(outputs, [ca.vertsplit(symbol)]))
+    found = ca.vertcat(*casadi_expressions(outputs, [ca.vertsplit(symbol)]))
     both = ca.Function("both", [symbol], [found, ca.jacobian(found, symbol)])
     values, slopes = (np.array(part) for part in both([a, b]))
     wanted = [
@@ -213,8 +229,8 @@ def test_what_cannot_be_is_one_line(log_crane, slider_crank, five_bar, monkeypat
 
 def test_dots_are_sums_of_products():
     tape = Tape()
-    x = tape.loads(0, 0, 4)
-    found = expressions(
-        dots([x[0], 2.0, x[1]], [x[1:], [x[3], 0.0, x[0]]]), [[1.0, 2.0, 3.0, 4.0]]
+    x = tape.load_vector(0, 0, 4)
+    found = casadi_expressions(
+        dot_products([x[0], 2.0, x[1]], [x[1:], [x[3], 0.0, x[0]]]), [[1.0, 2.0, 3.0, 4.0]]
     )
     assert [float(value) for value in found] == [1 * 2 + 2 * 3 + 2 * 4, 1 * 4 + 2 * 1]

@@ -12,9 +12,9 @@ from broken import DATA
 import crane
 import crane.cli
 from crane.common.errors import InputError
-from crane.description import bundled, changed, parameters
-from crane.formats import loading, read
-from crane.formats.loading import Variants
+from crane.description import apply_parameter_changes, bundled_machines, parameters
+from crane.formats import machine_loading, read_machine_spec
+from crane.formats.machine_loading import MachineVariants
 from crane.hydraulics.components import Spool
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -31,7 +31,7 @@ def tip(machine, q_a=POSE):
 
 
 def test_without_changes_nothing_changes(mini):
-    names = parameters(read("mini_forwarder"))
+    names = parameters(read_machine_spec("mini_forwarder"))
     same = crane.load("mini_forwarder", dict(list(names.items())[:-1]))  # all but the payload
     for name in ("mass_matrix", "gravity"):
         one, two = (getattr(crane.Dynamics(m), name)(POSE) for m in (mini, same))
@@ -106,7 +106,7 @@ def test_friction_control_and_limits():
     assert machine.friction["q3"].stiction == 0.5 and machine.friction["q3"].viscous == 0.4
     assert machine.control["X2"].kp == 17.0 and machine.control["X2"].ki == 20000
     assert machine.upper[1] == 0.025
-    assert dict(machine.changes) == changed
+    assert dict(machine.parameter_changes) == changed
 
 
 def test_urdfs_can_be_changed_too():
@@ -159,9 +159,11 @@ def test_numbers_that_leave_the_loops_alone_do_not_close_them_again(
     name, alike, other, monkeypatch
 ):
     """What comes of it is as if all had been loaded with these numbers, to the last bit."""
-    variants, closings = Variants(crane.load(name)), []
-    closed = loading.closed
-    monkeypatch.setattr(loading, "closed", lambda *x: closings.append(x) or closed(*x))
+    variants, closings = MachineVariants(crane.load(name)), []
+    closed = machine_loading.build_closure
+    monkeypatch.setattr(
+        machine_loading, "build_closure", lambda *x: closings.append(x) or closed(*x)
+    )
     for changes, count in ((alike, 0), (other, 1), ({**alike, **other}, 0), ({}, 0)):
         closings.clear()
         found = variants.machine(changes)
@@ -242,17 +244,17 @@ def documented():
             .replace("QUANTITY", ".+") for name in names}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [*bundled(), str(DATA / "four_bar.yaml")])
+@pytest.mark.parametrize("name", [*bundled_machines(), str(DATA / "four_bar.yaml")])
 def test_every_name_is_documented(name):
     patterns = documented()
-    for parameter in parameters(read(name)):
+    for parameter in parameters(read_machine_spec(name)):
         assert any(re.fullmatch(x, parameter) for x in patterns.values()), parameter
 
 
 def test_every_documented_name_is_one():
-    every = (*bundled(), DATA / "four_bar.yaml", DATA / "network.yaml")
-    names = [x for name in every for x in parameters(read(name))]
-    spec = read("patu655")
+    every = (*bundled_machines(), DATA / "four_bar.yaml", DATA / "network.yaml")
+    names = [x for name in every for x in parameters(read_machine_spec(name))]
+    spec = read_machine_spec("patu655")
     valves = dict(spec.hydraulics.valves)
     valves["X_lift"] = dataclasses.replace(valves["X_lift"], spool_b=Spool("X_lift"))
     two = dataclasses.replace(spec.hydraulics, valves=valves)
@@ -264,9 +266,10 @@ def test_every_documented_name_is_one():
 def test_names_can_be_listed_and_changed(capsys):
     crane.cli.program()(args=["info", "mini_forwarder", "--parameters"], standalone_mode=False)
     listed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert {name: float(f"{x:.6g}") for name, x in parameters(read("mini_forwarder")).items()} == {
-        name: float(value) for name, value in listed
-    }
+    assert {
+        name: float(f"{x:.6g}")
+        for name, x in parameters(read_machine_spec("mini_forwarder")).items()
+    } == {name: float(value) for name, value in listed}
 
 
 def test_numbers_of_springs_stops_and_ropes(tmp_path):
@@ -280,13 +283,13 @@ def test_numbers_of_springs_stops_and_ropes(tmp_path):
     assert (
         crane.load("patu655", changes={"end_stop.slew.damping": 7.0}).end_stops[0].damping == 7.0
     )
-    spec = read("mini_forwarder")
+    spec = read_machine_spec("mini_forwarder")
     ropes = (crane.Rope(("link1", "link7"), 0.5, 1e4), crane.Rope(("link1", "link7"), 0.6, 2e4))
     springs = (crane.ForceElement("q1", stiffness=3.0),)
     spec = dataclasses.replace(spec, ropes=ropes, forces=springs)
     names = parameters(spec)
     assert names["rope.link1-link7.length"] == 0.5 and names["rope.link1-link7#2.length"] == 0.6
-    new = changed(spec, {"rope.link1-link7#2.length": 0.7, "spring.q1.rest": 0.1})
+    new = apply_parameter_changes(spec, {"rope.link1-link7#2.length": 0.7, "spring.q1.rest": 0.1})
     assert [rope.length for rope in new.ropes] == [0.5, 0.7] and new.forces[0].rest == 0.1
     with pytest.raises(InputError, match="stiffness of .* is -1"):
-        changed(spec, {"spring.q1.stiffness": -1.0})
+        apply_parameter_changes(spec, {"spring.q1.stiffness": -1.0})

@@ -24,9 +24,9 @@ from typed import typed
 from work import TooMuchWorkError, at_most
 
 import crane
-from crane.description import bundled, examples
+from crane.description import bundled_machines, example_robots
 from crane.formats import write_machine
-from crane.formats.check import Report, check
+from crane.formats.check import CheckReport, check
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"
@@ -57,7 +57,7 @@ def seen(name: str, lines: list[str], *edits: Edit, machine: str = MACHINE):
     return pytest.param(Checked(lines, edits, machine), id=name.replace(" ", "-"))
 
 
-def checked(machine: str, edits: tuple[Edit, ...], folder: Path) -> Report:
+def checked(machine: str, edits: tuple[Edit, ...], folder: Path) -> CheckReport:
     path = copy_machine(machine, folder)
     for edit in edits:
         edit.apply(folder)
@@ -737,7 +737,7 @@ def test_says_no_more_than_load_of_single_slips(tmp_path):
             continue
         folder.mkdir()
         findings = checked(broken.machine, broken.edits, folder).findings
-        if sum(finding.error for finding in findings) > 1:
+        if sum(finding.is_error for finding in findings) > 1:
             more[broken.name] = [str(finding) for finding in findings]
     # which are several slips, or one that really breaks several things
     assert more.keys() <= {
@@ -747,7 +747,7 @@ def test_says_no_more_than_load_of_single_slips(tmp_path):
     }, more  # fmt: skip
 
 
-@pytest.mark.parametrize("name", bundled())
+@pytest.mark.parametrize("name", bundled_machines())
 def test_bundled_machines_are_clean(name):
     report = check(name)
     assert report.findings == ()
@@ -762,22 +762,22 @@ ARMS = (
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not examples(), reason="example-robot-data is not installed")
+@pytest.mark.skipif(not example_robots(), reason="example-robot-data is not installed")
 @pytest.mark.parametrize("name", ARMS)
 def test_arms_give_no_false_alarm(name):
     assert check(name).findings == ()
 
 
-@pytest.mark.skipif(not examples(), reason="example-robot-data is not installed")
+@pytest.mark.skipif(not example_robots(), reason="example-robot-data is not installed")
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.long)])
 def test_published_robots_load_where_they_are_not_refused(every):
-    for name in sorted(examples())[::every]:
+    for name in sorted(example_robots())[::every]:
         report = check(name)
         try:
             crane.load(name, strict=True)
         except crane.CraneError as error:
-            assert any(finding.what in str(error) for finding in report.findings), name
+            assert any(finding.message in str(error) for finding in report.findings), name
         else:
             assert report.errors == 0, (name, report.findings)
 
@@ -819,7 +819,7 @@ def test_the_next_command_loads_the_same_machine(tmp_path, floating):
     words = shlex.split(line)
     assert [x for x in (*options, *floating) if x not in words] == []
     machine = crane.load(path, changes={"arm.mass": 3}, arguments={"model": "other"})
-    words = shlex.split(machine.command)
+    words = shlex.split(machine.command_line_arguments)
     assert words[1:] == ["--set", "arm.mass=3.0", "--arg", "model:=other"]
     assert typed("convert", *words, tmp_path / "other").returncode == 0
     assert crane.load(tmp_path / "other" / "other.yaml").tree.links["arm"].inertial.mass == 3

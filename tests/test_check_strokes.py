@@ -8,9 +8,9 @@ import pytest
 
 import crane
 from crane.common.errors import SimulationError
-from crane.control.phases import Phases
-from crane.description import bundled
-from crane.description.phases import Phase
+from crane.control.lever_phases import LeverPhases
+from crane.description import bundled_machines
+from crane.description.task_phases import Phase
 from crane.formats.check import check
 
 VIA = (
@@ -29,7 +29,7 @@ def boom(folder, limits="", more=""):
 
 
 def told(path):
-    return [finding.what for finding in check(path).findings]
+    return [finding.message for finding in check(path).findings]
 
 
 def test_a_via_point_beyond_the_stroke_is_told(tmp_path):
@@ -65,7 +65,7 @@ def test_the_part_of_the_strokes_that_does_not_close_is_told(tmp_path):
     assert last == pytest.approx(longest, abs=1e-4) and "loop 'eye'" in line
 
 
-@pytest.mark.parametrize("name", bundled())
+@pytest.mark.parametrize("name", bundled_machines())
 def test_bundled_machines_close_all_over_their_strokes(name):
     assert not [line for line in told(name) if "strokes" in line or "task" in line]
 
@@ -75,7 +75,7 @@ def test_a_dead_centre_in_the_way_of_a_phase_is_named(tmp_path):
     machine = crane.load("excavator", changes={"X_boom.upper": 3.0})
     up = Phase("up", {"X_boom": 1.0}, {"X_boom": 2.5}, 0.3)
     with pytest.raises(SimulationError) as caught:
-        crane.simulate(machine, Phases(machine, [up]), step=1e-2)
+        crane.simulate(machine, LeverPhases(machine, [up]), step=1e-2)
     text = str(caught.value)
     assert "'up' has not ended within 0.3 s" in text and "a dead centre is in between" in text
     assert "loop 'boom_eye' cannot be closed at" in text and "give a position before it" in text

@@ -9,7 +9,12 @@ import pinocchio as pin
 import pytest
 
 import crane
-from crane.closure.choice import choose, condition, motions, scales
+from crane.closure.active_joint_selection import (
+    condition_number,
+    motion_scales,
+    null_space_basis,
+    select_columns,
+)
 from crane.common.errors import CraneError, CraneWarning, MechanismError
 
 BODY = (
@@ -92,7 +97,7 @@ def test_bennetts_linkage_moves_as_its_closed_form_says(tmp_path):
     machine = crane.load(bennett(tmp_path))
     structure = machine.closure.structure
     assert machine.closure.degrees_of_freedom == 1
-    assert (len(structure.rows), len(structure.redundant)) == (2, 3)
+    assert (len(structure.independent_rows), len(structure.redundant_rows)) == (2, 3)
     one = np.linspace(0.4, 2.9, 60)
     q = machine.closure.solve(one[:, None])
     assert machine.closure.residual(q).max() < 1e-13
@@ -149,7 +154,7 @@ def sarrus(folder, active=("a1",), skew=0.0):
 def test_sarrus_moves_along_a_straight_line(tmp_path):
     machine = crane.load(sarrus(tmp_path))
     structure = machine.closure.structure
-    assert machine.closure.degrees_of_freedom == 1 and len(structure.redundant) == 1
+    assert machine.closure.degrees_of_freedom == 1 and len(structure.redundant_rows) == 1
     lift = np.linspace(0.1, 1.5, 40)
     q = machine.closure.solve(-lift[:, None])
     assert machine.closure.residual(q).max() < 1e-13
@@ -182,7 +187,7 @@ def cranks(folder, lengths, active=("one",), turned=True, home=None):
 def test_a_redundant_crank_is_counted_not_refused(tmp_path):
     machine = crane.load(cranks(tmp_path, (0.2, 0.2, 0.2)))
     assert machine.closure.degrees_of_freedom == 1
-    assert len(machine.closure.structure.redundant) == 7  # of 10 equations
+    assert len(machine.closure.structure.redundant_rows) == 7  # of 10 equations
     q = machine.closure.solve(np.linspace(-1.2, 1.2, 30)[:, None])
     one, table, two, three = (q[:, machine.column(x)] for x in ("one", "table", "two", "three"))
     for other in (-table, two, three):
@@ -238,17 +243,19 @@ def test_a_machine_without_active_joints_is_told_some(tmp_path):
             again = path.read_text() + f"active: [{listed}]\n"
             path.with_name("driven.yaml").write_text(again)
             machine = crane.load(path.with_name("driven.yaml"))
-            found = float(machine.closure.condition(machine.home))
+            found = float(machine.closure.condition_number(machine.home))
             assert found == pytest.approx(float(said), rel=6e-3)
 
 
 def test_actuators_are_proposed_first(mini):
     """The cranes' own drives, though pins on the booms would be the better conditioned ones."""
     for machine in (mini, crane.load("patu655")):
-        first, second = machine.closure.proposals
+        first, second = machine.closure.proposed_active_joints
         assert set(first.joints) == set(machine.active)
-        assert second.condition < first.condition
-        assert first.condition == pytest.approx(float(machine.closure.condition(machine.home)))
+        assert second.condition_number < first.condition_number
+        assert first.condition_number == pytest.approx(
+            float(machine.closure.condition_number(machine.home))
+        )
 
 
 def test_a_dead_centre_names_who_drives_through_it(tmp_path):
@@ -270,7 +277,7 @@ def test_a_file_that_says_nothing_of_a_singular_posture_gets_another(tmp_path):
     flat = cranks(tmp_path, (0.2, 0.2, 0.2), turned=False)
     with pytest.warns(CraneWarning, match="the posture is singular; moving one, too, the nearest"):
         machine = crane.load(flat)
-    assert float(machine.closure.condition(machine.home)) < 20
+    assert float(machine.closure.condition_number(machine.home)) < 20
 
 
 def everywhere(machine):
@@ -281,10 +288,10 @@ def everywhere(machine):
 def test_condition_is_that_of_the_orthonormal_equations(mini, stewart, five_bar):
     """||D^-1 gamma D_A|| against 1 / sigma_min(N_A) and 1 / sigma_min(J_P), rows orthonormal."""
     for machine in (mini, stewart, five_bar):
-        closure, scale = machine.closure, scales(machine.model)
+        closure, scale = machine.closure, motion_scales(machine.model)
         jacobian = closure.equations.evaluate(machine.home)[1]
-        basis = motions(jacobian, scale, 1e-8)
-        found = float(closure.condition(machine.home))
+        basis = null_space_basis(jacobian, scale, 1e-8)
+        found = float(closure.condition_number(machine.home))
         assert found >= 1
         for rows in (basis[closure.active], null_rows(jacobian * scale)[:, closure.passive]):
             least = np.linalg.svd(rows, compute_uv=False)[-1]
@@ -308,10 +315,10 @@ def test_choices_are_near_the_best(mini, five_bar, tmp_path):
             continue
     assert len(machines) > 6
     for machine in machines:
-        closure, scale = machine.closure, scales(machine.model)
+        closure, scale = machine.closure, motion_scales(machine.model)
         jacobian = closure.equations.evaluate(machine.home)[1]
-        basis = motions(jacobian, scale, 1e-8)
-        chosen = choose(basis, range(machine.model.nv))
+        basis = null_space_basis(jacobian, scale, 1e-8)
+        chosen = select_columns(basis, range(machine.model.nv))
         n, others = len(chosen), machine.model.nv - len(chosen)
         values = {
             choice: np.linalg.svd(basis[list(choice)], compute_uv=False)[-1]
@@ -325,16 +332,16 @@ def test_choices_are_near_the_best(mini, five_bar, tmp_path):
 
 def test_condition_does_not_depend_on_units(five_bar):
     """Equations multiplied by anything, a machine ten times as large."""
-    closure, scale = five_bar.closure, scales(five_bar.model)
+    closure, scale = five_bar.closure, motion_scales(five_bar.model)
     gamma = closure.gamma(five_bar.home)
-    assert condition(gamma, 7.0 * scale, closure.active) == pytest.approx(
-        float(condition(gamma, scale, closure.active))
+    assert condition_number(gamma, 7.0 * scale, closure.active) == pytest.approx(
+        float(condition_number(gamma, scale, closure.active))
     )
     jacobian = closure.equations.evaluate(five_bar.home)[1]
     weights = np.random.default_rng(0).uniform(0.01, 100, len(jacobian))
     for one in range(4):
         kept = [one]
-        both = [choose(motions(rows, scale, 1e-8), range(4), kept) for rows in
+        both = [select_columns(null_space_basis(rows, scale, 1e-8), range(4), kept) for rows in
                 (jacobian, weights[:, None] * jacobian)]  # fmt: skip
         assert np.array_equal(*both)
 
@@ -346,11 +353,11 @@ def test_no_joint_moves_by_more_than_those_that_were_chosen(size):
     joints, freedom = size
     for _ in range(60):
         basis = np.linalg.qr(random.normal(size=(joints, freedom)) ** 3)[0]
-        chosen = choose(basis, range(joints))
+        chosen = select_columns(basis, range(joints))
         scaled = basis @ np.linalg.inv(basis[chosen])
         assert np.abs(scaled).max() <= 1 + 1e-8
         least = np.linalg.svd(basis[chosen], compute_uv=False)[-1]
         assert 1 / least <= np.sqrt(1 + freedom * (joints - freedom))
         kept = random.permutation(joints)[:1].tolist()
-        others = choose(basis, range(joints), kept)
+        others = select_columns(basis, range(joints), kept)
         assert kept[0] in others and len(set(others.tolist())) == freedom

@@ -6,13 +6,13 @@ from circuits import SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
 
 import crane
-from crane.control import Signals
+from crane.control import ValveSignals
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     machine = everything(tmp_path_factory.mktemp("whole"))
-    signals = Signals(machine, TIMES, SIGNALS)
+    signals = ValveSignals(machine, TIMES, SIGNALS)
     return machine, signals, crane.simulate(machine, signals, duration=3.0, tolerance=1e-10)
 
 
@@ -49,7 +49,7 @@ def test_methods_agree_on_two_pumps_and_an_accumulator(tmp_path, method, backend
             "from": "x.a", "to": "gas", "type": "orifice", "coefficient": 1e-7,
         }},
     )  # fmt: skip
-    signals = Signals(machine, [0.0, 0.1, 0.2], {"x": [0.0, 0.0, 0.4], "y": [0.0, 0.5, 0.5]})
+    signals = ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [0.0, 0.0, 0.4], "y": [0.0, 0.5, 0.5]})
     one, other = (
         crane.simulate(machine, signals, duration=0.3, tolerance=1e-10, **options)
         for options in ({}, {"method": method, "backend": backend})

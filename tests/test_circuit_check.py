@@ -12,14 +12,23 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError
-from crane.common.magnitudes import OWN, USUAL, doubt, usual_of
+from crane.common.plausible_ranges import (
+    PLAUSIBLE_RANGES,
+    RANGES_BY_COMPONENT,
+    implausible_value_text,
+    plausible_range,
+)
 from crane.formats.check import check
-from crane.formats.machine_file.circuit import MOTOR
-from crane.hydraulics.components import Counterbalance, Cylinder, Oil, Valve
-from crane.hydraulics.connections import drained, fed, joined
-from crane.hydraulics.elements import Accumulator, Element, Line
-from crane.hydraulics.numbers import number_names
-from crane.hydraulics.sources import Engine, Supply
+from crane.formats.machine_file.circuit_section import MOTOR_KEYS
+from crane.hydraulics.circuit_connectivity import (
+    connected_nodes,
+    nodes_draining_to_tank,
+    nodes_fed_by_pumps,
+)
+from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
+from crane.hydraulics.components import CounterbalanceValve, Cylinder, Oil, Valve
+from crane.hydraulics.parameter_checks import parameter_names
+from crane.hydraulics.supply_and_engine import Engine, Supply
 
 SENSING = {"control": "load-sensing", "flow": 3e-3, "pressure": 2.8e7, "margin": 2e6}
 SECOND = {"pressure": 2e7, "flow": 2e-3}
@@ -77,11 +86,11 @@ ERRORS = [
 @pytest.mark.parametrize(("circuit", "where", "line"), ERRORS)
 def test_loose_ends_are_errors(base, circuit, where, line):
     (finding,) = findings(base, **circuit)
-    assert finding.error and finding.what.startswith(line)
+    assert finding.is_error and finding.message.startswith(line)
     assert (finding.file, finding.line) == ("changed.yaml", line_of(base, where))
     with pytest.raises(DescriptionError) as refused:
         crane.load(base[0] / "changed.yaml")
-    assert str(refused.value) == f"changed.yaml:{finding.line}: {finding.what}"
+    assert str(refused.value) == f"changed.yaml:{finding.line}: {finding.message}"
 
 
 WARNINGS = [
@@ -127,8 +136,8 @@ WARNINGS = [
 @pytest.mark.parametrize(("circuit", "where", "line"), WARNINGS)
 def test_what_is_odd_is_a_warning(base, circuit, where, line):
     found = findings(base, **circuit)
-    assert not [x for x in found if x.error], found
-    (finding,) = [x for x in found if x.what.startswith(line)]
+    assert not [x for x in found if x.is_error], found
+    (finding,) = [x for x in found if x.message.startswith(line)]
     assert (finding.file, finding.line) == ("changed.yaml", line_of(base, where))
     # what follows from a pump without a way back is told of what it feeds, too
     assert len(found) == 1 or "it only fills" in line
@@ -172,10 +181,10 @@ def test_what_nothing_relieves_rises_as_far_as_is_told(base):
     wide = {"type": "orifice"} | dict.fromkeys(("c1", "c2", "c3", "c4"), 2e-6)
     path = written(base, supply=pump, valves={"x": wide})
     (finding,) = check(path).findings
-    told = re.search("up to (.*) Pa over its (.*) Pa", finding.what).groups()
+    told = re.search("up to (.*) Pa over its (.*) Pa", finding.message).groups()
     machine = crane.load(path)
     time, signal = [0.0, 0.1, 0.1001, 0.8, 0.8001, 1.6], [0.0, 0.0, 10.0, 10.0, 0.0, 0.0]
-    run = crane.simulate(machine, crane.Signals(machine, time, {"x": signal}), duration=1.6)
+    run = crane.simulate(machine, crane.ValveSignals(machine, time, {"x": signal}), duration=1.6)
     assert run.channels["share_supply"].max() > 0.999
     peak = run.channels["pressure_supply"].max()
     assert 0.99 < peak / sum(map(float, told)) < 1.0
@@ -193,9 +202,9 @@ def test_nodes_of_a_circuit(base):
         },
     )  # fmt: skip
     circuit = crane.load(path).hydraulics
-    assert joined(circuit) == {"supply", "tank", "back", "store", "sump"}
-    assert drained(circuit) == {"tank", "supply", "back", "x.a", "x.b"}
-    assert fed(circuit) == {"supply", "x.a", "x.b", "back", "store"}
+    assert connected_nodes(circuit) == {"supply", "tank", "back", "store", "sump"}
+    assert nodes_draining_to_tank(circuit) == {"tank", "supply", "back", "x.a", "x.b"}
+    assert nodes_fed_by_pumps(circuit) == {"supply", "x.a", "x.b", "back", "store"}
 
 
 def test_locked_joints_leave_no_error(tmp_path):
@@ -223,7 +232,17 @@ def test_valves_that_take_more_than_the_pump_gives_are_a_note(base):
     assert check(written(base, supply={"pressure": 9.25e6, "flow": 1e-3}, **valve())).notes == ()
 
 
-KINDS = (Supply, Engine, Line, Accumulator, Element, Cylinder, Valve, Counterbalance, Oil)
+KINDS = (
+    Supply,
+    Engine,
+    CircuitLine,
+    Accumulator,
+    CircuitElement,
+    Cylinder,
+    Valve,
+    CounterbalanceValve,
+    Oil,
+)
 # signals in volts, ratios, damping and brakes, of which anything is usual
 UNJUDGED = {("valve", "neutral"), ("valve", "full"), ("valve", "damping"),
             ("cylinder", "damping"), ("accumulator", "exponent"),
@@ -233,29 +252,31 @@ SHARES = {("valve", "dead_band"), ("valve", "hysteresis"), ("valve", "float_from
 
 
 def test_all_numbers_of_a_circuit_are_in_the_table():
-    names = {(kind.__name__.lower(), name) for kind in KINDS for name in number_names(kind)}
-    names |= {("motor", name) for name in MOTOR}
-    lacking = {(kind, name) for kind, name in names if usual_of(name, False, kind) is None}
+    names = {(kind.__name__.lower(), name) for kind in KINDS for name in parameter_names(kind)}
+    names |= {("motor", name) for name in MOTOR_KEYS}
+    lacking = {(kind, name) for kind, name in names if plausible_range(name, False, kind) is None}
     assert lacking == UNJUDGED | SHARES
-    assert {kind for kind, _ in OWN} <= {kind for kind, _ in names}
+    assert {kind for kind, _ in RANGES_BY_COMPONENT} <= {kind for kind, _ in names}
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_defaults_are_usual(kind):
     for entry in fields(kind):
-        if entry.name in number_names(kind) and isinstance(entry.default, float):
+        if entry.name in parameter_names(kind) and isinstance(entry.default, float):
             for turning in (False, True):
-                text = doubt(entry.name, entry.default, turning, kind.__name__.lower())
+                text = implausible_value_text(
+                    entry.name, entry.default, turning, kind.__name__.lower()
+                )
                 assert not text, (kind, entry.name)
 
 
-@pytest.mark.parametrize("key", sorted(OWN))
+@pytest.mark.parametrize("key", sorted(RANGES_BY_COMPONENT))
 def test_proposals_of_parts_are_usual(key):
     kind, name = key
     for value in np.logspace(-12, 14, 80):
-        text = doubt(name, float(f"{value:.3g}"), False, kind)
+        text = implausible_value_text(name, float(f"{value:.3g}"), False, kind)
         for words in text.split("write ")[1:]:
-            assert not doubt(name, float(words.split()[0]), False, kind), text
+            assert not implausible_value_text(name, float(words.split()[0]), False, kind), text
 
 
 def joint_parts(kind, numbers):
@@ -329,7 +350,7 @@ def test_units_that_people_write_are_told(base, key, numbers, what, unit):
         }
     if key == "supplies":
         changed |= valve(supply="second")
-    texts = [x.what for x in findings(base, **changed)]
+    texts = [x.message for x in findings(base, **changed)]
     (told,) = [text for text in texts if what in text]
     assert unit in told
 
@@ -348,5 +369,5 @@ def test_the_note_on_a_bundled_circuit():
 
 
 def test_the_table_has_no_unknown_names():
-    names = {name for kind in KINDS for name in number_names(kind)} | set(MOTOR)
-    assert set(USUAL) - names <= {"meter_out", "bore", "rod", "stroke"}
+    names = {name for kind in KINDS for name in parameter_names(kind)} | set(MOTOR_KEYS)
+    assert set(PLAUSIBLE_RANGES) - names <= {"meter_out", "bore", "rod", "stroke"}

@@ -10,7 +10,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import DescriptionError, InputError
-from crane.control import Signals
+from crane.control import ValveSignals
 from crane.recordings import timeseries
 
 PUMP = {"control": "load-sensing", "pressure": 2e7, "flow": 6e-4, "margin": 2e6}
@@ -65,13 +65,13 @@ def test_every_number_of_the_circuit_acts(tmp_path):
     from circuit_state import circuit_of
 
     machine = everything(tmp_path)
-    usual = circuit_of(machine).numbers
+    usual = circuit_of(machine).constants
     for name, value in {
         "supply.pilot.pressure": 1.7e7, "engine.torque": 140.0, "line.block.volume": 6e-4,
         "accumulator.quick.volume": 6e-4, "element.feed.pressure": 2e6, "supply.second.throttle":
         7e-7, "valve.y.float_from": 0.7, "valve.x.hysteresis": 0.03, "cylinder.x.rupture_a": 1e-3,
     }.items():  # fmt: skip
-        other = circuit_of(crane.load(tmp_path / "rig.yaml", {name: value})).numbers
+        other = circuit_of(crane.load(tmp_path / "rig.yaml", {name: value})).constants
         assert 1 <= np.sum(other != usual) <= 2, name
 
 
@@ -92,7 +92,7 @@ def test_locked_joints_take_their_elements_along(tmp_path, held):
     assert ("quick" in circuit.accumulators) == ("x" not in held)
     assert circuit.elements.keys() >= {"cooler", "fill", "feed"}
     left = {joint: SIGNALS[joint] for joint in machine.active}
-    run = crane.simulate(machine, Signals(machine, TIMES, left), duration=0.8)
+    run = crane.simulate(machine, ValveSignals(machine, TIMES, left), duration=0.8)
     oil, energy = gaps(run, machine)
     assert oil < 1e-12 and energy < 1e-6
 
@@ -167,13 +167,13 @@ def test_what_knows_cylinders_alone_says_so(tmp_path):
 def test_calibration_finds_numbers_of_pumps_and_elements(tmp_path):
     """From a recording of the truth, by a machine whose throttles are 7 and 15 % off."""
     machine = everything(tmp_path)
-    run = crane.simulate(machine, Signals(machine, TIMES, SIGNALS), duration=2.0)
+    run = crane.simulate(machine, ValveSignals(machine, TIMES, SIGNALS), duration=2.0)
     names = [f"pressure_{joint}_{side}" for joint in "xyzw" for side in "ab"]
     units = {"time": "s", **{f"voltage_{x}": "V" for x in "xyzw"}}
     units |= {x: machine.unit(x) for x in "xyzw"} | dict.fromkeys(names, "Pa")
     columns = [run.channels[x] for x in (*(f"voltage_{x}" for x in "xyzw"), *names)]
     values = np.column_stack([run.time, *columns[:4], *run.q.T, *columns[4:]])
-    timeseries.write(tmp_path / "run.csv", timeseries.Table(units, values, {}))
+    timeseries.write_table(tmp_path / "run.csv", timeseries.Table(units, values, {}))
     true = {"element.cooler.coefficient": 2e-6, "supply.second.throttle": 6e-7}
     wrong = crane.load(
         tmp_path / "rig.yaml",
@@ -204,19 +204,22 @@ def test_sensitivities_by_numbers_of_the_circuit(tmp_path):
 
     def end(changes):
         other = crane.load(tmp_path / "rig.yaml", changes)
-        control = Signals(other, [0.0, 0.1, 0.2], signals)
+        control = ValveSignals(other, [0.0, 0.1, 0.2], signals)
         return crane.simulate(other, control, duration=0.6, tolerance=1e-11).q[-1]
 
     names = ("supply.margin", "supply.pilot.pressure", "element.cooler.coefficient")
     found = crane.sensitivities(
-        machine, Signals(machine, [0.0, 0.1, 0.2], signals), duration=0.6, by=list(names)
+        machine,
+        ValveSignals(machine, [0.0, 0.1, 0.2], signals),
+        duration=0.6,
+        parameters=list(names),
     )
     for name in names:
         head = found.values[names.index(name)]
         step = 1e-4 * head
         slope = (end({name: head + step}) - end({name: head - step})) / (2 * step)
         assert slope.any()
-        one = [found.of(joint, name)[-1] for joint in "xy"]
+        one = [found.derivative(joint, name)[-1] for joint in "xy"]
         np.testing.assert_allclose(one, slope, rtol=2e-3, atol=1e-4 * np.abs(slope).max())
 
 

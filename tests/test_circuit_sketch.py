@@ -12,9 +12,15 @@ from typed import typed
 
 import crane
 from crane.common.errors import InputError
-from crane.hydraulics.sources import TANK
+from crane.hydraulics.supply_and_engine import TANK_NODE
 from crane.view.sketch.circuit import circuit_figure
-from crane.view.sketch.circuit.quantities import bar, figure, litres, per_turn, volume
+from crane.view.sketch.circuit.format_quantities import (
+    format_displacement,
+    format_flow,
+    format_number,
+    format_pressure,
+    format_volume,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -99,11 +105,13 @@ def test_every_part_is_named_with_its_numbers(drawings):
             assert f"label valve {joint}" in said, name
             if cylinder.relief:
                 for side in "ab":
-                    assert said[f"label relief {joint}.{side}"] == [bar(cylinder.relief)]
+                    assert said[f"label relief {joint}.{side}"] == [
+                        format_pressure(cylinder.relief)
+                    ]
         for pump, supply in hydraulics.sources.items():
             assert pump.startswith(said[f"name pump {pump}"][0].rstrip("…"))
             told = said[f"label pump {pump}"]
-            assert f"{litres(supply.flow)} l/min" in told or not supply.flow
+            assert f"{format_flow(supply.flow)} l/min" in told or not supply.flow
         for part in (*hydraulics.accumulators, *hydraulics.elements):
             assert any(said.get(f"name {kind} {part}") for kind in ("accumulator", "element"))
 
@@ -193,7 +201,7 @@ def test_every_net_hangs_together_and_joins_its_ports(drawings):
     for name, (machine, _, ink) in drawings.items():
         for net in {x.net for x in (*ink.wires, *ink.ports)}:
             groups = pieces(ink, net)
-            if net == TANK:
+            if net == TANK_NODE:
                 for wires, ports in groups:
                     assert wires and any(p.part.startswith("tank") for p in ports), (name, ports)
             else:
@@ -236,9 +244,9 @@ def test_open_centres_are_in_series(tmp_path):
         mine = [j for j, v in machine.hydraulics.valves.items() if v.supply == pump]
         chain = [f"C {pump} {i + 1}" for i in range(len(mine))]
         for i, joint in enumerate(mine):
-            nets = [p.net for p in ink.ports if p.part == f"valve {joint}"]
+            nets = [p.net for p in ink.ports if p.component == f"valve {joint}"]
             assert (chain[i - 1] if i else pump) in nets and chain[i] in nets
-        assert chain[-1] in [p.net for p in ink.ports if p.part == f"throttle {pump}"]
+        assert chain[-1] in [p.net for p in ink.ports if p.component == f"throttle {pump}"]
 
 
 def test_words_on_pumps(drawings):
@@ -276,11 +284,22 @@ def test_rods_are_where_chamber_a_is_not(tmp_path):
 
 
 def test_numbers_as_data_sheets_have_them():
-    assert [bar(9.25e6), litres(40 / 6e4), volume(2.5e-3), volume(4e-5)] == [
-        "92.5 bar", "40", "2.5 l", "40 cm³",
-    ]  # fmt: skip
-    assert per_turn(1e-5) == "62.8 cm³/rev" and per_turn(1.4137e-3) == "8.88 l/rev"
-    assert [figure(x) for x in (0, 100, 1234.5, 0.05, 2e-7)] == [
+    assert [
+        format_pressure(9.25e6),
+        format_flow(40 / 6e4),
+        format_volume(2.5e-3),
+        format_volume(4e-5),
+    ] == [
+        "92.5 bar",
+        "40",
+        "2.5 l",
+        "40 cm³",
+    ]
+    assert (
+        format_displacement(1e-5) == "62.8 cm³/rev"
+        and format_displacement(1.4137e-3) == "8.88 l/rev"
+    )
+    assert [format_number(x) for x in (0, 100, 1234.5, 0.05, 2e-7)] == [
         "0", "100", "1234", "0.05", "2.00e-07",
     ]  # fmt: skip
 

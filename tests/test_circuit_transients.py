@@ -6,7 +6,7 @@ from hydraulic_rig import AREA_A, AREA_B, HOSE, STROKE, rig
 from scipy.integrate import solve_ivp
 
 import crane
-from crane.control import Signals
+from crane.control import ValveSignals
 
 BULK, TANK, G = 1.2e9, 1e5, 9.81
 C = 4e-7
@@ -68,7 +68,7 @@ def compare(
         start: What of y at the start is no channel, by name.
         corners: Where signals turn as they arrive, if not at times.
     """
-    control = Signals(machine, times, signals)
+    control = ValveSignals(machine, times, signals)
     run = crane.simulate(machine, control, initial, duration, tolerance=1e-10)
     found = {}
     for i, joint in enumerate(machine.active):

@@ -8,8 +8,8 @@ from hydraulic_rig import AREA_A, AREA_B, HOSE, ORIFICE, STROKE, rig
 from scipy.optimize import brentq
 
 import crane
-from crane.control import Signals
-from crane.hydraulics.flow import in_series, root
+from crane.control import ValveSignals
+from crane.hydraulics.orifice_flow import series_coefficient, signed_square_root
 
 TANK = 1e5
 SENSING = {
@@ -30,7 +30,7 @@ def moved(machine, signals, duration, initial=None, **options):
     ramps = {joint: [0.0, 0.0, signal] for joint, signal in signals.items()}
     assert len(initial) == n
     return crane.simulate(
-        machine, Signals(machine, [0.0, 0.1, 0.2], ramps), initial, duration, **options
+        machine, ValveSignals(machine, [0.0, 0.1, 0.2], ramps), initial, duration, **options
     )
 
 
@@ -147,7 +147,7 @@ def test_power_is_a_hyperbola_with_a_corner(tmp_path):
         expected = min(1.0, 2e4 / (2e-3 * above))
         assert at.pumps["supply"].share == pytest.approx(expected, rel=1e-12)
         if above >= 1e7:
-            assert at.pumps["supply"].shaft == pytest.approx(2e4, rel=1e-12)
+            assert at.pumps["supply"].shaft_power == pytest.approx(2e4, rel=1e-12)
 
 
 @pytest.mark.parametrize("powers", [(3e4, 3e4), (4e4, 1e4)])
@@ -164,7 +164,7 @@ def test_summed_power_of_two_pumps_is_never_exceeded(tmp_path, powers):
             machine, [1.0, 1.0], pressure_supply=one, pressure_second=two, pressure_x_a=one,
             pressure_y_a=two,
         )  # fmt: skip
-        taken = at.pumps["supply"].shaft + at.pumps["second"].shaft
+        taken = at.pumps["supply"].shaft_power + at.pumps["second"].shaft_power
         assert taken <= most * (1 + 1e-12)
         if max(pump.share for pump in at.pumps.values()) < 1:
             assert taken == pytest.approx(most, rel=1e-12)
@@ -188,7 +188,7 @@ def test_slip_friction_and_drag_of_a_pump(tmp_path):
     line = 1.2e9 / 2e-3 * (1e-3 * n - 2e-12 * above)
     assert rates["pressure_supply"] == pytest.approx(line, rel=1e-12)
     shaft = 1e-3 * n * above * 1.06 + 800 * n**2
-    assert at.pumps["supply"].shaft == pytest.approx(shaft, rel=1e-12)
+    assert at.pumps["supply"].shaft_power == pytest.approx(shaft, rel=1e-12)
     torque = min(400.0, 400 * (1 + 10 / 190 - n) * 190 / 10)
     slower = (torque - shaft / (n * 190)) / (2.0 * 190)
     assert rates["engine"] == pytest.approx(slower, rel=1e-12)
@@ -361,7 +361,9 @@ def test_hysteresis_is_as_wide_as_it_says(tmp_path):
     machine = rig(tmp_path, {**SIMPLE, "hysteresis": 0.06}, axis="1 0 0", supply={"pressure": 2e5})
     times = np.array([0.0, 10.0, 30.0, 50.0])
     wanted = np.array([0.0, 0.8, -0.8, 0.8])
-    run = crane.simulate(machine, Signals(machine, times, {"x": wanted}), duration=50.0, step=0.01)
+    run = crane.simulate(
+        machine, ValveSignals(machine, times, {"x": wanted}), duration=50.0, step=0.01
+    )
     u, t = run.channels["spool_x"], run.time
     signal = np.interp(t, times, wanted)
     down, up = (t > 14) & (t < 29), (t > 34) & (t < 49)
@@ -400,12 +402,12 @@ def test_load_holding_stands_in_the_way_of_float_and_regeneration(tmp_path):
     assert flow(at, "outlet", "x.a") == 0.0
     at, _ = now(machine, [-1.0], pressure_x_a=12e6)
     opening = (12e6 + 4 * TANK - 1.2e7) / 2e6
-    c = in_series(3.4e-6, 3e-7 * opening, 0.0)
+    c = series_coefficient(3.4e-6, 3e-7 * opening, 0.0)
     assert flow(at, "outlet", "x.a") == pytest.approx(c * np.sqrt(12e6 - TANK), rel=1e-12)
     at, _ = now(machine, [1.0], pressure_x_a=2e5, pressure_x_b=5e6)
     assert flow(at, "regeneration") == 0.0
     at, _ = now(machine, [1.0], pressure_x_a=2.5e6, pressure_x_b=5e6)
-    c = in_series(1e-6, 3e-7, 0.0)
+    c = series_coefficient(1e-6, 3e-7, 0.0)
     assert flow(at, "regeneration") == 0.0 or flow(at, "regeneration") == pytest.approx(
         c * min(1.0, (5e6 + 1e7 - 1.2e7) / 2e6) * np.sqrt(2.5e6), rel=1e-12
     )
@@ -468,7 +470,7 @@ def test_a_valve_of_priority_is_served_first(tmp_path, first):
         == machine.hydraulics
     )
     loads = [crane.Wrench("load_y", (-3e4, 0, 0))]
-    signals = crane.Signals(machine, [0.0, 4.0], {"x": [1.0, 1.0], "y": [1.0, 1.0]})
+    signals = crane.ValveSignals(machine, [0.0, 4.0], {"x": [1.0, 1.0], "y": [1.0, 1.0]})
     run = crane.simulate(machine, signals, [0.05, 0.05], duration=2.0, step=5e-3, loads=loads)
     flows = np.array([run.channels[f"flow_{joint}_a"][-1] for joint in "xy"])
     assert flows.sum() == pytest.approx(6e-4, rel=1e-3)
@@ -525,7 +527,7 @@ def test_accumulator_gives_its_heat_away(tmp_path):
         elements={"fill": FILL | {"coefficient": 3e-5, "joints": ["x"]}},
     )  # fmt: skip
     times = [0.0, 0.1, 0.11, 0.13, 0.14]
-    signals = Signals(machine, times, {"x": [0, 0, 1.0, 1.0, 0.0]})
+    signals = ValveSignals(machine, times, {"x": [0, 0, 1.0, 1.0, 0.0]})
     run = crane.simulate(machine, signals, duration=30.0, step=0.01)
     p, t, pumped = run.channels["pressure_gas"], run.time, run.channels["oil_pumped"]
     begun = np.searchsorted(t, 0.2)
@@ -562,7 +564,7 @@ def test_accumulator_runs_empty_and_fills_again(tmp_path, more):
             "leak": {"from": "gas", "to": "tank", "type": "leak", "gain": 4e-11},
         },
     )  # fmt: skip
-    signals = Signals(machine, [0.0, 2.5, 2.6, 3.5], {"x": [0.0, 0.0, 1.0, 1.0]})
+    signals = ValveSignals(machine, [0.0, 2.5, 2.6, 3.5], {"x": [0.0, 0.0, 1.0, 1.0]})
     run = crane.simulate(machine, signals, duration=3.5)
     p = run.channels["pressure_gas"]
     assert p.min() < 2e5 and p[-1] > 10e6
@@ -623,4 +625,4 @@ def test_motor_beside_a_cylinder(tmp_path):
     assert at.forces[1] == pytest.approx(4e6 * 2e-5, rel=1e-12)
     assert rates["pressure_y_a"] == pytest.approx(-1.2e9 / 2e-4 * 2e-5 * 0.1, rel=1e-12)
     assert at.chambers[0][0].volume == pytest.approx(HOSE + 0.2 * AREA_A, rel=1e-12)
-    assert STROKE > 0.2 and root(0.0) == 0.0
+    assert STROKE > 0.2 and signed_square_root(0.0) == 0.0

@@ -15,8 +15,8 @@ import crane
 from crane.cli import entry
 from crane.cli.commands import list_machines
 from crane.common.errors import InputError
-from crane.description import bundled, examples
-from crane.view.plots.recording import recording_figure
+from crane.description import bundled_machines, example_robots
+from crane.view.plots.recording_figure import recording_figure
 
 
 def one_error(result) -> str:
@@ -54,31 +54,31 @@ def test_list():
     assert result.returncode == 0
     lines = result.stdout.splitlines()
     told = dict(line.strip().split(maxsplit=1) for line in lines if line.startswith("  "))
-    assert list(told) == list(bundled())
+    assert list(told) == list(bundled_machines())
     assert told["patu655"] == "The PATU 655, a full-size log crane"
     # each says what it is, in a line of a terminal's width
     assert all(what.startswith(("An ", "The ")) for what in told.values())
     assert max(map(len, lines)) <= 100
-    assert len(lines) == len(bundled()) + 2
-    robots = len(examples())
+    assert len(lines) == len(bundled_machines()) + 2
+    robots = len(example_robots())
     assert lines[-1].startswith(f"{robots} robots of example-robot-data")
     assert lines[-1].endswith(": crane list --robots")
     others = typed("list", "--robots")
     assert others.returncode == 0
-    assert others.stdout.splitlines()[1:] == [f"  {name}" for name in examples()]
+    assert others.stdout.splitlines()[1:] == [f"  {name}" for name in example_robots()]
     assert "ur5_robot" in others.stdout and "some are refused" in others.stdout
 
 
 def test_no_robots_are_an_error_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr("crane.description.sources.example_root", lambda: None)
-    examples.cache_clear()
+    monkeypatch.setattr("crane.description.machine_lookup.example_root", lambda: None)
+    example_robots.cache_clear()
     try:
         with pytest.raises(InputError, match="no robots here, install example-robot-data"):
             list_machines(robots=True)
         list_machines(robots=False)
         assert "robots" not in capsys.readouterr().out
     finally:
-        examples.cache_clear()
+        example_robots.cache_clear()
 
 
 def test_info_says_what_the_machine_is():
@@ -169,7 +169,7 @@ def test_check_of_a_tree_imports_no_scipy(tmp_path):
     """Importing scipy takes as long as all else that it does."""
     urdf = (DATA / "four_bar" / "ground.urdf").read_text()
     (tmp_path / "tree.urdf").write_text(urdf)
-    others = (*SLOW, "crane.cli.simulate", "crane.formats.sdf.translate", "llvmlite.binding")
+    others = (*SLOW, "crane.cli.simulate", "crane.formats.sdf.sdf_translation", "llvmlite.binding")
     assert loaded_by(tmp_path, "check", "tree.urdf", slow=others) == "[]"
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from closing_from_anywhere import Task, rows, table
 
-from crane.closure.anywhere import unwound
+from crane.closure.multi_start_search import remove_revolutions
 from crane.formats.check import check
 
 NAMED = 0.05  # difference of distances from the start that counts [rad], or machine's size
@@ -33,7 +33,7 @@ def apart(task, one, two):
     model = task.equations.model
     size = max(np.abs(place.translation).max() for place in model.jointPlacements)
     off = np.abs(one - two)
-    slides = task.equations.coordinates.slides
+    slides = task.equations.coordinates.is_translation
     endless = np.isinf(task.lower) & ~slides
     off[endless] = np.abs(np.angle(np.exp(1j * (one - two))))[endless]
     off[slides] /= size
@@ -72,7 +72,7 @@ def assert_nearest_and_told(kind, seed, tmp_path):
     path = tmp_path / "mechanism.urdf"
     path.write_text(task.mechanism.urdf(task.said))
     home = task.by_search()
-    told = [finding.what for finding in check(path).findings]
+    told = [finding.message for finding in check(path).findings]
     others = [q for q in assemblies(task, 60) if apart(task, q, home).max() > 1e-3]
     away = far(task, home)
     for q in others:
@@ -108,5 +108,5 @@ def test_whole_turns_come_out_where_limits_let_them():
     lower = np.array([-1.0, -np.inf, 2.0, 4.0, 2.0, -1.0])
     upper = np.array([1.0, np.inf, 4.0, 7.0, 3.0, 1.0])
     winds = np.array([True, True, True, True, True, False])
-    found = unwound(q, np.array([0.0, -3.0, 0.0, 0.0, 0.0, 0.0]), winds, lower, upper)
+    found = remove_revolutions(q, np.array([0.0, -3.0, 0.0, 0.0, 0.0, 0.0]), winds, lower, upper)
     np.testing.assert_allclose(found, [0.2, 3 - turn, turn - 3, 0.5 + turn, 1.0, 7.0], atol=1e-14)

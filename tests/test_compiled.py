@@ -11,7 +11,7 @@ import pytest
 
 import crane
 import crane.codegen.program
-import crane.dynamics.tree
+import crane.dynamics.pinocchio_dynamics
 from crane.common.errors import (
     CraneError,
     CraneWarning,
@@ -165,7 +165,7 @@ def test_random_mechanisms_agree_with_pinocchio(count, kind, tmp_path):
         except CraneError:
             continue
         jacobian = closure.equations.evaluate(machine.home)[1]
-        block = jacobian[np.ix_(closure.structure.rows, closure.passive)]
+        block = jacobian[np.ix_(closure.structure.independent_rows, closure.passive)]
         if np.linalg.cond(block) > 50 or np.abs(closure.gamma(postures)).max() > 20:
             continue
         assert closure.residual(machine.home) < 1e-12 and np.abs(machine.home).max() < 1e-12
@@ -227,7 +227,7 @@ def on_a_stand(folder, kind, closed):
 
 def test_the_trunk_is_the_body_that_carries_all_others(machines, five_bar, tmp_path):
     def trunk(machine):
-        return machine.closure.fast.geometry.trunk
+        return machine.closure.compiled_closure.geometry.trunk
 
     for name in ("mini", "loaded mini", "ur5_robot", "xarm7"):
         assert trunk(machines[name][0]) == 1, name
@@ -243,7 +243,7 @@ def test_the_trunk_is_the_body_that_carries_all_others(machines, five_bar, tmp_p
 @pytest.mark.parametrize("closed", [True, False])
 def test_an_oblique_trunk_agrees_with_pinocchio(tmp_path, kind, closed):
     machine = dressed(on_a_stand(tmp_path, kind, closed))
-    assert machine.closure.fast.geometry.trunk == 1
+    assert machine.closure.compiled_closure.geometry.trunk == 1
     samples = draw(machine, 40)
     home, stand = machine.home[machine.closure.active], machine.active.index("stand")
     moved = samples["q"][:, stand].copy()
@@ -267,8 +267,8 @@ def test_postures_equal_those_tracked_in_numpy(machines, name, share):
     q_a = draw(machine, 60, 3, share)["q"]
     if name == "slider_crank":
         q_a = np.random.default_rng(1).uniform(0.15, 2.9, (60, 1))
-    branch = closure._branch
-    wanted = np.array([branch.reach(target, branch.home).q for target in q_a])
+    branch = closure._continuation
+    wanted = np.array([branch.continue_to(target, branch.home).q for target in q_a])
     assert np.abs(closure.solve(q_a) - wanted).max() < 1e-12
     assert np.abs(closure.solve(q_a[::-1])[::-1] - wanted).max() < 1e-12
     order = np.argsort(q_a[:, 0])
@@ -329,7 +329,7 @@ def test_guesses_of_other_branches_are_refused(slider_crank):
     guess[columns] = 0.2 * np.cos(theta) + 0.3 * np.cos(psi), theta, psi - theta
     for nudge in (0.0, 1e-9, 1e-7):
         with pytest.raises(WrongBranchError):
-            closure.solve([theta], guess=guess + nudge)
+            closure.solve([theta], initial_guess=guess + nudge)
     near = closure.solve([1.1])
     assert np.abs(closure.solve([theta], guess=near) - closure.solve([theta])).max() < 1e-12
 
@@ -345,10 +345,10 @@ def test_guesses_with_opposed_axes_are_refused(tmp_path):
             phi, jacobian = closure.equations.evaluate(guess)
             step = np.linalg.lstsq(jacobian, -phi, rcond=1e-8)[0]
             guess = guess + step * min(1.0, 0.3 / np.abs(step).max(initial=1e-300))
-        if closure.residual(guess) < 1e-12 and closure.equations.turned_over(guess):
+        if closure.residual(guess) < 1e-12 and closure.equations.find_opposed_loop(guess):
             found += 1
             with pytest.raises(WrongBranchError, match="loop 'clasp' is assembled the other way"):
-                closure.solve(guess[closure.active], guess=guess)
+                closure.solve(guess[closure.active], initial_guess=guess)
     assert np.abs(closure.solve(machine.home[closure.active]) - machine.home).max() < 1e-12
 
 
@@ -519,16 +519,16 @@ def test_long_formulas_are_left_to_pinocchio(mini, monkeypatch):
         again = crane.load("mini_forwarder")  # with nothing compiled yet
     quick = crane.Dynamics(mini)
     wanted = {quantity: ask(quick, quantity, samples) for quantity in QUANTITIES}
-    monkeypatch.setattr(crane.codegen.program, "MOST", 10)
-    monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
+    monkeypatch.setattr(crane.codegen.program, "MAX_OPERATIONS", 10)
+    monkeypatch.setattr(crane.closure.compiled_closure, "_SHARED_CODE", {})
     asked = []
-    at = crane.dynamics.tree.TreeDynamics.at
+    at = crane.dynamics.pinocchio_dynamics.PinocchioDynamics.evaluate
 
     def spy(self, quantity, *rest):
         asked.append(quantity)
         return at(self, quantity, *rest)
 
-    monkeypatch.setattr(crane.dynamics.tree.TreeDynamics, "at", spy)
+    monkeypatch.setattr(crane.dynamics.pinocchio_dynamics.PinocchioDynamics, "evaluate", spy)
     long = crane.Dynamics(again)
     for quantity in QUANTITIES:
         asked.clear()

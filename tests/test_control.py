@@ -5,7 +5,7 @@ import pytest
 
 import crane
 from crane.common.errors import CraneWarning, InputError
-from crane.control import CONTROLLERS, controller
+from crane.control import CONTROLLERS, make_controller
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +71,10 @@ def test_computed_torque_corrects_like_a_critically_damped_oscillator(forwarder,
 
 
 def test_named_controllers(forwarder, path):
-    assert isinstance(controller("pi", forwarder, path), crane.PI)
-    assert isinstance(controller("computed-torque", forwarder, path), crane.ComputedTorque)
+    assert isinstance(make_controller("pi", forwarder, path), crane.PI)
+    assert isinstance(make_controller("computed-torque", forwarder, path), crane.ComputedTorque)
     with pytest.raises(InputError, match=r"controller 'pid' is unknown, did you mean 'pi'\?"):
-        controller("pid", forwarder, path)
+        make_controller("pid", forwarder, path)
     names = {"pi", "computed-torque", "valve-pd", "valve-feedforward", "tip-velocity"}
     assert set(CONTROLLERS) == names
 

@@ -9,8 +9,8 @@ import pytest
 
 import crane
 from crane.common.errors import CraneWarning, InputError
-from crane.control import Law
-from crane.simulation.integration import CompiledStepper, PythonStepper
+from crane.control import ControlLaw
+from crane.simulation.integration import PythonStepper, RungeKuttaStepper
 
 PAGE = Path(__file__).parents[1] / "docs" / "controllers.md"
 
@@ -95,7 +95,7 @@ def test_a_law_sees_the_weight_alone_in_numbers_and_traced(page):
     machine, start = page["machine"], page["trajectory"].position(0.0)
     push = np.array([0.5, 40.0, -60.0])  # more than its friction
 
-    class Weight(Law):
+    class Weight(ControlLaw):
         def begin(self, at):
             return at.gravity()
 
@@ -145,9 +145,9 @@ def test_one_law_gives_the_same_in_numbers_and_traced(page, name):
 def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch):
     machine, trajectory, most = page["machine"], page["trajectory"], page["most"]
     made = []
-    build = CompiledStepper._build
+    build = RungeKuttaStepper._build
     monkeypatch.setattr(
-        CompiledStepper, "_build", lambda x, program: made.append(x) or build(x, program)
+        RungeKuttaStepper, "_build", lambda x, program: made.append(x) or build(x, program)
     )
     tighter = crane.simulate(
         machine, page["Fast"](machine, trajectory, 0.5 * most), duration=0.2, method="rk4"
@@ -168,7 +168,7 @@ def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch)
 def test_states_begin_where_the_machine_stands(page):
     """`begin` sees the inverse dynamics at the start, whoever asks."""
 
-    class Held(Law):
+    class Held(ControlLaw):
         def begin(self, at):
             return at.inverse([0.0, 0.0, 0.0], friction=False)
 
@@ -185,7 +185,7 @@ def test_states_begin_where_the_machine_stands(page):
 def test_wrong_numbers_of_forces_and_rates_are_told(page):
     machine, start = page["machine"], page["trajectory"].position(0.0)
 
-    class Short(Law):
+    class Short(ControlLaw):
         def law(self, at):
             return at.v_a[:2], at.v_a
 
@@ -205,7 +205,7 @@ def test_wrong_numbers_of_forces_and_rates_are_told(page):
 
 
 def test_a_branch_in_a_law_is_an_error(page):
-    class Branching(Law):
+    class Branching(ControlLaw):
         def law(self, at):
             return [1.0 if x > 0 else -1.0 for x in at.q_a], ()
 

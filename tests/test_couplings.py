@@ -117,7 +117,7 @@ def test_a_machine_file_couples_joints(tmp_path):
         "  - {name: rack, joints: {x: 1.0, q2: -0.07}}\n"
     )
     machine = crane.load(tmp_path / "train.yaml")
-    same = crane.load(train(tmp_path)).driven_by(["q2"])
+    same = crane.load(train(tmp_path)).with_active_joints(["q2"])
     force = [crane.Dynamics(m).inverse([0.3], [0.2], [0.1])[0] for m in (machine, same)]
     assert force[0] == pytest.approx(force[1], rel=1e-12)
 

@@ -8,9 +8,9 @@ import singular
 from scipy.integrate import solve_ivp
 
 import crane
-from crane.closure import home
+from crane.closure import home_search
 from crane.common.errors import CraneWarning, SimulationError
-from crane.motion.curves import point_to_point
+from crane.motion.trajectory import point_to_point
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 GRAVITY = 9.81
@@ -62,7 +62,7 @@ def test_forces_and_friction_stay_those_of_the_drive(tmp_path):
     machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6).replace(friction=friction)
     runs = {}
     for active in ("s", "a"):
-        one = machine.seen_from(machine.home, (active,))
+        one = machine.with_home_configuration(machine.home, (active,))
 
         def push(t, q, v, active=active):
             # 5 N along the slider, whichever coordinate it is seen by
@@ -121,14 +121,14 @@ def test_parallelograms_stay_such_in_line(tmp_path, count, active):
 
 def test_crossings_do_not_analyse_the_structure_anew(tmp_path, monkeypatch):
     """Ten times the links come in line; the equations that count stay the same."""
-    analysed, whole = [], home.analyse
+    analysed, whole = [], home_search.analyse_constraints
 
     def counted(*arguments):
         analysed.append(arguments)
         return whole(*arguments)
 
     machine = singular.windows(tmp_path, "r0", 6)
-    monkeypatch.setattr(home, "analyse", counted)
+    monkeypatch.setattr(home_search, "analyse_constraints", counted)
     found = run(machine, "r0", 1.0, 10.0, step=1e-2)
     energy = found.channels["kinetic"] + found.channels["potential"]
     assert not analysed and np.ptp(energy) < 1e-5
@@ -148,7 +148,7 @@ def test_a_rocker_that_turns_back_everywhere(tmp_path):
         np.testing.assert_allclose(other, runs[0], rtol=0, atol=1e-7)
 
 
-class Weighed(crane.Law):
+class Weighed(crane.ControlLaw):
     """A spring along a reference, and what holds the weight."""
 
     def __init__(self, machine, reference):
@@ -158,9 +158,9 @@ class Weighed(crane.Law):
     def references(self, times):
         return self.reference.position(times)
 
-    def law(self, at):
-        error = np.array(at.reference) - np.array(at.q_a)
-        return np.array(at.gravity()) + 1e3 * error - 50.0 * np.array(at.v_a), ()
+    def law(self, inputs):
+        error = np.array(inputs.reference) - np.array(inputs.q_a)
+        return np.array(inputs.gravity()) + 1e3 * error - 50.0 * np.array(inputs.v_a), ()
 
 
 @pytest.mark.parametrize("made", [crane.ComputedTorque, Weighed])
@@ -183,13 +183,13 @@ def test_postures_follow_a_recorded_stroke_through_dead_centres(tmp_path, rod):
     found = run(crank, "a", 3.0, 5.0, step=2e-3)
     wanted = singular.postures(crank, found)
     assert np.ptp(wanted[:, crank.column("a")]) > 6 * np.pi
-    slider = crank.seen_from(crank.home, ("s",)).closure
+    slider = crank.with_home_configuration(crank.home, ("s",)).closure
     stroke = wanted[:, [crank.column("s")]]
-    postures = slider.follow(stroke)
+    postures = slider.follow_motion(stroke)
     assert slider.residual(postures).max() < 1e-12
     assert np.abs(postures - wanted).max() < 1e-4
     # a stroke says nothing of the crank to first order there: errors of e are sqrt(e)
     noise = 1e-6 * np.random.default_rng(0).normal(size=stroke.shape)
-    assert np.abs(slider.follow(stroke + noise) - wanted).max() < 5 * np.sqrt(1e-6)
+    assert np.abs(slider.follow_motion(stroke + noise) - wanted).max() < 5 * np.sqrt(1e-6)
     with pytest.raises(crane.CraneError, match="sample 1: the motion does not go on to it"):
-        slider.follow(stroke[:2] - [[0.0], [5.0]])
+        slider.follow_motion(stroke[:2] - [[0.0], [5.0]])

@@ -7,9 +7,9 @@ from test_circuit_transients import VALVE, G, compare, cylinder, orifices
 
 import crane
 from crane.common.errors import CraneError
-from crane.control import Command, Signals
-from crane.control.base import At
-from crane.identification.excitation.levers import Levers
+from crane.control import ValveCommand, ValveSignals
+from crane.control.control_law import ControllerInputs
+from crane.identification.excitation.pulse_signals import PulseSignals
 
 W = 40.0  # of a critically damped spool [rad/s]
 LATE = 0.01337  # [s], no multiple of anything
@@ -34,7 +34,7 @@ def test_a_spool_follows_signals_that_are_given_in_time(tmp_path, late):
     """Polygons: a sum of ramps, each late by as much."""
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": late})
     times, values = [0.05, 0.1, 0.2, 0.25], [0.1, 0.1, 0.6, -0.3]
-    run = crane.simulate(machine, Signals(machine, times, {"x": values}), duration=0.4)
+    run = crane.simulate(machine, ValveSignals(machine, times, {"x": values}), duration=0.4)
     slopes = np.concatenate([[0.0], np.diff(values) / np.diff(times), [0.0]])
     wanted = 0.1 + sum(
         turn * ramp(run.time - at - late)
@@ -51,7 +51,7 @@ def test_a_spool_follows_a_log_whose_samples_are_close(tmp_path, late):
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": late})
     times = np.arange(0.0, 0.4, 0.005)
     values = 0.4 * np.sin(20.0 * times) + 0.1 * np.random.default_rng(3).uniform(-1, 1, len(times))
-    run = crane.simulate(machine, Signals(machine, times, {"x": values}), duration=0.35)
+    run = crane.simulate(machine, ValveSignals(machine, times, {"x": values}), duration=0.35)
     slopes = np.concatenate([[0.0], np.diff(values) / np.diff(times), [0.0]])
     wanted = values[0] + sum(
         turn * ramp(run.time - at - late)
@@ -65,7 +65,9 @@ def test_a_spool_follows_a_program_that_holds_its_signals(tmp_path, late):
     """A sum of steps, of the period 10 ms; one after the other, with the first one before them."""
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": late})
     signals = 0.6 * np.sin(np.arange(31))
-    program = crane.Sampled(lambda t, q, v, p: [signals[round(t / 0.01)]], machine, period=0.01)
+    program = crane.SampledCommand(
+        lambda t, q, v, p: [signals[round(t / 0.01)]], machine, period=0.01
+    )
     for _ in range(2):  # nothing is remembered of the first run
         run = crane.simulate(machine, program, duration=0.3)
         wanted = signals[0] * step(run.time)
@@ -95,7 +97,9 @@ def test_a_cylinder_with_dead_time_beside_scipy(tmp_path):
 
 def test_two_spools_of_different_dead_time(tmp_path):
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": LATE, "spool_b": {"delay": 0.05}})
-    run = crane.simulate(machine, Signals(machine, [0.1, 0.2], {"x": [0.0, 0.5]}), duration=0.3)
+    run = crane.simulate(
+        machine, ValveSignals(machine, [0.1, 0.2], {"x": [0.0, 0.5]}), duration=0.3
+    )
     for name, late in (("spool_x", LATE), ("spool_x_b", 0.05)):
         wanted = 5.0 * (ramp(run.time - 0.1 - late) - ramp(run.time - 0.2 - late))
         np.testing.assert_allclose(run.channels[name], wanted, atol=1e-7)
@@ -111,7 +115,7 @@ def test_a_law_is_asked_each_millisecond_and_held(tmp_path):
         q_ref, v_ref, _ = reference(t)
         return 20.0 * (q_ref - q) + 0.5 * (v_ref - v)
 
-    program = crane.Sampled(unit, machine, period=1e-3)
+    program = crane.SampledCommand(unit, machine, period=1e-3)
     two = crane.simulate(machine, program, duration=0.4)
     np.testing.assert_allclose(one.q, two.q, atol=1e-9)
     np.testing.assert_allclose(one.channels["voltage_x"], two.channels["voltage_x"], atol=1e-6)
@@ -138,12 +142,12 @@ def test_a_loop_with_too_much_dead_time_swings(tmp_path):
 
 def test_a_recording_is_replayed_with_its_dead_time(tmp_path):
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": LATE})
-    signals = Signals(machine, [0.1, 0.2, 0.4], {"x": [0.0, 0.5, -0.5]})
+    signals = ValveSignals(machine, [0.1, 0.2, 0.4], {"x": [0.0, 0.5, -0.5]})
     run = crane.simulate(machine, signals, duration=0.6)
     run.to_csv(tmp_path / "run.csv")
     again, _ = crane.replay(machine, tmp_path / "run.csv")
     np.testing.assert_allclose(again.q, run.q, atol=1e-5 * np.ptp(run.q))
-    account = crane.power_account(machine, run)
+    account = crane.power_balance(machine, run)
     shafts = account.powers["supply.shaft"]
     others = sum(x for name, x in account.powers.items() if not name.endswith("shaft"))
     np.testing.assert_allclose(others, shafts, atol=1e-9 * np.abs(shafts).max())
@@ -155,21 +159,21 @@ def test_how_a_motion_changes_with_dead_time(tmp_path):
     time = np.linspace(0.0, 0.5, 51)
 
     def control(machine):
-        return Signals(machine, time, {"x": 0.4 * np.sin(10 * time)})
+        return ValveSignals(machine, time, {"x": 0.4 * np.sin(10 * time)})
 
     found = crane.sensitivities(
-        machine, control(machine), duration=0.5, by=["valve.x.delay"], outputs=["x"]
+        machine, control(machine), duration=0.5, parameters=["valve.x.delay"], outputs=["x"]
     )
     ends = []
     for late in (LATE - 1e-4, LATE + 1e-4):
         other = crane.load(tmp_path / "rig.yaml", {"valve.x.delay": late})
         ends.append(crane.simulate(other, control(other), duration=0.5, tolerance=1e-10).q[:, 0])
     slope = (ends[1] - ends[0]) / 2e-4
-    np.testing.assert_allclose(found.slopes[:, 0, 0], slope, atol=2e-3 * np.abs(slope).max())
+    np.testing.assert_allclose(found.derivatives[:, 0, 0], slope, atol=2e-3 * np.abs(slope).max())
     weights = np.ones((501, 1))
     with pytest.raises(CraneError, match="changes when signals arrive, which a gradient takes"):
-        crane.gradient(machine, control(machine), of=weights, duration=0.5,
-                       by=["valve.x.delay"], outputs=["x"])  # fmt: skip
+        crane.gradient(machine, control(machine), functional=weights, duration=0.5,
+                       parameters=["valve.x.delay"], outputs=["x"])  # fmt: skip
 
 
 def test_what_cannot_be_is_refused_in_one_line(tmp_path):
@@ -180,31 +184,33 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path):
     machine = rig(tmp_path, ORIFICE | {"delay": 0.02}, control=GAINS)
     reference = crane.via_points([0.0, 0.4], [[0.2], [0.25]])
     with pytest.raises(CraneError, match="a controller in Python has no formulas"):
-        crane.sensitivities(machine, crane.ValvePD(machine, reference), by=["valve.x.c1"])
+        crane.sensitivities(machine, crane.ValvePD(machine, reference), parameters=["valve.x.c1"])
     with pytest.raises(CraneError, match="runs on the compiled backend alone"):
         crane.simulate(machine, crane.ValvePD(machine, reference), backend="pinocchio")
 
-    class Law(Command):
+    class Law(ValveCommand):
         measured = True
 
         def references(self, times):
             return np.full((len(times), 2), 1e6)
 
-        def signals(self, at: At):
+        def signals(self, at: ControllerInputs):
             return [0.1 * at.q_a[0]]
 
     with pytest.raises(CraneError, match="Law has measured pressures and is no function of time"):
         crane.simulate(machine, Law(), duration=0.1)
     at_once = rig(tmp_path, ORIFICE, control=GAINS)
     with pytest.raises(CraneError, match="has no derivative at a delay of 0"):
-        crane.sensitivities(at_once, crane.ValvePD(at_once, reference), by=["valve.x.delay"])
+        crane.sensitivities(
+            at_once, crane.ValvePD(at_once, reference), parameters=["valve.x.delay"]
+        )
 
 
 def test_pulses_that_meet_the_machine_arrive_late(tmp_path):
     """Also those of slots that have passed: the spool is where the signal was a delay ago."""
     machine = rig(tmp_path, ORIFICE | {"delay": 0.137})
     plan = np.array([[[0.6, 1.0]], [[-0.5, 0.7]], [[0.3, 1.0]]])
-    pulses = Levers(machine, plan, 0.2, 8.0, machine.lower, machine.upper, np.inf)
+    pulses = PulseSignals(machine, plan, 0.2, 8.0, machine.lower, machine.upper, np.inf)
     run = crane.simulate(machine, pulses, duration=1.0)
     signal = run.channels["voltage_x"]
     assert signal.max() > 0.2 and signal.min() < -0.2

@@ -10,9 +10,21 @@ import pytest
 from broken import DATA, GROUND, LOOPED, MACHINE, MINI, MODELS, ROCKER, Edit, copy_machine, swap
 
 import crane
-from crane.common.errors import CraneError, CraneWarning, DescriptionError, MechanismError, known
-from crane.description import LOOP_TYPES, Friction, bundled, examples, inertia_problem
-from crane.description.sources import find
+from crane.common.errors import (
+    CraneError,
+    CraneWarning,
+    DescriptionError,
+    MechanismError,
+    suggest_names,
+)
+from crane.description import (
+    LOOP_TYPES,
+    Friction,
+    bundled_machines,
+    example_robots,
+    inertia_problem,
+)
+from crane.description.machine_lookup import find_machine_file
 
 NO_MACHINE = (
     "not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an SDF (.sdf) or a MJCF "
@@ -235,7 +247,7 @@ class TestWarnings:
             four_bar()
             four_bar(machine=LOOPED)
 
-    @pytest.mark.parametrize("name", bundled())
+    @pytest.mark.parametrize("name", bundled_machines())
     def test_bundled_machines_warn_of_nothing(self, name):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -259,12 +271,12 @@ class TestWarnings:
 
 class TestSources:
     def test_bundled(self):
-        assert bundled()["mini_forwarder"] == MODELS / MINI
-        assert find("mini_forwarder") == MODELS / MINI
+        assert bundled_machines()["mini_forwarder"] == MODELS / MINI
+        assert find_machine_file("mini_forwarder") == MODELS / MINI
 
     def test_examples_are_robots_of_example_robot_data(self):
-        assert len(examples()) > 50
-        assert find("ur5_robot").name == "ur5_robot.urdf"
+        assert len(example_robots()) > 50
+        assert find_machine_file("ur5_robot").name == "ur5_robot.urdf"
         assert crane.load("ur5_robot").active == tuple(
             f"{name}_joint"
             for name in (
@@ -275,11 +287,11 @@ class TestSources:
     @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
     def test_every_example_loads_or_is_refused_with_a_line(self):
         loaded = 0
-        for name in examples():
+        for name in example_robots():
             try:
                 machine = crane.load(name)
             except CraneError as error:
-                assert str(error).startswith(examples()[name].name)
+                assert str(error).startswith(example_robots()[name].name)
             else:
                 loaded += 1
                 free = machine.model.nv - len(machine.closure.equations.couplings)
@@ -290,15 +302,20 @@ class TestSources:
     def test_paths(self, tmp_path, monkeypatch):
         path = copy_machine(MACHINE, tmp_path)
         monkeypatch.chdir(tmp_path)
-        assert find(path) == find(str(path)) == find(MACHINE) == path.resolve()
+        assert (
+            find_machine_file(path)
+            == find_machine_file(str(path))
+            == find_machine_file(MACHINE)
+            == path.resolve()
+        )
         path.rename(tmp_path / "OTHER.YML")
         assert crane.load("OTHER.YML").name == "four_bar"
 
     def test_reference_loads_the_same_machine_again(self, four_bar, mini):
-        assert mini.reference == "mini_forwarder"
+        assert mini.load_name == "mini_forwarder"
         machine = four_bar()
-        assert machine.reference == str(machine.path)
-        assert crane.load("ur5_robot").reference == "ur5_robot"
+        assert machine.load_name == str(machine.path)
+        assert crane.load("ur5_robot").load_name == "ur5_robot"
 
     @pytest.mark.parametrize(
         ("name", "message"),
@@ -328,7 +345,7 @@ class TestSources:
         (tmp_path / "a.txt").write_text("a crane")
         with pytest.raises(CraneError) as caught:
             crane.load(name)
-        assert str(caught.value) == message.format(bundled=", ".join(sorted(bundled())))
+        assert str(caught.value) == message.format(bundled=", ".join(sorted(bundled_machines())))
 
     @pytest.mark.parametrize("suffix", ["", ".yaml"])
     def test_name_longer_than_any_file(self, suffix):
@@ -341,27 +358,27 @@ class TestWords:
         assert str(CraneError("a\nb\r\u2028c\x1b[31m\tä")) == "a b  c [31m ä"
 
     def test_mechanism_errors_tell_what_they_are_about(self):
-        assert MechanismError("text", "loop pin").about == "loop pin"
+        assert MechanismError("text", "loop pin").subject == "loop pin"
 
     def test_nearest_name_or_all(self):
-        assert known(["q1", "X1"]) == "known: X1, q1"
-        assert known(["link2_D", "link2_E"], "link_2D") == "did you mean 'link2_D'?"
-        assert known(["link2_D"], "boom") == "known: link2_D"
-        assert known([]) == "there are none"
+        assert suggest_names(["q1", "X1"]) == "known: X1, q1"
+        assert suggest_names(["link2_D", "link2_E"], "link_2D") == "did you mean 'link2_D'?"
+        assert suggest_names(["link2_D"], "boom") == "known: link2_D"
+        assert suggest_names([]) == "there are none"
 
     def test_of_many_names_the_nearest_are_listed_first(self):
         names = [f"link_{i}" for i in range(40)] + ["bucket_lip", "bucket_load", "tip_fork"]
-        assert known(names, "bucketlip") == "did you mean 'bucket_lip'?"
-        told = known(names, "tip")
+        assert suggest_names(names, "bucketlip") == "did you mean 'bucket_lip'?"
+        told = suggest_names(names, "tip")
         assert told.startswith("the nearest of 43 known ones are tip_fork, ")
         assert told.count(",") == 7
-        assert "bucket_lip, bucket_load" in known(names, "Bucket")
-        assert known(names) == (
+        assert "bucket_lip, bucket_load" in suggest_names(names, "Bucket")
+        assert suggest_names(names) == (
             "known: bucket_lip, bucket_load, link_0, link_1, link_10, link_11, link_12, link_13 "
             "and 35 more"
         )
         many = (f"n{i}" for i in range(10**5))
-        assert len(known(many, "x")) < 200
+        assert len(suggest_names(many, "x")) < 200
 
     @pytest.mark.parametrize(
         ("mass", "moments", "problem"),

@@ -5,10 +5,10 @@ import pytest
 from typed import typed
 
 import crane
-from crane.formats.loading import Variants
-from crane.studies.design.dual import FUNCTIONS, Dual
-from crane.studies.design.expressions import Expression, requirement
-from crane.studies.design.quantities import Point, Terms
+from crane.formats.machine_loading import MachineVariants
+from crane.studies.design.dual_numbers import DUAL_FUNCTIONS, DualNumber
+from crane.studies.design.measure_expressions import MeasureExpression, parse_requirement
+from crane.studies.design.variant_measures import MeasureOptions, VariantEvaluation
 
 pytestmark = pytest.mark.slow
 
@@ -102,12 +102,12 @@ def test_the_classical_transmission_angle_problem(four_bar):
     t, u = np.tan(np.deg2rad(100.0)), np.tan(np.deg2rad(77.5))
     roots = np.roots([1.0, 2.0, -(t**2), -(t**2) / u**2 * (1 + t**2)])
     q = max(x.real for x in roots if abs(x.imag) < 1e-9 and x.real > 0)
-    assert sum(x.fits for x in found.solutions) >= 8
+    assert sum(x.is_feasible for x in found.solutions) >= 8
     for x in found.solutions:
-        if x.fits:
+        if x.is_feasible:
             crank, coupler, rocker = x.values
             assert coupler / crank == pytest.approx(abs(t) / np.sqrt(q), rel=1e-4)
-            assert x.goals[0] == pytest.approx(48.1868, abs=1e-3)
+            assert x.objectives[0] == pytest.approx(48.1868, abs=1e-3)
             assert (crank, coupler, rocker) == pytest.approx(
                 (0.345671, 0.833634, 0.966648), abs=1e-4
             )
@@ -136,18 +136,20 @@ def test_a_front_of_two_goals_is_that_of_a_grid():
         "swing": lambda machine: np.degrees(np.ptp(at(machine, 0.1, 1.0)[0])),
     }
     found = crane.design("excavator", vary, maximise=goals, measures=own, starts=1, points=5)
-    front = np.array([x.goals for x in found.solutions])
+    front = np.array([x.objectives for x in found.solutions])
     assert len(front) >= 3 and (np.ptp(front, axis=0) > 0.01 * front.mean(axis=0)).all()
-    variants = Variants(crane.load("excavator"))
+    variants = MachineVariants(crane.load("excavator"))
     low, high = np.array(list(vary.values())).T
-    expressions = [Expression(goal) for goal in goals]
+    expressions = [MeasureExpression(goal) for goal in goals]
     grid = []
     for a in np.linspace(low[0], high[0], 7):
         for b in np.linspace(low[1], high[1], 7):
             values = np.array([a, b])
             try:
-                point = Point(variants, list(vary), values, high - low, Terms(own=own))
-                grid.append([point.value(x) for x in expressions])
+                point = VariantEvaluation(
+                    variants, list(vary), values, high - low, MeasureOptions(user_measures=own)
+                )
+                grid.append([point.evaluate(x) for x in expressions])
             except crane.CraneError:
                 continue
     grid = np.array(grid)
@@ -169,20 +171,20 @@ def test_a_front_of_two_goals_is_that_of_a_grid():
 )  # fmt: skip
 def test_slopes_are_those_of_variants_beside(text):
     names = ["boom_lift.x", "arm.mass", "bucket_lip.x", "upper_boom.z"]
-    variants = Variants(crane.load("excavator"))
+    variants = MachineVariants(crane.load("excavator"))
     here = np.array([variants.values[name] for name in names])
     ranges = np.array([0.5, 100.0, 0.3, 0.2])
-    terms, expression = Terms(tasks=("grade",)), Expression(text)
+    terms, expression = MeasureOptions(tasks=("grade",)), MeasureExpression(text)
 
     def at(values):
-        return Point(variants, names, values, ranges, terms)
+        return VariantEvaluation(variants, names, values, ranges, terms)
 
-    found = at(here).dual(expression)
+    found = at(here).evaluate_dual(expression)
     for i, step in enumerate(1e-3 * ranges):
         more, less = (here + sign * step * np.eye(4)[i] for sign in (1, -1))
-        difference = (at(more).value(expression) - at(less).value(expression)) / (2 * step)
+        difference = (at(more).evaluate(expression) - at(less).evaluate(expression)) / (2 * step)
         scale = max(abs(difference), abs(found.value) * 1e-2 / ranges[i])
-        assert found.slopes[i] == pytest.approx(difference, abs=2e-4 * scale)
+        assert found.derivatives[i] == pytest.approx(difference, abs=2e-4 * scale)
 
 
 def test_dual_numbers_are_exact():
@@ -191,9 +193,14 @@ def test_dual_numbers_are_exact():
     text = "exp(0.1*x)*sqrt(y) - x**3/(1 + y) + log(y)*sin(x)*cos(y) + abs(-x) + 2**y + x**y"
     text += " + max(x, y)"
     for x, y in random.uniform(0.3, 2.0, (20, 2)):
-        names = {"x": Dual(x, np.array([1.0, 0.0])), "y": Dual(y, np.array([0.0, 1.0]))}
-        found = Expression(text)(
-            names.__getitem__, lambda f, a: FUNCTIONS[f](*a), lambda c: Dual(c, np.zeros(2))
+        names = {
+            "x": DualNumber(x, np.array([1.0, 0.0])),
+            "y": DualNumber(y, np.array([0.0, 1.0])),
+        }
+        found = MeasureExpression(text)(
+            names.__getitem__,
+            lambda f, a: DUAL_FUNCTIONS[f](*a),
+            lambda c: DualNumber(c, np.zeros(2)),
         )
         numpy = {name: getattr(np, name) for name in ("exp", "sqrt", "log", "sin", "cos")}
         numpy |= {
@@ -234,7 +241,7 @@ def test_what_cannot_be_designed_is_said_in_one_line(given, told):
 
 def test_requirements_are_differences():
     for text, value, equal in (("3 >= 2", 1, False), ("3 <= 2", -1, False), ("3 == 2", 1, True)):
-        expression, same = requirement(text)
+        expression, same = parse_requirement(text)
         assert (expression(float, None), same) == (value, equal)
 
 
@@ -265,10 +272,10 @@ def test_loads_before_and_after_are_drawn(tmp_path):
 
 def test_slopes_of_a_chart_are_written(tmp_path):
     chart = crane.capacity(crane.load("excavator"), "bucket", radii=[5.0, 6.0], heights=[1.0])
-    chart.slopes_to_csv(tmp_path / "slopes.csv", ["arm.mass"])
+    chart.derivatives_to_csv(tmp_path / "slopes.csv", ["arm.mass"])
     lines = [x for x in (tmp_path / "slopes.csv").read_text().splitlines() if x[0] != "#"]
     assert lines[0].endswith("load [kg],load_by_arm.mass [kg/SI]") and len(lines) == 5
-    wanted = chart.slopes(["arm.mass"])[0, 0, :, 0]
+    wanted = chart.derivatives(["arm.mass"])[0, 0, :, 0]
     assert [float(x.split(",")[-1]) for x in lines[1:3]] == pytest.approx(wanted)
 
 
@@ -294,9 +301,9 @@ def test_a_wall_does_not_take_what_was_found(pendulum):
 
     vary = {"upper.mass": (0.05, 1.0), "lower.mass": (0.05, 1.0)}
     found = crane.design(pendulum, vary, minimise=["wall"], measures={"wall": wall}, starts=4)
-    assert all(np.isfinite(x.goals).all() and x.fits for x in found.solutions)
-    assert found.solutions[0].goals[0] == pytest.approx(0.55, abs=0.08)  # x = 0.3, y = 0.5
-    assert len({x.start.tobytes() for x in found.solutions}) == 4
+    assert all(np.isfinite(x.objectives).all() and x.is_feasible for x in found.solutions)
+    assert found.solutions[0].objectives[0] == pytest.approx(0.55, abs=0.08)  # x = 0.3, y = 0.5
+    assert len({x.initial_values.tobytes() for x in found.solutions}) == 4
 
 
 def test_measures_that_are_no_number_do_not_fit(pendulum):
@@ -306,7 +313,7 @@ def test_measures_that_are_no_number_do_not_fit(pendulum):
 
     vary = {"upper.mass": (0.05, 1.0)}
     found = crane.design(pendulum, vary, maximise=["odd"], measures={"odd": odd}, starts=3)
-    assert 0.2 < found.solutions[0].goals[0] <= 0.5
+    assert 0.2 < found.solutions[0].objectives[0] <= 0.5
 
 
 def test_a_machine_that_is_not_its_files_is_refused():

@@ -13,13 +13,17 @@ from motions import NOISE, noisy
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
-from crane.identification.mechanics.determined import weak_directions
-from crane.identification.mechanics.feasible import body_parameters, curvature, pseudo_inertia
+from crane.identification.mechanics.feasible_estimate import thicken_body
+from crane.identification.mechanics.feasible_parameters import (
+    body_parameters,
+    divergence_hessian_root,
+    pseudo_inertia,
+)
+from crane.identification.mechanics.identifiability import weak_directions
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.possible import thick
-from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.signals.motion import Motion
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
+from crane.identification.signals.signal_processing import Motion
 
 motion = partial(motions.motion, period=8.0, duration=16.0)
 
@@ -137,7 +141,7 @@ def test_a_recording_that_tells_all_is_told_without_a_word():
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)
         found = identify(arm, Motion(time, q, v, acc, tau))
-    assert found.doubt == "" and not any(found.marks) and found.undetermined == []
+    assert found.warning == "" and not any(found.marks) and found.undetermined_directions == []
 
 
 # --- standard deviations ---------------------------------------------------------------------
@@ -151,7 +155,7 @@ def test_curvature_is_the_second_derivative_of_the_divergence():
         E = rng.normal(size=(4, 4))
         E = E + E.T
         along = body_parameters(L @ E @ L.T)
-        wanted = np.sum((curvature(body_parameters(L @ L.T)) @ along) ** 2)
+        wanted = np.sum((divergence_hessian_root(body_parameters(L @ L.T)) @ along) ** 2)
         assert np.sum(E**2) == pytest.approx(wanted, rel=1e-9)
 
 
@@ -179,14 +183,14 @@ def test_a_feasible_estimate_is_as_known_as_its_own_objective_says(mini, plain):
 @pytest.mark.parametrize("prior", [None, 0.3])
 def test_feasible_intervals_cover_machines_that_are_not_as_described(mini, prior):
     """Bodies and friction drawn by 30 % about the description: 90 to 99 % of the intervals."""
-    model, given, covered = Model(mini), motion(mini), []
+    model, given, covered = IdentificationModel(mini), motion(mini), []
     at = model.samples(given.q, given.v, given.a)
-    W, offset = model.regressor(at), model.known(at)
+    W, offset = model.regressor(at), model.known_forces(at)
     for seed in range(8):
         rng = np.random.default_rng(seed)
         truth = model.nominal.copy()
         for i in range(0, 10 * len(model.bodies), 10):
-            L = np.linalg.cholesky(pseudo_inertia(thick(truth[i : i + 10])))
+            L = np.linalg.cholesky(pseudo_inertia(thicken_body(truth[i : i + 10])))
             E = rng.normal(size=(4, 4))
             values, vectors = np.linalg.eigh(0.15 * (E + E.T))
             X = vectors @ np.diag(np.exp(values)) @ vectors.T

@@ -5,7 +5,7 @@ import pytest
 from free_bodies import about, balance, moment, places
 
 import crane
-from crane.formats.loading import Variants
+from crane.formats.machine_loading import MachineVariants
 
 G, NONE = np.array([0.0, 0.0, -9.81]), np.zeros(3)
 PUMP, TANK = 3.5e7, 3.0e5  # of the excavator [Pa]
@@ -78,16 +78,16 @@ def test_what_the_drives_give_alone_is_pressure_times_levers(excavator):
     for one, curls in ((found.bucket, None), (found.arm, found.bucket.stroke)):
         i = excavator.active.index(one.joint)
         at_best = force(one.joint, one.stroke, curls or one.stroke)
-        assert one.alone == pytest.approx(at_best, rel=1e-9)
+        assert one.isolated_force == pytest.approx(at_best, rel=1e-9)
         low, high = excavator.lower[i] + 1e-3, excavator.upper[i] - 1e-3
         brute = [force(one.joint, x, curls or x) for x in np.linspace(low, high, 200)]
-        assert max(brute) <= one.alone * (1 + 1e-12)
-        assert max(brute) == pytest.approx(one.alone, rel=1e-4)
+        assert max(brute) <= one.isolated_force * (1 + 1e-12)
+        assert max(brute) == pytest.approx(one.isolated_force, rel=1e-4)
         step = 1e-3 * (high - low)  # a maximum: flat to both sides
         beside = [force(one.joint, one.stroke + x, curls or one.stroke + x) for x in (-step, step)]
         assert beside[0] - beside[1] == pytest.approx(0, abs=1e-3 * (2 * at_best - sum(beside)))
-    assert found.bucket.alone == pytest.approx(140.5e3, rel=0.005)  # as data sheets print
-    assert found.arm.alone == pytest.approx(106.7e3, rel=0.01)
+    assert found.bucket.isolated_force == pytest.approx(140.5e3, rel=0.005)  # as data sheets print
+    assert found.arm.isolated_force == pytest.approx(106.7e3, rel=0.01)
 
 
 @pytest.mark.parametrize("weights", [False, True])
@@ -98,20 +98,26 @@ def test_what_holds_ends_what_digs(excavator, weights):
         q = excavator.closure.solve(one.q_a)
         way, gravity = tangent(excavator, q, one.pivot), G if weights else NONE
         hand = by_hand(excavator, [one.joint], q, way, gravity)
-        for cause, force in one.each.items():
-            if cause.why == "tips":
-                first, second = (places(excavator, q)[x][:3, 3] for x in cause.what.split(" to "))
+        for cause, force in one.forces_by_factor.items():
+            if cause.reason == "tips":
+                first, second = (
+                    places(excavator, q)[x][:3, 3] for x in cause.element.split(" to ")
+                )
                 held = moment(excavator, q, G, 0.0, LIP, first, second)
                 line = (second - first) / np.linalg.norm(second - first)
                 lip = places(excavator, q)[LIP][:3, 3]
                 turned = line @ np.cross(lip - first, -way)
-                hand[cause.what] = -held / turned if turned > 0 else np.inf
-            if cause.what in hand:
-                assert force == pytest.approx(hand[cause.what], rel=1e-9)
+                hand[cause.element] = -held / turned if turned > 0 else np.inf
+            if cause.element in hand:
+                assert force == pytest.approx(hand[cause.element], rel=1e-9)
         assert one.force == pytest.approx(min(hand.values()), rel=1e-9)
         # at the edge of two causes, one of which is what a closed valve holds
-        ends = [cause.why for cause, force in one.each.items() if force <= one.force * (1 + 1e-9)]
-        assert one.cause.why in ends and "holding pressure" in ends
+        ends = [
+            cause.reason
+            for cause, force in one.forces_by_factor.items()
+            if force <= one.force * (1 + 1e-9)
+        ]
+        assert one.limiting_factor.reason in ends and "holding pressure" in ends
         axes = [np.linspace(excavator.lower[k], excavator.upper[k], 9) for k in (1, 2, 3)]
         if one.joint == "X_arm":
             axes[2] = [found.bucket.stroke]
@@ -137,7 +143,7 @@ def test_a_tool_that_pushes_upwards_lifts(excavator):
     field = crane.tool_force(excavator, "up", step=1.0)
     assert np.array_equal(np.isfinite(field.forces), np.isfinite(chart.loads))
     assert np.nanmax(np.abs(field.forces / (9.81 * chart.loads) - 1)) < 1e-13
-    assert np.array_equal(field.cause, chart.cause)
+    assert np.array_equal(field.limiting_factor_index, chart.limiting_factor_index)
     other = crane.tool_force(excavator, (0.0, 0.0, 2.0), step=1.0)
     assert np.array_equal(other.forces, field.forces, equal_nan=True)
 
@@ -145,7 +151,7 @@ def test_a_tool_that_pushes_upwards_lifts(excavator):
 @pytest.mark.parametrize("direction", ["tangent", "-tangent", "normal", "in", (1.0, 0.0, -1.0)])
 def test_every_place_is_what_statics_by_hand_give(excavator, direction):
     field = crane.tool_force(excavator, direction, step=2.0, slews=[0.0, 1.2])
-    ways = field.ways()
+    ways = field.section_directions()
     reached = np.argwhere(np.isfinite(field.forces) & (field.forces > 0))
     for s, b, a in reached[np.random.default_rng(0).choice(len(reached), 8, replace=False)]:
         q = excavator.closure.solve(field.q_a[s, b, a])
@@ -159,14 +165,14 @@ def test_every_place_is_what_statics_by_hand_give(excavator, direction):
             "in": turn @ [-1.0, 0.0, 0.0],
         }.get(direction, turn @ [0.5**0.5, 0.0, -(0.5**0.5)])
         assert ways[s, b, a] == pytest.approx((turn.T @ way)[[0, 2]], abs=1e-9)
-        hand = by_hand(excavator, field.working, q, way, G)
-        for cause in field.causes:
-            if cause.why == "tips":
-                first, second = (at[x][:3, 3] for x in cause.what.split(" to "))
+        hand = by_hand(excavator, field.working_joints, q, way, G)
+        for cause in field.limiting_factors:
+            if cause.reason == "tips":
+                first, second = (at[x][:3, 3] for x in cause.element.split(" to "))
                 line = (second - first) / np.linalg.norm(second - first)
                 turned = line @ np.cross(at[LIP][:3, 3] - first, -way)
                 held = moment(excavator, q, G, 0.0, LIP, first, second)
-                hand[cause.what] = -held / turned if turned > 0 else np.inf
+                hand[cause.element] = -held / turned if turned > 0 else np.inf
         assert field.forces[s, b, a] == pytest.approx(min(hand.values()), rel=1e-8)
 
 
@@ -186,7 +192,7 @@ def test_slopes_of_tool_forces_are_those_of_fields_beside(excavator, given, gap)
     field = crane.tool_force(excavator, **given, step=1.5, slews=[0.4])
     works = "X_boom" if given["direction"] == "normal" else "X_arm"
     names = ["boom_lift.y", "arm.mass", f"cylinder.{works}.area_a"]
-    slopes, beside = field.slopes(names), Variants(excavator)
+    slopes, beside = field.derivatives(names), MachineVariants(excavator)
     at = {"slews": [0.4], "radii": field.radii, "heights": field.heights}
     for k, name in enumerate(names):
         value = beside.values[name]
@@ -197,7 +203,11 @@ def test_slopes_of_tool_forces_are_those_of_fields_beside(excavator, given, gap)
         )
         with np.errstate(invalid="ignore"):
             difference = (more.forces - less.forces) / (2 * step)
-        same = (more.cause == field.cause) & (less.cause == field.cause) & (field.forces > 0)
+        same = (
+            (more.limiting_factor_index == field.limiting_factor_index)
+            & (less.limiting_factor_index == field.limiting_factor_index)
+            & (field.forces > 0)
+        )
         same &= np.isfinite(difference)
         found = np.abs(difference - slopes[..., k])[same] / np.abs(difference[same]).max()
         assert same.sum() > 8 and np.median(found) < gap

@@ -54,8 +54,8 @@ def aside(text, far):
 def assert_closed(machine, least, most):
     """Independent equations to rounding, all others within what is allowed, here and elsewhere."""
     closure, structure = machine.closure, machine.closure.structure
-    surplus, units = structure.surplus, closure.equations.row_units
-    assert least <= surplus.gap * units[surplus.row] <= most
+    surplus, units = structure.redundancy, closure.equations.residual_units
+    assert least <= surplus.largest_gap * units[surplus.largest_row] <= most
     for reach in (0.0, 0.02, -0.03):
         q = closure.solve(machine.home[closure.active] + reach)
         phi = closure.equations.scaled(q)[0]

@@ -10,13 +10,13 @@ from rig import Rig, Tolerances
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
-from crane.identification.excitation.fourier import Fourier
+from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.signals.hum import line
-from crane.identification.signals.outliers import outliers, repaired
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
+from crane.identification.signals.outliers import outlier_mask, replace_outliers
+from crane.identification.signals.spectral_lines import strongest_spectral_line
 from crane.recordings.logs import read_log
-from crane.recordings.measured import read_measured
+from crane.recordings.measured_recordings import read_measured
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 COLUMNS = Path(__file__).parents[1] / "scripts" / "columns"
@@ -30,11 +30,11 @@ def reference(seed):
     """Five harmonics of 0.1 Hz, twice, over most of the strokes."""
     rows = np.random.default_rng(seed).normal(size=(11, 3))
     rows[0] = 0
-    q = Fourier(rows, 10.0).position(np.linspace(0, 10, 2000))
+    q = FourierTrajectory(rows, 10.0).position(np.linspace(0, 10, 2000))
     scale = 2 * RANGE / np.ptp(q, axis=0)
     rows[1:] *= scale
     rows[0] = MIDDLE - scale * (q.max(axis=0) + q.min(axis=0)) / 2
-    return Fourier(rows, 10.0, 2)
+    return FourierTrajectory(rows, 10.0, 2)
 
 
 def rig_recording(machine, rig, seed):
@@ -181,7 +181,7 @@ def test_what_is_no_outlier(kind):
         "walk": np.cumsum(rng.normal(size=len(time))),
         "constant": np.full(len(time), 3.0),
     }[kind]
-    assert not outliers(x).any()
+    assert not outlier_mask(x).any()
 
 
 def test_neighbouring_outliers_are_found():
@@ -191,9 +191,9 @@ def test_neighbouring_outliers_are_found():
     at = [100, 200, 201, 300, 302, 400, 403, 500, 501, 502]
     x = true.copy()
     x[at] += [1, 1, -1, 2, 1, -1, -1, 1, 1.2, 0.9]
-    found = outliers(x)
+    found = outlier_mask(x)
     assert np.flatnonzero(found).tolist() == at
-    assert np.abs(repaired(x, found) - true).max() < 5e-3
+    assert np.abs(replace_outliers(x, found) - true).max() < 5e-3
 
 
 def test_lines_have_their_frequency_and_amplitude():
@@ -201,8 +201,10 @@ def test_lines_have_their_frequency_and_amplitude():
     noise = np.random.default_rng(3).normal(size=len(time))
     motion = 30 * np.sin(2 * np.pi * 0.3 * time)
     sweep = 3 * np.sin(2 * np.pi * (20 + 4 * time) * time)
-    assert line(motion + noise + sweep, 1e-3, 5.0) is None
-    frequency, amplitude = line(motion + noise + 0.5 * np.cos(2 * np.pi * 60.2 * time), 1e-3, 5.0)
+    assert strongest_spectral_line(motion + noise + sweep, 1e-3, 5.0) is None
+    frequency, amplitude = strongest_spectral_line(
+        motion + noise + 0.5 * np.cos(2 * np.pi * 60.2 * time), 1e-3, 5.0
+    )
     assert abs(frequency - 60.2) < 0.1 and abs(amplitude / 0.5 - 1) < 0.1
 
 
@@ -236,7 +238,7 @@ def test_measured_arms_run_through(tmp_path):
     runs = {}
     for name, log in (("kr300", "kr300_A"), ("kr300", "kr300_B"), ("tx40", "tx40_recording")):
         table = read_log(DATA / name / f"{log}.npz", COLUMNS / f"{name}.txt")
-        timeseries.write(tmp_path / f"{log}.csv", table)
+        timeseries.write_table(tmp_path / f"{log}.csv", table)
         runs[log] = read_measured(crane.load(name), tmp_path / f"{log}.csv")
     for name, learn, judge, doubtful in (
         ("kr300", "kr300_A", "kr300_B", []),

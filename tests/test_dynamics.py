@@ -377,8 +377,8 @@ def test_power_of_the_drives_is_the_rate_of_energy_plus_dissipation(loaded):
             2e-5,
         )
         slip, none = np.sign(loaded.closure.gamma(loaded.closure.solve(q)) @ v)[here], np.zeros(3)
-        dynamics.set_modes(slip, none, none, True)
-        *rates, lost, _ = dynamics.at("rates", loaded.closure.solve(q), v, force)
+        dynamics.set_stick_slip_modes(slip, none, none, True)
+        *rates, lost, _ = dynamics.evaluate_closed("rates", loaded.closure.solve(q), v, force)
         speed = np.array(rates[: loaded.model.nv])
         # by hand: friction of all joints, and the two dampers among the elements
         by_hand = v @ dynamics.friction(q, v) + 0.7 * speed[loaded.column("q9")] ** 2
@@ -819,7 +819,7 @@ def test_from_rest_friction_that_sticks_is_against_the_acceleration(mini, backen
     wanted = bare.inverse(q_a, rest, a_a) + offsets
     for joint, law in laws.items():
         row = gamma[machine.column(joint)]
-        wanted += row * law.breakaway * np.sign(row @ a_a)
+        wanted += row * law.breakaway_force * np.sign(row @ a_a)
     found = rough.inverse(q_a, rest, a_a, friction=True)
     assert found == pytest.approx(wanted, abs=1e-9)
     assert np.abs(found - bare.inverse(q_a, rest, a_a) - offsets).max() > 1.0

@@ -13,21 +13,21 @@ from test_compiled import off
 from typed import typed
 
 import crane
-from crane.closure.traced import Bodies, Constants, Loops
+from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics
 from crane.codegen import Program, Tape
-from crane.codegen.derivative import derivatives
+from crane.codegen.differentiation import differentiate
 from crane.common.errors import CraneWarning, InputError
-from crane.dynamics.compiled import MOVES, QUANTITIES
-from crane.dynamics.traced import Sweep
-from crane.identification.mechanics.base import random_samples
-from crane.identification.mechanics.friction import friction
+from crane.dynamics.compiled_dynamics import QUANTITIES, STICK_SLIP_QUANTITIES
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
+from crane.identification.mechanics.base_parameters import random_samples
+from crane.identification.mechanics.force_element_terms import ForceElementTerm, GasSpringTerm
+from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertias import Inertial
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.passive import GasScale, SpringForce
-from crane.identification.mechanics.term import Direction
-from crane.identification.mechanics.terms import default_terms
-from crane.identification.signals.motion import Motion
+from crane.identification.mechanics.inertial_terms import InertialTerm
+from crane.identification.mechanics.model_term import ForceDirection
+from crane.identification.mechanics.term_selection import default_terms
+from crane.identification.signals.signal_processing import Motion
 
 BOOM, STRUT = ("base", "link7"), ("link3_H", "A1_rod")  # of the mini forwarder
 
@@ -82,7 +82,7 @@ def clad(machine, seed):
 # --- both backends ---------------------------------------------------------------------------
 
 
-class Floats(Constants):
+class Floats(FormulaConstants):
     """Numbers of a machine, not traced: formulas of floats are floats."""
 
     def __init__(self, values):
@@ -95,11 +95,11 @@ class Floats(Constants):
 def formula(dynamics, quantity, q, v_a, x):
     """A quantity by its formulas, without compiling them."""
     fast = dynamics.machine.closure.fast
-    posture = Bodies(fast.geometry, Floats(fast.geometry.numbers), q.tolist())
-    loops = Loops(fast._equations, fast._structure, fast._active, fast._passive, posture)
-    sweep = Sweep(
+    posture = PositionKinematics(fast.geometry, Floats(fast.geometry.numbers), q.tolist())
+    loops = LoopFormulas(fast._equations, fast._structure, fast._active, fast._passive, posture)
+    sweep = DynamicsFormulas(
         posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(), dynamics.form,
-        quantity in MOVES,
+        quantity in STICK_SLIP_QUANTITIES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
 
@@ -109,12 +109,12 @@ def same_on_both_backends(machine, samples):
     q_a, v_a, x = samples
     q = machine.closure.solve(q_a)
     for quantity in ("passive", "inverse with friction", "bias", "energy", "rates", "observation"):
-        wanted = two.at(quantity, q, v_a, x)
+        wanted = two.evaluate_closed(quantity, q, v_a, x)
         found = np.array(
             [formula(one, quantity, *sample) for sample in zip(q, v_a, x, strict=True)]
         )
         assert off(found, wanted) < (1e-9 if quantity == "rates" else 1e-11)
-    assert np.abs(two.at("passive", q, v_a, x)).max() > 0.1
+    assert np.abs(two.evaluate_closed("passive", q, v_a, x)).max() > 0.1
     return one
 
 
@@ -135,7 +135,7 @@ def test_random_mechanisms(kind, tmp_path):
                 machine = crane.load(oracles.random_mechanism(tmp_path, seed, kind))
             except crane.CraneError:
                 continue
-        condition = float(machine.closure.condition(machine.home))
+        condition = float(machine.closure.condition_number(machine.home))
         if condition < 30 and len(machine.joints) < 8:
             same_on_both_backends(clad(machine, seed), samples_of(machine, 0.005))
             made += 1
@@ -152,7 +152,7 @@ def test_machine_code(mini):
     q = mini.closure.solve(samples[0])
     for quantity in ("passive", "rates", "observation"):
         assert one.backend_of(quantity) == "compiled"
-        found, wanted = (d.at(quantity, q, *samples[1:]) for d in (one, two))
+        found, wanted = (d.evaluate_closed(quantity, q, *samples[1:]) for d in (one, two))
         assert off(found, wanted) < 1e-11
 
 
@@ -169,7 +169,7 @@ def test_large_machines(family, joints, tmp_path):
     """By recursion over clusters, across which the elements act."""
     machine = clad(crane.load(families.write(family, joints, tmp_path)), 5)
     dynamics = same_on_both_backends(machine, samples_of(machine, 0.05))
-    assert dynamics.form.plan and len(machine.active) > 7
+    assert dynamics.formula_structure.recursion_plan and len(machine.active) > 7
 
 
 # --- work and energy -------------------------------------------------------------------------
@@ -227,7 +227,7 @@ def test_dampers_and_ropes_take_out_what_the_length_s_rate_says(mini):
         assert depth > 0.01
         lost = 7.0 * boom**2 + 400.0 * depth * (max(0.0, 1 + 1.5 * strut) - 1) * strut
         q = machine.closure.solve(home)
-        rates = dynamics.at("rates", q, v_a, np.zeros(3))
+        rates = dynamics.evaluate_closed("rates", q, v_a, np.zeros(3))
         assert rates[-2] == pytest.approx(lost, rel=1e-8) and lost > 0
 
 
@@ -264,17 +264,19 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     closure, n = mini.closure, 3
     tape = Tape()
     q, posture, loops = closure.fast.trace(tape, 0, 2)
-    constants, v_a = Constants(tape, 1, dynamics.numbers), tape.loads(3, 0, n)
-    sweep = Sweep(posture, loops, constants, q, v_a, dynamics.form)
-    rows = derivatives(sweep.passive, v_a)
+    constants, v_a = FormulaConstants(tape, 1, dynamics.numbers), tape.load_vector(3, 0, n)
+    sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
+    rows = differentiate(sweep.passive_force, v_a)
     program = Program()
-    program.add("f", 4, [entry for row in rows for entry in row])
+    program.add_formula("f", 4, [entry for row in rows for entry in row])
     program.compile()
     at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
     found = np.zeros(n * n)
     program.call("f", closure.fast.geometry.numbers, dynamics.numbers, at, v, found)
     wanted = [
-        oracles.derivative(lambda t, e=e: dynamics.at("passive", at, v + t * e, v), 1e-2)
+        oracles.derivative(
+            lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2
+        )
         for e in np.eye(n)
     ]
     size = np.abs(wanted).max()
@@ -401,7 +403,7 @@ def test_a_floating_body_on_springs(tmp_path):
     )
     springs = tuple(crane.ForceElement("", 90.0, 0.9, between=(f"a{i}", f"e{i}")) for i in "012")
     machine = crane.load(tmp_path / "box.urdf").replace(forces=springs)
-    assert machine.coordinates.floating
+    assert machine.coordinates.floating_base_columns
     same_on_both_backends(machine, samples_of(machine, 0.3))
     start = np.array([0.1, 0.0, -0.1, 0.2, 0.1, 0.3])
     run = crane.simulate(
@@ -440,7 +442,7 @@ def test_machine_files_hold_them(tmp_path):
     )
     assert machine.ropes == (crane.Rope(("coupler_pin", "pin_B"), 0.3, 1e4, 0.2),)
     again = crane.load(crane.write_machine(machine, tmp_path / "again"))
-    assert again.elements == machine.elements
+    assert again.force_elements == machine.force_elements
 
 
 def test_locks_take_what_they_put_on_one_body(tmp_path):
@@ -574,20 +576,20 @@ def test_columns_of_identification(mini):
     gas = crane.GasSpring("strut", 2e-4, 3e5, 2e-5, 0.15, 1.3, between=STRUT)
     rope = crane.Rope(BOOM, 0.05, 90.0, 1.0)
     machine = bare(mini).replace(forces=(spring,), gas_springs=(gas,), ropes=(rope,))
-    samples = random_samples(Model(machine), 30, seed=8)
+    samples = random_samples(IdentificationModel(machine), 30, seed=8)
     tau = crane.Dynamics(machine).inverse(samples.q_a, samples.v_a, samples.a_a)
     plain = machine.replace(forces=())
-    along = Direction("boom", between=BOOM)
+    along = ForceDirection("boom", between=BOOM)
     for model in (
-        Model(machine),
-        Model(
+        IdentificationModel(machine),
+        IdentificationModel(
             plain,
             [
-                Inertial(plain),
-                SpringForce(plain, along, lambda q: -q, "stiffness", 30.0),
-                SpringForce(plain, along, np.ones_like, "force", -2.0),
-                friction(plain, along, ("viscous",)),
-                GasScale(plain, "strut"),
+                InertialTerm(plain),
+                ForceElementTerm(plain, along, lambda q: -q, "stiffness", 30.0),
+                ForceElementTerm(plain, along, np.ones_like, "force", -2.0),
+                friction_term(plain, along, ("viscous",)),
+                GasSpringTerm(plain, "strut"),
             ],
         ),
     ):
@@ -595,10 +597,12 @@ def test_columns_of_identification(mini):
         if "boom.viscous" in model.names:
             values[model.names.index("boom.viscous")] = 4.0
             assert model.names[-1] == "strut.gas_scale" and "boom.stiffness" in model.names
-        found = model.regressor(samples) @ values + model.known(samples)
+        found = model.regressor(samples) @ values + model.known_forces(samples)
         assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
     with pytest.raises(InputError, match="frame 'moon' is unknown"):
-        SpringForce(plain, Direction("x", between=("base", "moon")), np.ones_like, "force")
+        ForceElementTerm(
+            plain, ForceDirection("x", between=("base", "moon")), np.ones_like, "force"
+        )
 
 
 @pytest.mark.slow
@@ -614,13 +618,13 @@ def test_identified_machines_keep_them(tmp_path):
         "volume: 2e-5, rest: 0.1}\n"
     )
     machine, locked = crane.load(path), crane.load(path, lock={"X2": 0.012})
-    assert machine.ropes and not locked.ropes and len(locked.elements) == 2
+    assert machine.ropes and not locked.ropes and len(locked.force_elements) == 2
     time = np.arange(0, 8, 4e-3)[:, None]
     place, turn = np.array([0.3, 0.015]), np.array([1.0, 0.012])
     q, v, a = place + turn * np.sin(time), turn * np.cos(time), -turn * np.sin(time)
     tau = crane.Dynamics(locked).inverse(q, v, a, friction=True)
     tau += np.random.default_rng(0).normal(size=tau.shape) * np.ptp(tau, axis=0) * 1e-3
-    terms = [*default_terms(locked), GasScale(locked, "strut")]
+    terms = [*default_terms(locked), GasSpringTerm(locked, "strut")]
     result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
     scale = result.parameters[result.model.names.index("strut.gas_scale")]
     written = crane.load(crane.write_identified(result, tmp_path / "out"))
@@ -661,7 +665,10 @@ def test_operations_of_machines_without_elements_read_none():
     """Behind those of joints, 10, 22 and 1 each: gravity, whether it moves, what stands, tip."""
     machine = crane.load("mini_forwarder")
     dynamics = crane.Dynamics(machine)
-    assert len(dynamics.numbers) == 33 * machine.model.nv + 4 + 7 and dynamics.form.spans == ()
+    assert (
+        len(dynamics.numbers) == 33 * machine.model.nv + 4 + 7
+        and dynamics.formula_structure.distance_bodies == ()
+    )
     sizes = [
         len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)

@@ -5,11 +5,11 @@ from scipy.stats import f, t
 
 from crane.common.errors import InputError
 from crane.identification.estimation.estimators import (
-    essential,
+    essential_parameters,
     huber,
-    instrumental,
+    instrumental_variables,
     least_squares,
-    weighted,
+    weighted_least_squares,
 )
 
 
@@ -31,7 +31,7 @@ def test_ordinary_least_squares_of_white_noise():
     textbook = np.sqrt(squares / 796 * np.diag(np.linalg.inv(W.T @ W)))
     np.testing.assert_allclose(found.std, textbook, rtol=0.15)
     half = np.diff(found.interval(0.9))[:, 0] / 2
-    np.testing.assert_allclose(half, t.ppf(0.95, found.freedom) * found.std)
+    np.testing.assert_allclose(half, t.ppf(0.95, found.degrees_of_freedom) * found.std)
 
 
 def test_without_noise_every_estimator_is_exact():
@@ -39,9 +39,9 @@ def test_without_noise_every_estimator_is_exact():
     groups = np.arange(800) % 2
     for found in (
         least_squares(W, y),
-        weighted(W, y, groups),
+        weighted_least_squares(W, y, groups),
         huber(W, y, groups),
-        instrumental(W, y, W, groups),
+        instrumental_variables(W, y, W, groups),
     ):
         np.testing.assert_allclose(found.values, [1, 2, 3, 4], rtol=1e-11)
 
@@ -51,7 +51,7 @@ def test_weighting_finds_the_noise_of_each_joint():
     W, y = white(4000, noise=0.0)
     groups = np.arange(4000) % 2
     sigma = np.array([0.1, 3.0])
-    found = weighted(
+    found = weighted_least_squares(
         W, y + sigma[groups] * rng.standard_normal(4000), groups, np.arange(4000) // 2
     )
     np.testing.assert_allclose(found.noise, sigma, rtol=0.06)
@@ -68,7 +68,9 @@ def test_huber_resists_outliers():
     assert (found.std < 0.1 * plain.std).all()
 
 
-@pytest.mark.parametrize("estimator", [least_squares, weighted, huber, instrumental])
+@pytest.mark.parametrize(
+    "estimator", [least_squares, weighted_least_squares, huber, instrumental_variables]
+)
 def test_prior(estimator):
     """Known noise: the posterior of normal distributions. A column of zeros keeps its prior."""
     W, y = white(3000)
@@ -76,7 +78,11 @@ def test_prior(estimator):
     y = y - white(3000)[0][:, 2] * 3
     mean, std = np.array([1.01, 0, 7, 0]), np.array([0.01, np.inf, 0.2, np.inf])
     kind = {"groups": np.zeros(3000, int), "prior": (mean, std)}
-    found = estimator(W, y, W, **kind) if estimator is instrumental else estimator(W, y, **kind)
+    found = (
+        estimator(W, y, W, **kind)
+        if estimator is instrumental_variables
+        else estimator(W, y, **kind)
+    )
     assert found.values[2] == pytest.approx(7)
     assert found.std[2] == pytest.approx(0.2)
     information = W.T @ W / found.noise**2 + np.diag(1 / std**2)
@@ -92,7 +98,7 @@ def test_instruments_remove_the_bias_of_a_noisy_regressor():
     rng = np.random.default_rng(3)
     Z, y = white(20_000, 3, noise=0.1)
     W = Z + 0.5 * Z.std(axis=0) * rng.standard_normal(Z.shape)
-    plain, found = least_squares(W, y), instrumental(W, y, Z)
+    plain, found = least_squares(W, y), instrumental_variables(W, y, Z)
     assert (plain.values < 0.85 * np.array([1, 2, 3])).any()
     assert (np.abs(found.values - [1, 2, 3]) < 4 * found.std).all()
 
@@ -110,15 +116,15 @@ def draw(kind, strength, rng, count, joints):
 @pytest.mark.parametrize(
     ("estimator", "kind", "strength", "gaps", "count"),
     [
-        (weighted, "ar", 0.95, True, 1000),
+        (weighted_least_squares, "ar", 0.95, True, 1000),
         (huber, "ar", 0.9, False, 1000),
-        (weighted, "low", 0.3, True, 1000),
+        (weighted_least_squares, "low", 0.3, True, 1000),
         *(pytest.param(*x, marks=pytest.mark.long) for x in (
-            (weighted, "ar", -0.5, False, 1000),
-            (weighted, "ar", 0.0, True, 1000),
-            (weighted, "ar", 0.9, False, 1000),
-            (weighted, "ar", 0.95, False, 1000),
-            (weighted, "low", 0.1, True, 2500),
+            (weighted_least_squares, "ar", -0.5, False, 1000),
+            (weighted_least_squares, "ar", 0.0, True, 1000),
+            (weighted_least_squares, "ar", 0.9, False, 1000),
+            (weighted_least_squares, "ar", 0.95, False, 1000),
+            (weighted_least_squares, "low", 0.1, True, 2500),
         )),
     ],
 )  # fmt: skip
@@ -143,7 +149,7 @@ def test_effective_rows_of_autoregressive_noise():
     rng = np.random.default_rng(5)
     W = rng.standard_normal((20_000, 2))
     found = least_squares(W, draw("ar", 0.9, rng, 20_000, 1)[:, 0])
-    assert found.effective[0] == pytest.approx(20_000 * 0.1 / 1.9, rel=0.15)
+    assert found.effective_samples[0] == pytest.approx(20_000 * 0.1 / 1.9, rel=0.15)
 
 
 def test_essential_parameters():
@@ -151,7 +157,7 @@ def test_essential_parameters():
     rng = np.random.default_rng(6)
     y = W @ [2.0, 0, 3, 0, 0, 4] + 0.5 * rng.standard_normal(500)
     found = least_squares(W, y)
-    assert essential(found, 0.01).tolist() == [0, 2, 5]
+    assert essential_parameters(found, 0.01).tolist() == [0, 2, 5]
     # The same F as from the sums of squares, where the covariance is the textbook one.
     dropped = [1, 3, 4]
     rest = np.linalg.lstsq(W[:, [0, 2, 5]], y)[1][0]

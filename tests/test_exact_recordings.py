@@ -6,7 +6,7 @@ from scipy.interpolate import CubicSpline
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import crane
-from crane.common.threads import on_one_thread
+from crane.common.threads import with_single_threaded_blas
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 
@@ -60,7 +60,7 @@ def blas():
     return [library for library in threadpool_info() if library["user_api"] == "blas"]
 
 
-@on_one_thread
+@with_single_threaded_blas
 def crane_sees():
     """Largest number of threads that a decorated function has."""
     return max(library["num_threads"] for library in blas())

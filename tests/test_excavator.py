@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 import crane
-from crane.studies.tipping import tipping_load
+from crane.studies.task_tipping_load import tipping_load
 
 PRESSURE, BUCKET, ARM = 3.5e7, 1.1309734e-2, 1.5393804e-2  # [Pa], areas of the pistons [m2]
 RADIUS = 1.47  # of the bucket's tip about its pin [m]
@@ -67,7 +67,7 @@ def test_it_weighs_and_digs_as_data_sheets_say(machine):
 
 def test_a_cycle_ends_where_it_began_and_keeps_the_balance(machine):
     task = machine.tasks["dig"]
-    under = machine.under(*task.loads)
+    under = machine.with_external_forces(*task.loads)
     levers = crane.joystick(machine, "dig")
     run = crane.simulate(under, levers, duration=task.duration, step=1e-2)
     seen = run.channels
@@ -91,10 +91,10 @@ def test_levers_tip_it_with_the_load_that_is_said(machine):
     least = []
     for share in (0.98, 1.02):
         loaded = crane.load("excavator", {"payload.mass": share * found.mass})
-        under = loaded.under(*loaded.tasks["dig"].loads)
+        under = loaded.with_external_forces(*loaded.tasks["dig"].loads)
         run = crane.simulate(under, crane.joystick(loaded, "dig"), duration=16.0, step=5e-3)
         least.append(run.channels["stability"].min())
-    assert least[0] > 0 > least[1] and 0 < found.mass < found.static
+    assert least[0] > 0 > least[1] and 0 < found.mass < found.static_mass
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def cycles():
         found[name] = (
             machine,
             crane.simulate(
-                machine.under(*task.loads),
+                machine.with_external_forces(*task.loads),
                 crane.joystick(machine, "dig"),
                 duration=16.0,
                 step=1e-2,
@@ -173,7 +173,7 @@ def trucks():
         ("excavator", {"supply.droop": 2e5}), ("excavator_ls", {}), ("excavator_two_pumps", {}),
     ):  # fmt: skip
         machine = crane.load(name, changes=changes)
-        under = machine.under(*machine.tasks["load_truck"].loads)
+        under = machine.with_external_forces(*machine.tasks["load_truck"].loads)
         levers = crane.joystick(under, "load_truck")
         found[name] = machine, crane.simulate(under, levers, step=1e-2)
     return found
@@ -202,7 +202,7 @@ def test_trucks_take_time_or_power(trucks):
     """A pump without a limit is the fastest one, by far more work; the account holds in all."""
     times, works = [], []
     for machine, run in trucks.values():
-        account = crane.power_account(machine, run)
+        account = crane.power_balance(machine, run)
         largest = max(np.abs(power).max() for power in account.powers.values())
         assert np.abs(account.residual).max() <= 1e-9 * largest
         seen = run.channels

@@ -6,12 +6,12 @@ from typed import typed
 
 import crane
 from crane.common.errors import InputError
-from crane.identification.excitation.excite import excite
-from crane.identification.excitation.fourier import Fourier, bases
-from crane.identification.excitation.information import Information
-from crane.identification.excitation.limits import gear
-from crane.identification.mechanics.base import base_parameters, random_samples
-from crane.identification.mechanics.model import Model
+from crane.identification.excitation.fisher_information import FisherInformation
+from crane.identification.excitation.fourier_trajectory import FourierTrajectory, fourier_basis
+from crane.identification.excitation.periodic_excitation import excite
+from crane.identification.excitation.trajectory_limits import singularity_proximity
+from crane.identification.mechanics.base_parameters import base_parameters, random_samples
+from crane.identification.mechanics.identification_model import IdentificationModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 QUICK = {"harmonics": 3, "periods": 2, "starts": 1}
@@ -27,7 +27,7 @@ def found(mini):
 
 @pytest.fixture(scope="module")
 def series():
-    return Fourier(np.random.default_rng(3).normal(size=(9, 2)), 2.5, 3)
+    return FourierTrajectory(np.random.default_rng(3).normal(size=(9, 2)), 2.5, 3)
 
 
 def test_velocity_and_acceleration_are_derivatives(series):
@@ -63,7 +63,10 @@ def test_it_is_periodic_between_rests(series):
 
 def test_ways_from_and_to_rest_stay_on_the_curve(series):
     """Points of a way lie on the periodic curve, nowhere faster than it."""
-    curve = bases(np.linspace(0, series.period, 200001), 4, series.period)[0] @ series.coefficients
+    curve = (
+        fourier_basis(np.linspace(0, series.period, 200001), 4, series.period)[0]
+        @ series.coefficients
+    )
     top = np.abs(series(np.linspace(series.lead, series.lead + 2.5, 5000))[1]).max(axis=0)
     for start in (0.0, series.duration - series.lead):
         q, v, _ = series(start + np.linspace(0, series.lead, 50))
@@ -116,7 +119,7 @@ def test_accelerations_can_be_limited(slider_crank):
     most = 0.5 * float(keeps(free, slider_crank)[1][0])
     tame = excite(slider_crank, **QUICK, period=2.0, acceleration={joint: most})
     assert keeps(tame, slider_crank)[1][0] <= 0.95 * most
-    assert tame.after.logdet < free.after.logdet
+    assert tame.optimized_information.logdet < free.optimized_information.logdet
 
 
 @pytest.mark.slow
@@ -124,11 +127,11 @@ def test_forces_can_be_what_limits(edited):
     """A crank whose drive is weak: a third of the force that the motion would take."""
     machine = edited("slider_crank.yaml")
     free = excite(machine, **QUICK, period=1.0)
-    needed = free.used[3, 0] * machine.model.effortLimit[machine.closure.active[0]] * 0.95
+    needed = free.limit_usage[3, 0] * machine.model.effortLimit[machine.closure.active[0]] * 0.95
     machine.model.effortLimit[machine.closure.active[0]] = needed / 2
     weak = excite(machine, **QUICK, period=1.0)
     assert keeps(weak, machine)[2][0] <= 0.95
-    assert weak.used[3, 0] > 0.9
+    assert weak.limit_usage[3, 0] > 0.9
 
 
 @pytest.mark.slow
@@ -137,10 +140,10 @@ def test_the_edge_of_the_branch_is_kept(five_bar):
     """Cranks that turn one radian either way leave the reach; the reference does not."""
     result = excite(five_bar, **QUICK, period=4.0)
     q, v, a = result.trajectory(np.linspace(0, result.trajectory.duration, 3001))
-    at = Model(five_bar).samples(q, v, a)  # every sample closes
+    at = IdentificationModel(five_bar).samples(q, v, a)  # every sample closes
     assert five_bar.closure.residual(at.q).max() < 1e-12
-    assert gear(five_bar, at).max() <= 1
-    assert result.after.condition < result.before.condition / 5
+    assert singularity_proximity(five_bar, at).max() <= 1
+    assert result.optimized_information.condition < result.initial_information.condition / 5
 
 
 # --- what it tells ---------------------------------------------------------------------------
@@ -155,12 +158,12 @@ def naive(excitation):
     for i in range(n):
         k = i % K + 1
         table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half[i])
-    return Fourier(table, excitation.trajectory.period, excitation.trajectory.periods)
+    return FourierTrajectory(table, excitation.trajectory.period, excitation.trajectory.periods)
 
 
 def information_of(excitation, path):
     """ln det (1 + M) in parameters scaled like the excitation's, by eigenvalues."""
-    model = Model(excitation.machine)
+    model = IdentificationModel(excitation.machine)
     time = path.lead + np.arange(0, path.period, excitation.step)
     W = model.regressor(model.samples(*path(time)))[:, :, excitation.base.independent]
     W = (W / excitation.noise[:, None]).reshape(-1, excitation.base.rank) * excitation.scale
@@ -185,9 +188,9 @@ def test_condition_can_be_the_criterion(slider_crank):
         excite(slider_crank, harmonics=3, period=4.0, criterion=name)
         for name in ("condition", "logdet")
     )
-    assert one.after.condition < one.before.condition / 2
-    assert one.after.condition < other.after.condition
-    assert one.after.logdet < other.after.logdet
+    assert one.optimized_information.condition < one.initial_information.condition / 2
+    assert one.optimized_information.condition < other.optimized_information.condition
+    assert one.optimized_information.logdet < other.optimized_information.logdet
 
 
 @pytest.mark.slow
@@ -200,7 +203,7 @@ def test_same_seed_same_bits(slider_crank):
 
 def test_predicted_deviations_are_those_of_least_squares(mini, found):
     """600 recordings with white noise: a deviation comes out within 3 % (one sigma)."""
-    model, path, base = Model(mini), found.trajectory, found.base
+    model, path, base = IdentificationModel(mini), found.trajectory, found.base
     time = path.lead + found.step * np.arange(path.periods * round(path.period / found.step))
     W = model.regressor(model.samples(*path(time)))[:, :, base.independent]
     W = (W / found.noise[:, None]).reshape(-1, base.rank)
@@ -212,16 +215,16 @@ def test_predicted_deviations_are_those_of_least_squares(mini, found):
 
 def test_with_a_prior_deviations_are_those_after_it(slider_crank):
     """Bayes: covariance (prior^-1 + W^T W / noise^2)^-1, computed without any scaling."""
-    model = Model(slider_crank)
+    model = IdentificationModel(slider_crank)
     base = base_parameters(model)
     at = random_samples(model, 50)
     prior = np.linspace(0.1, 2.0, len(model.names))
     noise = np.array([0.3])
-    information = Information(model, base, noise, noise, at, prior)
+    information = FisherInformation(model, base, noise, noise, at, prior)
     W = model.regressor(at)[:, :, base.independent].reshape(-1, base.rank)
     before = base.grouping @ np.diag(prior**2) @ base.grouping.T
     after = np.linalg.inv(np.linalg.inv(before) + 4 * W.T @ W / noise**2)
-    quality = information.quality(at, 200)  # a recording of four times these samples
+    quality = information.measures(at, 200)  # a recording of four times these samples
     assert quality.std == pytest.approx(np.sqrt(np.diag(after)), rel=1e-6)
     gain = np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]
     assert quality.logdet == pytest.approx(gain, rel=1e-8)
@@ -233,8 +236,8 @@ def test_an_open_arm():
     result = excite(arm, period=10.0, harmonics=3, starts=1)
     v, _, tau = keeps(result, arm)
     assert (v <= 0.95).all() and (tau <= 0.95).all()
-    assert result.after.logdet > result.before.logdet + 20
-    assert result.base.rank == base_parameters(Model(arm)).rank
+    assert result.optimized_information.logdet > result.initial_information.logdet + 20
+    assert result.base.rank == base_parameters(IdentificationModel(arm)).rank
 
 
 # --- files and errors ------------------------------------------------------------------------
@@ -253,8 +256,14 @@ def test_files(slider_crank, tmp_path):
 
 def test_errors(mini, slider_crank, edited):
     for call, text in (
-        (lambda: Fourier(np.zeros((4, 2)), 1.0), r"shape \(4, 2\), give \(1 \+ 2 harmonics"),
-        (lambda: Fourier(np.zeros((3, 2)), 0.0), "period is 0.0 s, give a number above 0"),
+        (
+            lambda: FourierTrajectory(np.zeros((4, 2)), 1.0),
+            r"shape \(4, 2\), give \(1 \+ 2 harmonics",
+        ),
+        (
+            lambda: FourierTrajectory(np.zeros((3, 2)), 0.0),
+            "period is 0.0 s, give a number above 0",
+        ),
         (lambda: excite(mini, criterion="det"), "criterion 'det' is unknown, known: condition"),
         (lambda: excite(mini, harmonics=0), "number of harmonics is 0, give a whole number"),
         (lambda: excite(mini, seed=-1), "seed is -1, give a whole number from 0"),
@@ -321,5 +330,5 @@ def test_all_cylinders_together_take_what_the_pump_gives():
         drawn += taken
     assert drawn.max() <= hydraulics.supply.flow
     assert drawn.max() == pytest.approx(
-        0.95 * found.used[4].max() * hydraulics.supply.flow, rel=0.01
+        0.95 * found.limit_usage[4].max() * hydraulics.supply.flow, rel=0.01
     )

@@ -9,8 +9,8 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError
-from crane.identification.excitation.levers import full_speed
-from crane.identification.excitation.told import Told
+from crane.identification.excitation.pulse_signals import full_opening_speed
+from crane.identification.excitation.signal_information import SignalInformation
 from crane.recordings import timeseries
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -47,7 +47,7 @@ def test_a_notebook_shows_signals_and_what_they_tell(found):
 def strokes(machine, signals, time):
     """Of a machine that the signals drive, and its velocities."""
     run = crane.simulate(
-        machine, crane.Signals(machine, time, signals), None, time[-1], time[1] - time[0]
+        machine, crane.ValveSignals(machine, time, signals), None, time[-1], time[1] - time[0]
     )
     return run.q[:, 0], run.v[:, 0]
 
@@ -64,10 +64,12 @@ def test_the_steady_velocity_at_full_opening(tmp_path, valve, backwards):
     part = circuit.valves["x"]
     signal = part.neutral + (part.full - part.neutral) * (-1 if backwards else 1)
     start = 0.45 if backwards else 0.05
-    run = crane.simulate(machine, crane.Signals(machine, [0.0], {"x": [signal]}), [start], 1.0)
+    run = crane.simulate(
+        machine, crane.ValveSignals(machine, [0.0], {"x": [signal]}), [start], 1.0
+    )
     settled = np.abs(run.v[-300:, 0]).mean()
     force = 2000.0 * 9.81
-    speed = full_speed(circuit.cylinders["x"], part, circuit.supply, force, backwards)
+    speed = full_opening_speed(circuit.cylinders["x"], part, circuit.supply, force, backwards)
     assert speed == pytest.approx(settled, rel=0.02)
 
 
@@ -102,7 +104,7 @@ def test_the_pump_delivers_what_is_asked_for(tmp_path):
         supply={"pressure": 140e5, "tank": 8e5, "flow": 30 / 6e4, "droop": 2e5, "volume": 2e-3},
     )  # fmt: skip
     found = crane.excite_valves(machine, ["load_x.mass"], duration=6.0, trials=3, rate=4.0)
-    assert 0.5 < found.pump <= 1.0
+    assert 0.5 < found.pump_flow_share <= 1.0
     flows = found.run.channels
     drawn = sum(np.maximum(flows[f"flow_{x}_{y}"], 0.0) for x in "xy" for y in "ab")
     assert drawn.max() < 1.05 * 30 / 6e4
@@ -114,14 +116,14 @@ def test_the_pump_delivers_what_is_asked_for(tmp_path):
 def test_the_information_is_that_of_derivatives_by_hand(machine, found):
     """Central differences of separately loaded machines; what is compared are from one side."""
     names, time = ["load_x.mass", "oil.bulk_modulus"], found.run.time
-    told = Told(machine, names, None, NOISE, 0)
+    told = SignalInformation(machine, names, None, NOISE, 0)
     columns = []
     for one in told.unknowns:
         ends = []
         for side in (1.0, -1.0):
             other = crane.load(machine.path, changes={one.name: one.start * (1 + side * 1e-3)})
             drive = crane.ValveDrive(
-                other, crane.Signals(other, time, found.signals),
+                other, crane.ValveSignals(other, time, found.signals),
                 {"x": (found.run.channels["pressure_x_a"][0],
                        found.run.channels["pressure_x_b"][0])},
             )  # fmt: skip
@@ -131,9 +133,9 @@ def test_the_information_is_that_of_derivatives_by_hand(machine, found):
             ends.append(np.column_stack([run[x] / s for x, s in NOISE.items()]).ravel())
         columns.append((ends[0] - ends[1]) / 2e-3)
     J = np.column_stack(columns)
-    rows = told.rows(found.run, starts=False)
+    rows = told.information_root(found.run, estimate_start=False)
     assert rows.T @ rows == pytest.approx(J.T @ J, rel=0.05)
-    alone, whole = (np.linalg.inv(x.T @ x) for x in (rows, told.rows(found.run)))
+    alone, whole = (np.linalg.inv(x.T @ x) for x in (rows, told.information_root(found.run)))
     assert (np.diag(whole) > np.diag(alone)).all()  # of a start that has to be found, too
 
 
@@ -148,10 +150,12 @@ def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
 
 def test_a_start_that_is_given_is_what_the_machine_has(machine):
     given = {"load_x.mass": 2100.0, "valve.x.neutral": (5.9, 5.8, 6.0)}
-    told = Told(machine, given, None, NOISE, 0)
-    assert told.machine.changes == {"load_x.mass": 2100.0, "valve.x.neutral": 5.9}
-    assert Told(machine, FIT, None, NOISE, 0).machine is machine
-    assert told.variant({"load_x.mass": 1900.0}).changes["load_x.mass"] == 1900.0
+    told = SignalInformation(machine, given, None, NOISE, 0)
+    assert told.machine.parameter_changes == {"load_x.mass": 2100.0, "valve.x.neutral": 5.9}
+    assert SignalInformation(machine, FIT, None, NOISE, 0).machine is machine
+    assert (
+        told.perturbed_machine({"load_x.mass": 1900.0}).parameter_changes["load_x.mass"] == 1900.0
+    )
 
 
 @pytest.mark.long
@@ -172,18 +176,21 @@ def test_estimates_spread_as_expected_and_less_than_of_a_joystick(machine, tmp_p
               (6, 0)],
     })  # fmt: skip
     plain = crane.simulate(machine, lever, None, 6.0, time[1] - time[0])
-    told = Told(machine, FIT, None, NOISE, 0)
+    told = SignalInformation(machine, FIT, None, NOISE, 0)
     errors = {}
-    for what, table in (("designed", found.table), ("joystick", told.table(plain))):
+    for what, table in (
+        ("designed", found.expected_readings),
+        ("joystick", told.expected_readings(plain)),
+    ):
         errors[what] = []
         for seed in range(count):
             values = table.values.copy()
             noise = np.random.default_rng(900 + seed).normal(size=values[:, 2:].shape)
             values[:, 2:] += noise * list(NOISE.values())
             path = tmp_path / "run.csv"
-            timeseries.write(path, timeseries.Table(table.units, values, {}))
+            timeseries.write_table(path, timeseries.Table(table.units, values, {}))
             fitted = crane.calibrate(wrong, path, FIT).values
-            errors[what].append([fitted[one.name] - one.start for one in found.fit])
+            errors[what].append([fitted[one.name] - one.start for one in found.unknowns])
     std = np.array([found.std[name] for name in FIT])
     squares = (np.square(errors["designed"]) / std**2).sum(axis=0)
     assert (squares < chi2.ppf(0.999, count)).all() and (squares > chi2.ppf(0.001, count)).all()
@@ -198,14 +205,14 @@ def test_of_a_log_crane_they_tell_more_than_its_task_of_levers():
     machine = crane.load("patu655", lock={"slew": 0.0}, changes={"payload.mass": 211.4})
     fit = ["payload.mass", "oil.bulk_modulus", "friction.X_lift.viscous", "valve.X_lift.neutral"]
     found = crane.excite_valves(machine, fit, duration=20.0, trials=30)
-    told = Told(machine, fit, None, None, 0)
+    told = SignalInformation(machine, fit, None, None, 0)
     stir = crane.simulate(machine, crane.joystick(machine, "stir"), None, 20.0, 0.01)
-    usual = told.quality(stir)
-    assert found.after.logdet > usual.logdet + len(fit) * np.log(2)
-    assert (found.after.std < usual.std).all()
+    usual = told.measures(stir)
+    assert found.optimized_information.logdet > usual.logdet + len(fit) * np.log(2)
+    assert (found.optimized_information.std < usual.std).all()
     heavy = crane.load("patu655", lock={"slew": 0.0}, changes={"payload.mass": 1.3 * 211.4})
     run = crane.simulate(
-        heavy, crane.Signals(heavy, found.run.time, found.signals), None, 20.0, 0.01
+        heavy, crane.ValveSignals(heavy, found.run.time, found.signals), None, 20.0, 0.01
     )
     assert (run.q.min(axis=0) > heavy.lower).all() and (run.q.max(axis=0) < heavy.upper).all()
 
@@ -266,7 +273,7 @@ def test_the_command_writes_signals_that_can_be_played(machine, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _, comparison = crane.replay(machine, out / "signals.csv", 0.01)
-    assert {channel.name: channel.relative < 1e-3 for channel in comparison.channels} == {
+    assert {channel.name: channel.relative_rms < 1e-3 for channel in comparison.channels} == {
         "x": True, "pressure_x_a": True, "pressure_x_b": True
     }  # fmt: skip
     for extra, said in (

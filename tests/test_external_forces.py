@@ -9,7 +9,7 @@ import pytest
 from typed import typed
 
 import crane
-from crane.codegen.scalar import scale
+from crane.codegen.symbolic import scale_vector
 from crane.common.errors import CraneError
 from crane.recordings import timeseries
 
@@ -34,7 +34,7 @@ def test_wrenches_do_what_those_of_pinocchio_do(name):
     q_a, v_a, random = wandering(machine)
     model, link = machine.model, machine.tip
     wrenches = random.normal(size=(len(q_a), 6))
-    found = dynamics.applied(q_a, {link: wrenches})
+    found = dynamics.project_wrenches(q_a, {link: wrenches})
     data, frame = model.createData(), model.frames[machine.frame(link)]
     for i, q in enumerate(machine.closure.solve(q_a)):
         gamma = machine.closure.gamma(q)
@@ -54,7 +54,7 @@ class Drag(crane.ExternalForce):
     """A force against the velocity, and a moment against the spin."""
 
     def wrench(self, here):
-        return scale(-30.0, here.velocity), scale(-2.0, here.spin)
+        return scale_vector(-30.0, here.velocity), scale_vector(-2.0, here.angular_velocity)
 
 
 def dragged(time, place, turn, velocity, spin):
@@ -79,7 +79,7 @@ def test_a_function_in_python_does_what_formulas_do(method):
         crane.simulate(machine, None, start, 0.3, 2e-3, method=method, loads=loads)
         for loads in (
             loads_of(machine, Drag(machine.tip, "drag")),
-            loads_of(machine, crane.Pushing(machine.tip, dragged, "drag")),
+            loads_of(machine, crane.WrenchFunction(machine.tip, dragged, "drag")),
         )
     ]
     assert runs[0].q == pytest.approx(runs[1].q, abs=1e-11)
@@ -120,19 +120,20 @@ def test_what_carries_a_load_hangs_as_still_as_with_a_payload():
     assert np.abs(run.q - run.q[0]).max() < 1e-9
     dynamics, q_a = crane.Dynamics(machine), run.q[0]
     wrench = {machine.tip: [0, 0, -1500.0, 0, 0, 0]}
-    borne = dynamics.gravity(q_a) - dynamics.applied(q_a, wrench)
+    borne = dynamics.gravity(q_a) - dynamics.project_wrenches(q_a, wrench)
     np.testing.assert_allclose(run.tau[0], borne, rtol=1e-12)
     later = crane.Wrench(machine.tip, [(0, 0, 0), (0, 0, -1500.0)], times=[0.0, 0.5])
     unloaded = crane.simulate(machine, None, None, 1e-3, loads=(later,))
     np.testing.assert_allclose(unloaded.tau[0], dynamics.gravity(q_a), rtol=1e-12)
     mini = crane.load("mini_forwarder")
     law = crane.PI(
-        mini.under(crane.Wrench(mini.tip, (0, 0, -5.0))), crane.task_trajectory(mini, "lift")
+        mini.with_external_forces(crane.Wrench(mini.tip, (0, 0, -5.0))),
+        crane.task_trajectory(mini, "lift"),
     )
     more = law.start(law.reference.position(0.0)) - crane.PI(mini, law.reference).start(
         law.reference.position(0.0)
     )
-    lifted = crane.Dynamics(mini).applied(
+    lifted = crane.Dynamics(mini).project_wrenches(
         law.reference.position(0.0), {mini.tip: [0, 0, -5.0, 0, 0, 0]}
     )
     np.testing.assert_allclose(more * law.settings[3:], -lifted, rtol=1e-9, atol=1e-12)
@@ -146,7 +147,7 @@ def test_a_controller_of_the_bare_machine_begins_with_what_the_run_carries():
     assert np.abs(run.q - run.q[0]).max() < 1e-9
     crane_ = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
     pull = crane.Wrench(crane_.tip, (0.0, 0.0, -1500.0))
-    drive = crane.ValveDrive(crane_, crane.Signals(crane_, [0.0], {}))
+    drive = crane.ValveDrive(crane_, crane.ValveSignals(crane_, [0.0], {}))
     given, own = (
         crane.simulate(crane_, control, duration=0.1, loads=(pull,)) for control in (drive, None)
     )
@@ -161,7 +162,7 @@ def test_with_hydraulics_a_pull_is_in_the_chambers():
     forces = [run.tau[-1] for run in runs]
     q_a = [run.q[-1] for run in runs]
     dynamics = crane.Dynamics(machine)
-    more = dynamics.applied(q_a[1], {machine.tip: [0, 0, -1500.0, 0, 0, 0]})
+    more = dynamics.project_wrenches(q_a[1], {machine.tip: [0, 0, -1500.0, 0, 0, 0]})
     expected = [dynamics.gravity(q) - dynamics.passive(q, 0 * q) for q in q_a]
     difference = forces[1] - forces[0]
     friction = runs[1].channels["rest_X_lift"][-1] - runs[0].channels["rest_X_lift"][-1]
@@ -179,7 +180,7 @@ def test_the_energy_of_a_load_on_valves_is_kept():
     motion = crane.ValvePD(machine, crane.task_trajectory(machine, "reach"))
     run, other = (
         crane.simulate(machine, motion, None, 3.0, loads=[pull, drag])
-        for drag in (Drag(machine.tip, "drag"), crane.Pushing(machine.tip, dragged, "drag"))
+        for drag in (Drag(machine.tip, "drag"), crane.WrenchFunction(machine.tip, dragged, "drag"))
     )
     assert other.q == pytest.approx(run.q, abs=1e-8)
     seen = run.channels
@@ -209,7 +210,11 @@ def test_recorded_loads_are_known_to_identification(tmp_path):
         errors.append(found.validation.rmse[1:] / np.abs(without.tau).max(axis=0)[1:])
     assert errors[0].max() < 1e-4 and errors[1].max() > 0.2, errors
     with pytest.raises(CraneError, match="has the load 'push', and no column tells"):
-        crane.identify(machine.under(crane.Wrench(machine.tip, name="push")), without, prior=0.1)
+        crane.identify(
+            machine.with_external_forces(crane.Wrench(machine.tip, name="push")),
+            without,
+            prior=0.1,
+        )
     lost = pulled.channels | {"load_nix_force_x": 0 * pulled.time}
     units = pulled.channel_units | {"load_nix_force_x": "N"}
     nix = dataclasses.replace(pulled, channels=lost, channel_units=units)
@@ -229,7 +234,7 @@ def test_what_a_function_in_python_raises_comes_out():
     for controller in (None, crane.ComputedTorque(machine, motion)):
         with pytest.raises(ZeroDivisionError, match="torn"):
             crane.simulate(
-                machine, controller, None, 0.2, loads=[crane.Pushing(machine.tip, torn)]
+                machine, controller, None, 0.2, loads=[crane.WrenchFunction(machine.tip, torn)]
             )
 
 
@@ -246,8 +251,8 @@ def test_what_is_no_load_is_refused():
         (lambda: crane.Wrench(tip, (1, 0, np.nan)), "no finite number"),
         (lambda: crane.Wrench(tip, [[1, 0, 0]] * 2, times=[1, 0]), "times do not rise"),
         (lambda: crane.Wrench(tip, axes="tip"), "give 'world' or 'frame'"),
-        (lambda: crane.Pushing(tip, lambda *_: [np.nan] * 6), "six numbers"),
-        (lambda: crane.Pushing(tip, lambda *_: [1.0, 2.0]), "six numbers"),
+        (lambda: crane.WrenchFunction(tip, lambda *_: [np.nan] * 6), "six numbers"),
+        (lambda: crane.WrenchFunction(tip, lambda *_: [1.0, 2.0]), "six numbers"),
         (lambda: 3.0, "no force from outside"),
         (lambda: crane.Wrench(machine.model.frames[1].name, (1, 0, 0)), "does not move"),
     ):
@@ -301,10 +306,12 @@ def test_loads_of_a_machine_file_as_closed_forms(pushed, tmp_path):
     assert run.q == pytest.approx(true, abs=1e-10)
     assert run.channels["work_push"] == pytest.approx(3 * true[:, 0], abs=1e-9)
     by = ("block.mass", "start.x_velocity")
-    slopes = crane.sensitivities(machine, None, None, 2.0, 0.01, by=by, outputs=("x", "z")).slopes
+    slopes = crane.sensitivities(
+        machine, None, None, 2.0, 0.01, parameters=by, outputs=("x", "z")
+    ).derivatives
     assert slopes[-1, 0] == pytest.approx([-3 * 4 / (2 * MASS**2), 2.0], abs=1e-8)
     assert slopes[-1, 1] == pytest.approx([-2 * 8 / (6 * MASS**2), 0.0], abs=1e-8)
-    assert len(crane.load(pushed, lock={"x": 0.5}).external) == 2
+    assert len(crane.load(pushed, lock={"x": 0.5}).external_forces) == 2
     written = crane.load(crane.write_machine(machine, tmp_path / "written"))
     again = crane.simulate(written, None, None, 2.0, 0.01)
     assert again.q == pytest.approx(run.q, abs=1e-12)
@@ -332,7 +339,7 @@ def test_loads_are_typed(pushed, tmp_path):
     command = ("simulate", pushed, "--duration", "1", "--step", "0.1", "--out", out)
     done = typed(*command, "--load", f"slide={table}")
     assert done.returncode == 0, done.stderr
-    rows = timeseries.read(out / "recording.csv")
+    rows = timeseries.read_table(out / "recording.csv")
     x = rows.values[-1, list(rows.units).index("x")]
     # 3 N and 1 + t N
     assert x == pytest.approx((4 * 0.5 + 1 / 6) / MASS, abs=1e-9)

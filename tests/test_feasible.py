@@ -4,7 +4,11 @@ import pytest
 from scipy.optimize import minimize
 
 from crane.common.errors import InputError
-from crane.identification.mechanics.feasible import body_parameters, feasible, pseudo_inertia
+from crane.identification.mechanics.feasible_parameters import (
+    body_parameters,
+    pseudo_inertia,
+    solve_feasible,
+)
 
 
 def body(rng, size, mass):
@@ -45,16 +49,18 @@ def test_pseudo_inertia_is_pinocchios():
 
 def test_truth_without_noise():
     W, y, truth, prior = problem(4, 5)
-    found = feasible(W, y, np.full(len(y), 1e2), names(4), prior, 1e-3, nonnegative=range(40, 45))
+    found = solve_feasible(
+        W, y, np.full(len(y), 1e2), names(4), prior, 1e-3, nonnegative=range(40, 45)
+    )
     np.testing.assert_allclose(found.values, truth, atol=1e-5)
-    assert found.smallest.min() > 0
+    assert found.smallest_eigenvalues.min() > 0
 
 
 def test_bodies_exist_where_least_squares_has_none():
     W, y, truth, prior = problem(11, 30, noise=5.0)
     plain = np.linalg.lstsq(W, y)[0]
     assert np.linalg.eigvalsh(pseudo_inertia(plain[:110].reshape(11, 10))).min() < 0
-    found = feasible(
+    found = solve_feasible(
         W, y, np.full(len(y), 0.2), names(11), prior, 25.0, nonnegative=range(110, 140)
     )
     P = pseudo_inertia(found.values[:110].reshape(11, 10))
@@ -68,9 +74,9 @@ def test_limits_of_the_prior_weight():
     W, y, truth, prior = problem(2, 2, noise=1e-3)
     weights = np.full(len(y), 1e3)
     spread = np.full(2, 1e-6)
-    strong = feasible(W, y, 1e-9 * weights, names(2), prior, 1e6, spread)
+    strong = solve_feasible(W, y, 1e-9 * weights, names(2), prior, 1e6, spread)
     np.testing.assert_allclose(strong.values, prior, rtol=1e-4, atol=1e-6)
-    weak = feasible(W, y, weights, names(2), prior, 1e-4)
+    weak = solve_feasible(W, y, weights, names(2), prior, 1e-4)
     np.testing.assert_allclose(weak.values, np.linalg.lstsq(W, y)[0], atol=1e-6)
 
 
@@ -78,7 +84,7 @@ def test_dependent_columns_are_left_to_the_prior():
     W, y, truth, prior = problem(2, 0)
     basis = np.linalg.qr(np.random.default_rng(1).standard_normal((20, 12)))[0]
     W = W @ basis @ basis.T
-    found = feasible(W, W @ truth, np.full(len(y), 1e2), names(2), prior, 1.0)
+    found = solve_feasible(W, W @ truth, np.full(len(y), 1e2), names(2), prior, 1.0)
     np.testing.assert_allclose(basis.T @ found.values, basis.T @ truth, atol=1e-3)
     # The truth exists and explains everything: the prior cannot be farther than from it.
     apart = 0.0
@@ -91,9 +97,9 @@ def test_dependent_columns_are_left_to_the_prior():
 def test_a_bound_holds():
     W, y, truth, prior = problem(1, 2)
     truth[10] = -3.0
-    found = feasible(W, W @ truth, np.ones(len(y)), names(1), prior, 1.0, nonnegative=[10])
+    found = solve_feasible(W, W @ truth, np.ones(len(y)), names(1), prior, 1.0, nonnegative=[10])
     assert found.values[10] == pytest.approx(0, abs=1e-6)
-    free = feasible(W, W @ truth, np.ones(len(y)), names(1), prior, 1.0)
+    free = solve_feasible(W, W @ truth, np.ones(len(y)), names(1), prior, 1.0)
     assert free.values[10] == pytest.approx(-3, abs=1e-2)
 
 
@@ -119,7 +125,7 @@ def test_brute_force_on_one_body():
 
     start = np.append(np.eye(4)[np.tril_indices(4)], prior[10])
     best = minimize(cost, start, method="BFGS", options={"gtol": 1e-7})
-    found = feasible(W, y, np.ones(40), ["link"], prior, 4.0, spread)
+    found = solve_feasible(W, y, np.ones(40), ["link"], prior, 4.0, spread)
     np.testing.assert_allclose(found.values, unpack(best.x)[1], atol=1e-5)
 
 
@@ -130,7 +136,7 @@ def test_priors_that_cannot_be():
         wrong = prior.copy()
         wrong[index] = change
         with pytest.raises(InputError) as error:
-            feasible(W, y, np.ones(len(y)), ["boom", "stick"], wrong, 1.0)
+            solve_feasible(W, y, np.ones(len(y)), ["boom", "stick"], wrong, 1.0)
         return str(error.value)
 
     assert message(-1.0, 10) == "prior of 'stick' has the mass -1 kg, give it a positive one"
@@ -139,6 +145,6 @@ def test_priors_that_cannot_be():
     )
     assert message([1, 0, 0, 0, 1, 0, 1, 0, 0, 2]).startswith("prior of 'stick' is flat: second")
     with pytest.raises(InputError, match=r"spread has the shape \(2,\), give \(1,\)"):
-        feasible(W, y, np.ones(len(y)), ["boom", "stick"], prior, 1.0, np.ones(2))
+        solve_feasible(W, y, np.ones(len(y)), ["boom", "stick"], prior, 1.0, np.ones(2))
     with pytest.raises(InputError, match=r"nonnegative columns \[3\], choose of 20 to 20"):
-        feasible(W, y, np.ones(len(y)), ["boom", "stick"], prior, 1.0, nonnegative=[3])
+        solve_feasible(W, y, np.ones(len(y)), ["boom", "stick"], prior, 1.0, nonnegative=[3])

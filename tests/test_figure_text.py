@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 
 import crane
 from crane.recordings.recording import Recording
-from crane.view.plots.comparison import plot_comparison
-from crane.view.plots.identification import matrix_figure
-from crane.view.plots.recording import joint_symbol, plot_recording
-from crane.view.plots.study import plot_study
-from crane.view.plots.text import plain
-from crane.view.plots.workspace import plot_workspace
-from crane.view.sketch.draw import sketch
-from crane.view.sketch.sheet import symbol
+from crane.view.plots.comparison_figure import plot_comparison
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.identification_figures import correlation_figure
+from crane.view.plots.recording_figure import joint_symbol, plot_recording
+from crane.view.plots.study_figure import plot_study
+from crane.view.plots.workspace_figure import plot_workspace
+from crane.view.sketch.sketch_figure import sketch
+from crane.view.sketch.sketch_layout import format_joint_symbol
 
 NAMES = [r"$\bad$", "$", "$$", "a$b$c", r"a\$b", r"\$\bad\$", r"$x^{", r"\frac{", "x^y_z", "50 %"]
 
@@ -36,21 +36,21 @@ def test_a_name_is_set_as_it_is(name):
     """As matplotlib sets it where it is told that there is no mathematics."""
     expected = picture(name, parse_math=False)
     assert expected.min() < 200
-    np.testing.assert_array_equal(picture(plain(name)), expected)
+    np.testing.assert_array_equal(picture(escape_label(name)), expected)
     np.testing.assert_array_equal(picture(joint_symbol(name)), expected)
-    np.testing.assert_array_equal(picture(symbol(name)), expected)
+    np.testing.assert_array_equal(picture(format_joint_symbol(name)), expected)
     picture(f"{joint_symbol('q1')}, {joint_symbol(name)}")  # both in one text
 
 
 def test_a_name_that_begins_with_an_underscore_is_in_the_legend():
     axes = Figure().subplots()
-    axes.plot([0, 1], label=plain("_a"))
+    axes.plot([0, 1], label=escape_label("_a"))
     assert [text.get_text() for text in axes.legend().get_texts()] == [" _a"]
 
 
 def test_long_names_and_names_that_cannot_be_printed():
-    assert len(plain("x" * 10**6)) == 80
-    assert plain("a\nb\0c") == "a b c"
+    assert len(escape_label("x" * 10**6)) == 80
+    assert escape_label("a\nb\0c") == "a b c"
 
 
 HOSTILE = {
@@ -86,5 +86,5 @@ def test_figures_of_a_machine_with_such_names(tmp_path):
     )
     plot_comparison(SimpleNamespace(time=time, channels=[channel]), figures[4])
     assert all(figure.stat().st_size for figure in figures)
-    picture_of_names = FigureCanvasAgg(matrix_figure(np.eye(2), [r"$\bad$.mass", "_b$c.m$x"]))
+    picture_of_names = FigureCanvasAgg(correlation_figure(np.eye(2), [r"$\bad$.mass", "_b$c.m$x"]))
     picture_of_names.draw()

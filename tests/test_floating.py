@@ -95,7 +95,7 @@ def test_the_tip_moves_as_its_jacobian_says(arm):
         ends = []
         for sign in (1, -1):
             at = pin.integrate(arm.model, arm.coordinates.configuration(q), sign * h * v)
-            ends.append(kinematics.position(arm.coordinates.coordinates(at)))
+            ends.append(kinematics.position(arm.from_configuration.from_configuration(at)))
         slope = (ends[0] - ends[1]) / (2 * h)
         np.testing.assert_allclose(kinematics.jacobian(q) @ v, slope, atol=1e-8)
 
@@ -189,7 +189,7 @@ def test_a_body_that_is_held_is_where_it_floated_to(arm):
     v[:6], x[:6] = 0, 0  # at rest, accelerations of the arm only
     names = [arm.joints[i] for i in range(6)]
     held = crane.load(arm.path, floating=True, lock=dict(zip(names, q[:6].tolist(), strict=True)))
-    assert held.active == arm.active[6:] and not held.coordinates.floating
+    assert held.active == arm.active[6:] and not held.coordinates.floating_base_columns
     wanted = crane.Dynamics(arm).inverse(q, v, x)[6:]
     np.testing.assert_allclose(
         crane.Dynamics(held).inverse(q[6:], v[6:], x[6:]), wanted, atol=1e-12
@@ -200,7 +200,7 @@ def test_a_body_that_is_held_is_where_it_floated_to(arm):
 
 def test_one_coordinate_held_leaves_cardan_angles(arm):
     sliding = crane.load(arm.path, floating=True, lock={"base_z": 0.3})
-    assert len(sliding.active) == 7 and not sliding.coordinates.floating
+    assert len(sliding.active) == 7 and not sliding.coordinates.floating_base_columns
 
 
 def test_a_sketch_asks_where_the_body_is_held(arm, tmp_path):

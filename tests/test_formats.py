@@ -14,7 +14,7 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.description import parameters
-from crane.formats import read, write_machine, write_mjcf, write_urdf_plus
+from crane.formats import read_machine_spec, write_machine, write_mjcf, write_urdf_plus
 
 
 @pytest.fixture(params=MACHINES)
@@ -84,11 +84,11 @@ def test_round_trip_of_machine_files(name, kind, tmp_path):
 
 def numbers(tree):
     """Links and joints without their places in files."""
-    plain = {f"joint {name}": dataclasses.replace(x, where="", limits=None)
+    plain = {f"joint {name}": dataclasses.replace(x, source_location="", limits=None)
              for name, x in tree.joints.items()}  # fmt: skip
-    limits = {f"limits {name}": dataclasses.replace(x.limits, where="")
+    limits = {f"limits {name}": dataclasses.replace(x.limits, source_location="")
               for name, x in tree.joints.items()}  # fmt: skip
-    links = {name: dataclasses.replace(x, where="") for name, x in tree.links.items()}
+    links = {name: dataclasses.replace(x, source_location="") for name, x in tree.links.items()}
     return plain | limits | links
 
 
@@ -138,7 +138,7 @@ def test_limits_that_are_none_are_infinite_and_survive_every_format(tmp_path):
             assert (limits.effort, limits.velocity) == expected[2:]
     with pytest.raises(CraneError, match=r"limits -0\.5 to inf rad \(slides\.urdf:7\), choose"):
         machine.check_limits([0.0, -1.0, 0.0])
-    assert "free.lower" not in parameters(read(machine.path))
+    assert "free.lower" not in parameters(read_machine_spec(machine.path))
     narrow = crane.load(machine.path, {"half.lower": -1e9})
     assert narrow.lower[1] == -inf
 

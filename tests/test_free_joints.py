@@ -196,8 +196,8 @@ def test_a_floating_closed_chain_is_that_of_constraint_dynamics(tmp_path):
         at = machine.coordinates.configuration(q)
         v = closure.gamma(q) @ v_a
         wanted = constraint_dynamics(machine, at, v, along)[closure.active]
-        a_a = machine.spread(a_d, "a_d")
-        a_a[~machine.driven] = a_f
+        a_a = machine.expand_driven(a_d, "a_d")
+        a_a[~machine.is_driven] = a_f
         np.testing.assert_allclose(a_a, wanted, rtol=0, atol=1e-10 * np.abs(wanted).max())
 
 
@@ -212,7 +212,7 @@ def test_momentum_is_kept_while_a_drive_moves_what_floats(tmp_path):
     control = crane.ComputedTorque(machine, path)
     run = crane.simulate(machine, control, initial=(start, rates), tolerance=1e-13)
     assert np.ptp(run.q[:, turn]) > 0.4 and np.ptp(run.q[:, machine.active.index("sway")]) > 0.05
-    free = ~machine.driven
+    free = ~machine.is_driven
     assert np.abs(run.tau[:, free]).max() == 0.0 and np.abs(run.tau).max() > 0.1
     data, found, size = machine.model.createData(), [], []
     for i in range(0, len(run.time), 50):
@@ -231,9 +231,9 @@ def test_momentum_is_kept_while_a_drive_moves_what_floats(tmp_path):
 # --- nobody drives them ----------------------------------------------------------------------
 
 
-class Everywhere(crane.Law):
-    def law(self, at):
-        return [-v for v in at.v_a], ()
+class Everywhere(crane.ControlLaw):
+    def law(self, inputs):
+        return [-v for v in inputs.v_a], ()
 
 
 class Late:

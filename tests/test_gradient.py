@@ -7,12 +7,12 @@ from work import at_most
 
 import crane
 from crane.common.errors import CraneError
-from crane.formats.loading import Variants
-from crane.simulation.sensitivity import adjoint, follow
-from crane.simulation.sensitivity.asked import Asked
-from crane.simulation.sensitivity.functional import _changes
-from crane.simulation.sensitivity.setup import Setup
-from crane.simulation.sensitivity.track import Track
+from crane.formats.machine_loading import MachineVariants
+from crane.simulation.sensitivity import adjoint_integration, variational_integration
+from crane.simulation.sensitivity.motion_gradient import _largest_changes
+from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
+from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
+from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 
 ORDER_8 = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 
@@ -38,19 +38,26 @@ def test_a_damped_spring_as_its_closed_form(tmp_path):
     by = ("start.x", "start.x_velocity", "block.mass", "spring.x.stiffness", "spring.x.damping")
     start = [0.3], [0.1]
     found = crane.gradient(
-        machine, None, start, 5.0, 1e-3, of=squares, by=by, outputs=("x", "x_velocity"),
+        machine,
+        None,
+        start,
+        5.0,
+        1e-3,
+        functional=squares,
+        parameters=by,
+        outputs=("x", "x_velocity"),
         tolerance=1e-12,
-    )  # fmt: skip
+    )
 
     def total(*at):
         return 0.5 * (swung(found.recording.time, *at) ** 2).sum()
 
     at = np.array([0.3, 0.1, MASS, STIFFNESS, DAMPING])
-    assert found.total == pytest.approx(total(*at), rel=1e-9)
+    assert found.functional_value == pytest.approx(total(*at), rel=1e-9)
     for i, name in enumerate(by):
         h = 3e-3 * at[i] * np.eye(5)[i]
         true = sum(w * (total(*(at + j * h)) - total(*(at - j * h))) for j, w in ORDER_8)
-        assert found.of(name) == pytest.approx(true / (3e-3 * at[i]), rel=1e-8), name
+        assert found.derivative(name) == pytest.approx(true / (3e-3 * at[i]), rel=1e-8), name
     assert found.values == pytest.approx(at)
 
 
@@ -60,10 +67,12 @@ def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
     spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
     machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}", spring)
     by = ("start.x", "friction.x.coulomb", "spring.x.stiffness", "block.mass")
-    found = crane.gradient(machine, None, [x0], 4.0, 2e-3, of=last(), by=by, outputs=("x",))
+    found = crane.gradient(
+        machine, None, [x0], 4.0, 2e-3, functional=last(), parameters=by, outputs=("x",)
+    )
     n = round((x0 * STIFFNESS / coulomb - 1.0) / 2.0 + 0.4999)
     true = (-1) ** n * np.array([1.0, -2 * n / STIFFNESS, 2 * n * coulomb / STIFFNESS**2, 0.0])
-    assert found.slopes == pytest.approx(true, abs=1e-8)
+    assert found.derivatives == pytest.approx(true, abs=1e-8)
 
 
 def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
@@ -71,12 +80,12 @@ def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
     coulomb = 2.0
     machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}")
     found = crane.gradient(
-        machine, Ramp(machine), [0.0], 2.0, 2e-3, of=last(),
-        by=("friction.x.coulomb", "block.mass"), outputs=("x",),
+        machine, Ramp(machine), [0.0], 2.0, 2e-3, functional=last(),
+        parameters=("friction.x.coulomb", "block.mass"), outputs=("x",),
     )  # fmt: skip
     since = 2.0 - coulomb / 3.0
     true = [-(since**2) / (2 * MASS), -3.0 * since**3 / (6 * MASS**2)]
-    assert found.slopes == pytest.approx(true, abs=1e-9)
+    assert found.derivatives == pytest.approx(true, abs=1e-9)
 
 
 def forwarder():
@@ -96,7 +105,7 @@ def hydraulic():
         valve = machine.hydraulics.valves[joint]
         ways = share * np.array([0.0, 0.0, 1.0, 1.0, -0.5])
         levers[joint] = valve.neutral + ways * (valve.full - valve.neutral)
-    signals = crane.Signals(machine, [0, 0.1, 0.3, 0.6, 0.8], levers)
+    signals = crane.ValveSignals(machine, [0, 0.1, 0.3, 0.6, 0.8], levers)
     by = (*HYDRAULIC, "start.X_lift", "friction.X_tilt.coulomb", "tilt_boom.com.x",
           "end_stop.X_lift.stiffness")  # fmt: skip
     outputs = ("X_lift", "X_tilt_velocity", "pressure_X_lift_a", "inclination_lift_boom")
@@ -105,21 +114,29 @@ def hydraulic():
 
 def both(machine, controller, initial, duration, by, outputs, accuracy):
     """Sums of random weights of what `follow` gives, and the gradients of these."""
-    asked = Asked.of(machine, controller, initial, duration, 1e-3, outputs, None, None)
-    track, several = Track(asked.motion, None), 2
-    directions = asked.directions.by(by, track.time)
-    base = asked.directions.base(track.time)
-    sizes = {name: asked.directions.size(name) for name in by}
-    stacked = Setup(*map(np.array, zip(*directions.values(), strict=True)))
-    forward = follow.follow(
-        asked.motion, outputs, lambda _: (base, stacked), np.array(list(sizes.values())), accuracy
-    ).slopes
+    asked = SensitivityProblem.from_arguments(
+        machine, controller, initial, duration, 1e-3, outputs, None, None
+    )
+    track, several = SimulatedMotion(asked.simulation, None), 2
+    directions = asked.directions.derivatives(by, track.time)
+    base = asked.directions.nominal_constants(track.time)
+    sizes = {name: asked.directions.typical_change(name) for name in by}
+    stacked = SimulationConstants(*map(np.array, zip(*directions.values(), strict=True)))
+    forward = variational_integration.integrate_sensitivities(
+        asked.simulation,
+        outputs,
+        lambda _: (base, stacked),
+        np.array(list(sizes.values())),
+        accuracy,
+    ).derivatives
     weights = np.random.default_rng(0).normal(size=(several, *forward.shape[:2]))
-    gatherer = adjoint.Gatherer(track, outputs, base, _changes(directions, sizes), accuracy)
-    found = gatherer.run(weights)
+    gatherer = adjoint_integration.AdjointIntegrator(
+        track, outputs, base, _largest_changes(directions, sizes), accuracy
+    )
+    found = gatherer.integrate_backward(weights)
     back = sum(
         getattr(found, part) @ getattr(stacked, part).T
-        for part in Setup._fields if part != "references"
+        for part in SimulationConstants._fields if part != "references"
     )  # fmt: skip
     assert not stacked.references.any()
     parts = np.einsum("Kik,ikp->Kip", weights, forward)
@@ -133,8 +150,8 @@ def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
     """To rounding, where both take the same steps: none in parts, or each."""
     case, accuracy = list(made()), np.inf
     if parted:
-        monkeypatch.setattr(follow, "DEEPEST", 1)
-        monkeypatch.setattr(adjoint, "DEEPEST", 1)
+        monkeypatch.setattr(variational_integration, "DEEPEST", 1)
+        monkeypatch.setattr(adjoint_integration, "DEEPEST", 1)
         case[3], accuracy = 0.1, 0.0
     back, forward, size, switches = both(*case, accuracy)
     assert (np.abs(back - forward) <= 1e-10 * size).all(), np.abs(back - forward) / size
@@ -143,7 +160,7 @@ def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
 
 @pytest.mark.parametrize("made", [forwarder, pytest.param(hydraulic, marks=pytest.mark.slow)])
 def test_its_own_choice_of_steps_is_as_good(made):
-    back, forward, size, _ = both(*made(), follow.ACCURACY)
+    back, forward, size, _ = both(*made(), variational_integration.STEP_ACCURACY)
     assert (np.abs(back - forward) <= 1e-6 * size).all(), np.abs(back - forward) / size
 
 
@@ -154,10 +171,18 @@ def test_differences_of_order_8_agree():
         for joint in crane.load("mini_forwarder").joints for key in ("coulomb", "stiction")
     })  # fmt: skip
     controller = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
-    variants, outputs = Variants(machine), ("X1", "tip_z", "q2_velocity")
+    variants, outputs = MachineVariants(machine), ("X1", "tip_z", "q2_velocity")
     by = ("link3.mass", "link3_G.x", "friction.X1.viscous", "link5.mass")
     found = crane.gradient(
-        machine, controller, None, 0.5, 1e-3, of=squares, by=by, outputs=outputs, tolerance=1e-12
+        machine,
+        controller,
+        None,
+        0.5,
+        1e-3,
+        functional=squares,
+        parameters=by,
+        outputs=outputs,
+        tolerance=1e-12,
     )
 
     def total(name, value):
@@ -174,41 +199,47 @@ def test_differences_of_order_8_agree():
         h = 1e-2 * (abs(value) or 0.1)
         ways = [(w, total(name, value + j * h) - total(name, value - j * h)) for j, w in ORDER_8]
         true = sum(w * way for w, way in ways) / h
-        noise = 1e-10 * found.total / h  # of simulations to 1e-12
-        assert found.of(name) == pytest.approx(true, rel=1e-7, abs=noise), name
+        noise = 1e-10 * found.functional_value / h  # of simulations to 1e-12
+        assert found.derivative(name) == pytest.approx(true, rel=1e-7, abs=noise), name
 
 
 @pytest.mark.long
 @pytest.mark.slow
 def test_all_numbers_that_matter_are_found():
     machine, controller, initial, _, _, _ = forwarder()
-    found = crane.gradient(machine, controller, initial, 0.1, of=last(), outputs=("X1_force",))
-    assert len(found.by) > 100
-    some = list(found.by[::20])
+    found = crane.gradient(
+        machine, controller, initial, 0.1, functional=last(), outputs=("X1_force",)
+    )
+    assert len(found.parameters) > 100
+    some = list(found.parameters[::20])
     fewer = crane.sensitivities(
-        machine, controller, initial, 0.1, by=some, outputs=("X1_force",)
-    ).slopes[-1, 0]
-    sizes = np.maximum(np.abs(fewer), 1e-9 * np.abs(found.slopes).max())
-    assert (np.abs([found.of(name) for name in some] - fewer) <= 1e-6 * sizes).all()
+        machine, controller, initial, 0.1, parameters=some, outputs=("X1_force",)
+    ).derivatives[-1, 0]
+    sizes = np.maximum(np.abs(fewer), 1e-9 * np.abs(found.derivatives).max())
+    assert (np.abs([found.derivative(name) for name in some] - fewer) <= 1e-6 * sizes).all()
     text = found.to_text()
-    assert f"20 of {len(found.by)} numbers" in text and "1 % does to J" in text
+    assert f"20 of {len(found.parameters)} numbers" in text and "1 % does to J" in text
 
 
 def test_it_takes_no_more_for_more_numbers():
     """The way back, counted in lines."""
     machine, controller, initial, _, _, outputs = forwarder()
-    asked = Asked.of(machine, controller, initial, 0.05, 1e-3, outputs, None, None)
-    track = Track(asked.motion, None)
-    base, names = asked.directions.base(track.time), ["link3.mass", "link7.mass"]
+    asked = SensitivityProblem.from_arguments(
+        machine, controller, initial, 0.05, 1e-3, outputs, None, None
+    )
+    track = SimulatedMotion(asked.simulation, None)
+    base, names = asked.directions.nominal_constants(track.time), ["link3.mass", "link7.mass"]
     names += [f"link{i}.com.{axis}" for i in (3, 4, 5, 6, 7) for axis in "xyz"]
-    every = asked.directions.by(names, track.time)
+    every = asked.directions.derivatives(names, track.time)
     work = []
     for count in (2, len(names)):
         some = {name: every[name] for name in names[:count]}
-        changes = _changes(some, {name: asked.directions.size(name) for name in some})
-        gatherer = adjoint.Gatherer(track, outputs, base, changes)
+        changes = _largest_changes(
+            some, {name: asked.directions.typical_change(name) for name in some}
+        )
+        gatherer = adjoint_integration.AdjointIntegrator(track, outputs, base, changes)
         with at_most(10**7) as counted:
-            gatherer.run(np.ones((1, 51, len(outputs))))
+            gatherer.integrate_backward(np.ones((1, 51, len(outputs))))
         work.append(counted.lines)
     assert work[1] <= 1.05 * work[0]
 
@@ -216,14 +247,14 @@ def test_it_takes_no_more_for_more_numbers():
 def test_several_at_once_are_each_by_itself(tmp_path):
     spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
     machine = block(tmp_path, f"{{x: {{coulomb: {1.7}}}}}", spring)
-    given = {"by": ("start.x", "friction.x.coulomb"), "outputs": ("x", "x_velocity")}
+    given = {"parameters": ("start.x", "friction.x.coulomb"), "outputs": ("x", "x_velocity")}
     weights = np.random.default_rng(3).normal(size=(3, 1001, 2))
-    found = crane.gradient(machine, None, [0.3], 2.0, 2e-3, of=weights, **given)
-    assert found.total.shape == (3,) and found.slopes.shape == (3, 2)
+    found = crane.gradient(machine, None, [0.3], 2.0, 2e-3, functional=weights, **given)
+    assert found.functional_value.shape == (3,) and found.derivatives.shape == (3, 2)
     for i, one in enumerate(weights):
-        alone = crane.gradient(machine, None, [0.3], 2.0, 2e-3, of=one, **given)
-        assert alone.total == pytest.approx(found.total[i])
-        assert alone.slopes == pytest.approx(found.slopes[i], rel=1e-6)
+        alone = crane.gradient(machine, None, [0.3], 2.0, 2e-3, functional=one, **given)
+        assert alone.functional_value == pytest.approx(found.functional_value[i])
+        assert alone.derivatives == pytest.approx(found.derivatives[i], rel=1e-6)
     assert "J3" in found.to_text()
 
 
@@ -231,12 +262,12 @@ def test_several_at_once_are_each_by_itself(tmp_path):
 @pytest.mark.parametrize("name", ["mini_forwarder", "patu655"])
 def test_a_machine_beside_another_has_the_numbers_of_one_that_is_loaded(name):
     machine = crane.load(name)
-    dynamics, variants = crane.Dynamics(machine), Variants(machine)
+    dynamics, variants = crane.Dynamics(machine), MachineVariants(machine)
     random, refused = np.random.default_rng(5), 0
     for number in random.permutation(list(variants.values))[:40].tolist():
         value = variants.values[number]
         changes, found = {number: value + 5e-3 * (abs(value) or 0.1)}, []
-        for made in (variants.machine, variants.near):
+        for made in (variants.machine, variants.perturbed_machine):
             try:
                 other = made(changes)
             except CraneError:
@@ -244,7 +275,7 @@ def test_a_machine_beside_another_has_the_numbers_of_one_that_is_loaded(name):
                 refused += 1
             else:
                 q = other.closure.solve(machine.home[machine.closure.active], machine.home)
-                found.append(np.concatenate([dynamics.constants(other), q]))
+                found.append(np.concatenate([dynamics.constants_of(other), q]))
         assert (found[0] is None) == (found[1] is None), number
         if found[0] is not None:
             assert found[0] == pytest.approx(found[1], rel=1e-12, abs=1e-12), number
@@ -256,17 +287,23 @@ def test_what_has_no_gradient_is_refused(tmp_path):
     start, by = ([0.0], [1.0]), ["block.mass"]
     weights = np.ones((101, 1))
     for options, text in (
-        ({"of": np.ones((100, 1)), "by": by}, r"have the shape \(100, 1\), give \(101, 1\)"),
-        ({"of": weights * np.nan, "by": by}, "not finite"),
-        ({"of": lambda t, y: (0.0, y[0]), "by": by}, r"have the shape \(1,\)"),
-        ({"of": weights, "by": ["mass"]}, "'mass'"),
-        ({"of": weights, "by": []}, "no number is named"),
-        ({"of": weights, "by": by, "outputs": ["y"]}, "'y' is no output of 'block'"),
+        (
+            {"functional": np.ones((100, 1)), "parameters": by},
+            r"have the shape \(100, 1\), give \(101, 1\)",
+        ),
+        ({"functional": weights * np.nan, "parameters": by}, "not finite"),
+        ({"functional": lambda t, y: (0.0, y[0]), "parameters": by}, r"have the shape \(1,\)"),
+        ({"functional": weights, "parameters": ["mass"]}, "'mass'"),
+        ({"functional": weights, "parameters": []}, "no number is named"),
+        (
+            {"functional": weights, "parameters": by, "outputs": ["y"]},
+            "'y' is no output of 'block'",
+        ),
     ):
         with pytest.raises(CraneError, match=text):
             crane.gradient(machine, None, start, 0.1, **options)
-    found = crane.gradient(machine, None, start, 0.1, of=weights, by=by)
+    found = crane.gradient(machine, None, start, 0.1, functional=weights, parameters=by)
     with pytest.raises(CraneError, match="'block.mas' is not among them"):
-        found.of("block.mas")
+        found.derivative("block.mas")
     with pytest.raises(CraneError, match="where the machine has other equations"):
-        crane.sensitivities("patu655", duration=0.1, by=["cylinder.X_tilt.stiffness"])
+        crane.sensitivities("patu655", duration=0.1, parameters=["cylinder.X_tilt.stiffness"])

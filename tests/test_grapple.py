@@ -9,8 +9,8 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError
-from crane.control import flow_share
-from crane.motion.sway import METHODS, Sway, impulses, retimed, without_sway
+from crane.control import largest_flow_share
+from crane.motion.sway import SWAY_METHODS, Sway, input_shaper, retime, suppress_sway
 
 pytestmark = pytest.mark.slow
 
@@ -58,7 +58,7 @@ def follow(machine, reference, after=6.0, **options):
     run = crane.simulate(
         machine, control, initial=(start, 0 * start), duration=until, step=1e-2, **options
     )
-    return run, run.q[:, -2:] - Sway(machine).hanging(run.q)[:, -2:]
+    return run, run.q[:, -2:] - Sway(machine).hanging_equilibrium(run.q)[:, -2:]
 
 
 # --- the pendulum ----------------------------------------------------------------------------
@@ -76,7 +76,7 @@ def test_small_sway_is_that_of_compound_pendulums(payload):
     machine = carrying(payload)
     home = machine.home[machine.closure.active]
     sway = Sway(machine)
-    np.testing.assert_allclose(sway.hanging(home), home, atol=1e-9)
+    np.testing.assert_allclose(sway.hanging_equilibrium(home), home, atol=1e-9)
     omega, zeta = sway.modes(home)
     np.testing.assert_allclose(omega, np.sqrt(sorted([radial, tangential])), rtol=1e-7)
     turning = {
@@ -86,7 +86,7 @@ def test_small_sway_is_that_of_compound_pendulums(payload):
     wanted = [VISCOUS / (2 * np.sqrt(x) * turning[x]) for x in sorted(turning)]
     np.testing.assert_allclose(zeta, wanted, rtol=1e-7)
     # the pin moves about the centre of oscillation, at I / (m d)
-    (shifts,) = sway.shifts(home[None])
+    (shifts,) = sway.pivoting_motions(home[None])
     reach = np.hypot(*crane.Kinematics(machine, "tip").position(home)[:2])
     length = GRAVITY / tangential
     assert abs(shifts[0, 1]) == pytest.approx(length / (reach), rel=1e-6)
@@ -106,7 +106,7 @@ def motion_of(machine, reference):
     """
     time = np.linspace(0.0, reference.duration, 2001)
     q = machine.closure.solve(reference.position(time))
-    place = crane.Kinematics(machine, "tip").positions(q)
+    place = crane.Kinematics(machine, "tip").positions_at_configurations(q)
     pitch = q[:, machine.column("q2")] + q[:, machine.column("q3")] + np.pi / 4
     slew = q[:, machine.column("slew")]
     spline = make_interp_spline(time, np.column_stack([place, slew, pitch]), k=7)
@@ -186,12 +186,12 @@ def loaded():
 
 @pytest.fixture(scope="module")
 def quarter(loaded):
-    return retimed(crane.task_trajectory(loaded, "swing"), 7.0)
+    return retime(crane.task_trajectory(loaded, "swing"), 7.0)
 
 
 def test_the_grapple_swings_as_its_equations_do(loaded, quarter):
     """A quarter turn that leaves 4 degrees, of the whole model and of the two pins alone."""
-    reference = without_sway(loaded, quarter, "none")
+    reference = suppress_sway(loaded, quarter, "none")
     run, _ = follow(loaded, reference, 0.0, tolerance=1e-12)
     wanted = swung(loaded, reference, 200.0, VISCOUS, run.time)
     assert np.ptp(wanted, axis=0).min() > 0.05
@@ -204,11 +204,11 @@ def test_the_grapple_swings_as_its_equations_do(loaded, quarter):
 @pytest.mark.parametrize("payload", [0.0, 250.0, 500.0])
 def test_a_flat_reference_leaves_no_sway(payload):
     machine = carrying(payload)
-    reference = retimed(crane.task_trajectory(machine, "swing"), 7.0)
-    flat = without_sway(machine, reference)
+    reference = retime(crane.task_trajectory(machine, "swing"), 7.0)
+    flat = suppress_sway(machine, reference)
     assert flat.duration == 7.0
     ends = np.array([0.0, 7.0])
-    driven = machine.driven
+    driven = machine.is_driven
     np.testing.assert_allclose(
         flat.position(ends)[:, driven], reference.position(ends)[:, driven], atol=1e-9
     )
@@ -216,13 +216,13 @@ def test_a_flat_reference_leaves_no_sway(payload):
     assert np.abs(sway[run.time < 7.0]).max() > 0.1
     assert np.abs(sway[run.time >= 7.0]).max() < 5e-6
     np.testing.assert_allclose(run.q[:, -2:], flat.position(run.time)[:, -2:], rtol=0, atol=5e-6)
-    _, before = follow(machine, without_sway(machine, reference, "none"), tolerance=1e-9)
+    _, before = follow(machine, suppress_sway(machine, reference, "none"), tolerance=1e-9)
     assert np.abs(before[run.time >= 7.0]).max() > 0.02
 
 
 def test_equations_on_paper_say_so_too(loaded, quarter):
     """The flat motion of the tip, and the two pins alone."""
-    flat = without_sway(loaded, quarter)
+    flat = suppress_sway(loaded, quarter)
     times = np.linspace(0.0, 7.0, 50)
     found = swung(loaded, flat, 200.0, VISCOUS, times)
     np.testing.assert_allclose(found, flat.position(times)[:, -2:], rtol=0, atol=5e-6)
@@ -240,13 +240,13 @@ class Shaped(crane.Trajectory):
     def position(self, time):
         return sum(x * self._base.position(np.asarray(time) - at) for at, x in self._impulses)
 
-    def _rate(self, order, time):
+    def _derivative(self, order, time):
         return sum(x * self._base._rate(order, np.asarray(time) - at) for at, x in self._impulses)
 
     def breaks(self):
         return np.array([0.0, self.duration])
 
-    turns = breaks
+    extremum_times = breaks
 
     def bounds(self):
         return self._base.bounds()
@@ -257,7 +257,7 @@ def test_a_shaper_of_the_wrong_length_leaves_what_theory_says(derivative):
     """|V| = |cos(pi r / 2)|, of ZVD its square, r the frequency over each mode's of the shaper."""
     designed = carrying(200.0, **smooth())
     home = designed.home[designed.closure.active]
-    delays, shares = impulses(designed, home, derivative)
+    delays, shares = input_shaper(designed, home, derivative)
     assert shares.sum() == pytest.approx(1.0) and delays[0] == 0
     shaped = Sway(designed).modes(home)[0]
     base = crane.point_to_point(home, home + [0.02, 0, 0, 0, 0, 0, 0], 5.0)
@@ -276,30 +276,42 @@ def test_a_shaper_of_the_wrong_length_leaves_what_theory_says(derivative):
 def beside(joint):
     """The machine with a joint locked, and a motion of its extension."""
     machine = crane.load(NAME, lock={joint: 0.0})
-    start = machine.home[machine.closure.active][machine.driven]
+    start = machine.home[machine.closure.active][machine.is_driven]
     return machine, crane.point_to_point(start, start + [0, 0, 0.3, 0], 5.0)
 
 
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda m, r: without_sway(m, r, "fast"), "method 'fast' is unknown, did you mean"),
-        (lambda m, r: without_sway(m, retimed(r, 1.0), "zvd"), "the shaper takes 4.08 s, the "
-         "motion 1 s"),
-        (lambda m, r: without_sway(m, retimed(r, 0.8)), "no motion of 0.8 s was found that leaves "
-         "what hangs without sway"),
-        (lambda m, r: retimed(r, 0.0), "the duration is 0"),
-        (lambda m, r: crane.ValveFeedforward(m, r, sway=-0.1), "the damping ratio of sway is "
-         "-0.1"),
+        (lambda m, r: suppress_sway(m, r, "fast"), "method 'fast' is unknown, did you mean"),
+        (
+            lambda m, r: suppress_sway(m, retime(r, 1.0), "zvd"),
+            "the shaper takes 4.08 s, the motion 1 s",
+        ),
+        (
+            lambda m, r: suppress_sway(m, retime(r, 0.8)),
+            "no motion of 0.8 s was found that leaves what hangs without sway",
+        ),
+        (lambda m, r: retime(r, 0.0), "the duration is 0"),
+        (
+            lambda m, r: crane.ValveFeedforward(m, r, sway=-0.1),
+            "the damping ratio of sway is -0.1",
+        ),
         (lambda m, r: Sway(crane.load("patu655")), "nothing sways on 'patu655': it has no free"),
-        (lambda m, r: without_sway(crane.load("patu655"), r), "nothing sways on 'patu655'"),
-        (lambda m, r: without_sway(*beside("slew")), "the drives of 'patu655_grapple' do not move "
-         "what hangs on sway_radial, sway_tangential in each direction"),
-        (lambda m, r: without_sway(m, crane.point_to_point(
-            [0, 0.117, 0.246, 0, 0], [1.5, 0.117, 0.246, 0, 0], 6.0)), "method 'flat': the "
-         "reference of 'X_ext' goes to -0.0"),
+        (lambda m, r: suppress_sway(crane.load("patu655"), r), "nothing sways on 'patu655'"),
+        (
+            lambda m, r: suppress_sway(*beside("slew")),
+            "the drives of 'patu655_grapple' do not move "
+            "what hangs on sway_radial, sway_tangential in each direction",
+        ),
+        (
+            lambda m, r: suppress_sway(
+                m, crane.point_to_point([0, 0.117, 0.246, 0, 0], [1.5, 0.117, 0.246, 0, 0], 6.0)
+            ),
+            "method 'flat': the reference of 'X_ext' goes to -0.0",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused(loaded, quarter, call, line):
     with pytest.raises(CraneError) as caught:
         call(loaded, quarter)
@@ -310,8 +322,8 @@ def test_any_machine_that_hangs(tmp_path):
     """Another one, whose grapple's products of inertia turn both planes into each other."""
     machine = crane.load(hanging.file(tmp_path))
     reference = crane.point_to_point([0.2, 0.3], [1.0, 0.45], 6.0)
-    run, sway = follow(machine, without_sway(machine, reference), tolerance=1e-11)
-    _, before = follow(machine, without_sway(machine, reference, "none"), tolerance=1e-11)
+    run, sway = follow(machine, suppress_sway(machine, reference), tolerance=1e-11)
+    _, before = follow(machine, suppress_sway(machine, reference, "none"), tolerance=1e-11)
     after = run.time >= 6.0
     assert np.abs(before[after]).max() > 0.02
     assert np.abs(sway[after]).max() < 1e-5
@@ -321,7 +333,7 @@ def test_any_machine_that_hangs(tmp_path):
 
 
 def test_the_fastest_motion_takes_all_of_the_flow(loaded, quarter):
-    none = crane.fastest(loaded, quarter)
+    none = crane.fastest_trajectory(loaded, quarter)
     time = np.linspace(0, none.duration, 1000)
     circuit = loaded.hydraulics
     flow = np.zeros((len(time), len(circuit.joints)))
@@ -332,15 +344,17 @@ def test_the_fastest_motion_takes_all_of_the_flow(loaded, quarter):
     assert none.duration == pytest.approx(1.875 * 1.4137e-3 * np.pi / 2 / 6.6667e-4, rel=2e-3)
     assert (flow / 6.6667e-4).max() == pytest.approx(1.0, rel=2e-3)
     assert flow.sum(axis=1).max() < circuit.supply.flow
-    assert flow_share(loaded, retimed(none, 2 * none.duration)) == pytest.approx(0.5, rel=2e-3)
+    assert largest_flow_share(loaded, retime(none, 2 * none.duration)) == pytest.approx(
+        0.5, rel=2e-3
+    )
     few = crane.load(NAME, changes={"payload.mass": 200.0, "supply.flow": 5e-4})
-    slow = crane.fastest(few, quarter)
+    slow = crane.fastest_trajectory(few, quarter)
     assert slow.duration == pytest.approx(none.duration * flow.sum(axis=1).max() / 5e-4, rel=2e-3)
 
 
 def test_valves_follow_what_the_circuit_turned_round_says(loaded, quarter):
     """Within half a millimetre and half a milliradian, where a PD controller lags by degrees."""
-    flat = without_sway(loaded, quarter)
+    flat = suppress_sway(loaded, quarter)
     start = flat.position(0.0)
     errors = []
     for control in (crane.ValveFeedforward(loaded, flat), crane.ValvePD(loaded, flat)):
@@ -356,7 +370,7 @@ def test_a_command_tells_what_sway_is_left():
     done = typed("sway", NAME, "--task", "swing", "--payload", "250", "--damping", "0")
     assert done.returncode == 0, done.stderr
     head, *lines = done.stdout.splitlines()
-    assert head.split("  ")[0] == "payload" and len(lines) == len(METHODS)
+    assert head.split("  ")[0] == "payload" and len(lines) == len(SWAY_METHODS)
     rows = {cells[2]: cells for cells in (line.split() for line in lines)}
     assert float(rows["none"][6]) > 2.0
     assert float(rows["flat"][8]) > 90.0 and float(rows["flat"][5]) < 1.1
@@ -367,10 +381,10 @@ def test_a_command_tells_what_sway_is_left():
 @pytest.mark.long
 def test_all_payloads_leave_a_tenth_of_the_sway():
     found = crane.sway_study(NAME, "swing", (0.0, 125.0, 375.0, 500.0))
-    assert len(found.rows) == 4 * 2 * len(METHODS)
+    assert len(found.rows) == 4 * 2 * len(SWAY_METHODS)
     for row in found.rows:
         if row.method == "flat":
-            assert row.less > 0.9 and row.share < 1.1
+            assert row.relative_reduction > 0.9 and row.relative_duration < 1.1
 
 
 @pytest.mark.slow
@@ -380,7 +394,7 @@ def test_feedback_damps_what_is_left(payload, joint):
     """From 5 degrees at rest: about the damping that is asked for, half a degree within 6 s."""
     machine = carrying(payload)
     home = machine.home[machine.closure.active]
-    stands = without_sway(machine, crane.point_to_point(home, home, 1.0), "none")
+    stands = suppress_sway(machine, crane.point_to_point(home, home, 1.0), "none")
     omega, zeta = Sway(machine).modes(home)
     which = machine.active.index(joint)
     after = []
@@ -397,14 +411,14 @@ def test_feedback_damps_what_is_left(payload, joint):
 
 def test_feedback_takes_what_a_plan_did_not_know(loaded):
     """A plan for 200 kg, and 160 kg in the claws."""
-    plan = crane.fastest(loaded, crane.task_trajectory(loaded, "swing"), "flat")
+    plan = crane.fastest_trajectory(loaded, crane.task_trajectory(loaded, "swing"), "flat")
     lighter = carrying(160.0)
     sway, left = Sway(lighter), []
     for ratio in (0.0, 0.2):
         control = crane.ValveFeedforward(loaded, plan, sway=ratio)
         run = crane.simulate(lighter, control, duration=12.0, step=1e-2)
         after = run.q[run.time >= plan.duration]
-        left.append(np.abs(after - sway.hanging(after))[:, -2:].max())
+        left.append(np.abs(after - sway.hanging_equilibrium(after))[:, -2:].max())
     assert left[0] > np.radians(1.0)
     assert left[1] < 0.5 * left[0]
 

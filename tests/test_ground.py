@@ -230,8 +230,10 @@ def test_machine_files_stand_on_the_ground(block, tmp_path):
     path.write_text(
         STANDING.replace("{frame: c0}", "{frame: c0, lateral_stiffness: 1e5, lateral_damping: 9}")
     )
-    (tyre, *_) = crane.load(crane.write_machine(crane.load(path), tmp_path / "tyre")).external
-    assert (tyre.lateral_stiffness, tyre.lateral_damping, tyre.states) == (1e5, 9.0, 2)
+    (tyre, *_) = crane.load(
+        crane.write_machine(crane.load(path), tmp_path / "tyre")
+    ).external_forces
+    assert (tyre.lateral_stiffness, tyre.lateral_damping, tyre.state_count) == (1e5, 9.0, 2)
     for old, new, text in (
         ("ground:", "#", "yaml:7: contacts without a ground"),
         ("{frame: c0}", "{frame: nix}", "yaml:7: .*'nix'"),
@@ -264,7 +266,7 @@ def test_a_root_has_the_freedoms_that_are_named(block, tmp_path):
     machine = crane.load(path)
     assert (machine.free, machine.driven_joints) == (("base_z", "base_ry"), ())
     rocks = crane.simulate(machine, None, None, 1.5)
-    floats = crane.load(block.path).under(*machine.external)
+    floats = crane.load(block.path).with_external_forces(*machine.external_forces)
     q = np.array([0.0, 0.0, 0.8, 0.0, 0.3, 0.0])
     whole = crane.simulate(floats, None, q, 1.5)
     assert rocks.q == pytest.approx(whole.q[:, [2, 4]], abs=1e-7)
@@ -272,8 +274,8 @@ def test_a_root_has_the_freedoms_that_are_named(block, tmp_path):
     again = crane.load(crane.write_machine(machine, tmp_path / "written"))
     assert crane.simulate(again, None, None, 0.2).q == pytest.approx(rocks.q[:201], abs=1e-10)
     named = crane.load(tmp_path / "root.urdf", floating=("ry", "z"))
-    assert named.joints == ("base_z", "base_ry") and "floating" in named.call
-    assert crane.formats.recalled(named.call).joints == named.joints
+    assert named.joints == ("base_z", "base_ry") and "floating" in named.load_expression
+    assert crane.formats.load_from_expression(named.load_expression).joints == named.joints
     locks = dict.fromkeys(("base_x", "base_y", "base_rx", "base_rz"), 0.0)
     held = crane.load(tmp_path / "root.urdf", floating=True, lock=locks)
     assert held.free == machine.free

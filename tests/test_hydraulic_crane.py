@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import crane
-from crane.control import Sampled, Signals, TipVelocity, ValveDrive, ValvePD, joystick
-from crane.hydraulics.circuit import BALANCES
-from crane.motion.trajectories import task_trajectory
+from crane.control import SampledCommand, TipVelocity, ValveDrive, ValvePD, ValveSignals, joystick
+from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.motion.task_trajectories import task_trajectory
 
 LOAD = {"payload.mass": 211.4}
 LIFT = 1  # column of X_lift
@@ -25,7 +25,7 @@ def loaded():
 
 
 def lifting(machine, volts=5.0):
-    return Signals(machine, [0.0, 1.0, 1.1], {"X_lift": [5.8, 5.8, volts]})
+    return ValveSignals(machine, [0.0, 1.0, 1.1], {"X_lift": [5.8, 5.8, volts]})
 
 
 def change(recording, name):
@@ -125,7 +125,7 @@ def test_stiff_oil_moves_with_its_flow(loaded):
             "oil.steel_modulus": factor * 2.1e11,
         }
         machine = crane.load("patu655", changes=LOAD | changes)
-        smooth = Signals(
+        smooth = ValveSignals(
             machine, np.linspace(0, 4, 401),
             {"X_lift": 5.8 - 0.4 - 0.3 * np.sin(np.pi * np.linspace(0, 4, 401) / 2) ** 2},
         )  # fmt: skip
@@ -174,7 +174,7 @@ def test_halving_the_step_changes_less_than_a_start_beside(loaded, task):
 @pytest.mark.long
 def test_machine_code_agrees_with_scipy_on_pinocchio(patu):
     """Another method, another path of the dynamics, formulas in floats."""
-    opening = Signals(patu, [0.0, 0.1, 0.2], {"X_lift": [5.8, 5.8, 4.6]})
+    opening = ValveSignals(patu, [0.0, 0.1, 0.2], {"X_lift": [5.8, 5.8, 4.6]})
     fast = crane.simulate(patu, opening, duration=0.4, step=1e-2)
     slow = crane.simulate(patu, opening, duration=0.4, step=1e-2, backend="pinocchio")
     assert np.ptp(fast.q[:, LIFT]) > 3e-3
@@ -196,7 +196,7 @@ def test_a_minute_of_work_balances(loaded):
     }
     recording = crane.simulate(loaded, joystick(loaded, levers), duration=60.0)
     check_balances(loaded, recording)
-    assert set(BALANCES) <= set(recording.channels)
+    assert set(BALANCE_UNITS) <= set(recording.channels)
     assert np.ptp(recording.channels["pump_work"]) > 5e4
 
 
@@ -239,7 +239,7 @@ def test_a_program_sees_what_the_machine_does(patu):
         calls.append((time, q_a.copy(), pressures.copy()))
         return [5.8, 5.0 if q_a[LIFT] < 0.13 else 5.8, 5.8, 5.8]
 
-    recording = crane.simulate(patu, Sampled(program, patu, period=0.02), duration=3.0)
+    recording = crane.simulate(patu, SampledCommand(program, patu, period=0.02), duration=3.0)
     assert [t for t, _, _ in calls] == pytest.approx(0.02 * np.arange(150))
     t, q_a, pressures = calls[50]
     at = round(t * 1000)
@@ -250,7 +250,7 @@ def test_a_program_sees_what_the_machine_does(patu):
 
 def test_a_program_starts_anew_in_each_simulation(patu):
     """Spools begin at neutral, not where the last simulation left them."""
-    program = Sampled(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
+    program = SampledCommand(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
     first, again = (crane.simulate(patu, program, duration=0.2) for _ in range(2))
     np.testing.assert_array_equal(first.q, again.q)
     assert again.channels["spool_X_lift"][0] == 0.0
@@ -258,14 +258,14 @@ def test_a_program_starts_anew_in_each_simulation(patu):
 
 @pytest.mark.parametrize("method", ["rk4", "BDF"])
 def test_methods_that_call_no_program_are_refused(patu, method):
-    program = Sampled(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
+    program = SampledCommand(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
     with pytest.raises(crane.CraneError, match=f"'{method}' does not call the valves' program"):
         crane.simulate(patu, program, duration=0.1, method=method)
 
 
 def test_circuit_follows_the_active_joints(patu):
     """Cylinders, valves and gains of joints that are driven no more go together."""
-    left = patu.driven_by(["slew", "q2", "X_tilt", "X_ext"]).hydraulics
+    left = patu.with_active_joints(["slew", "q2", "X_tilt", "X_ext"]).hydraulics
     for parts in (left.cylinders, left.valves, left.control):
         assert list(parts) == ["slew", "X_tilt", "X_ext"]
 
@@ -279,14 +279,14 @@ def test_a_pump_that_rests(loaded):
     recording = crane.simulate(machine, lifting(machine), duration=3.0)
     check_balances(machine, recording)
     assert np.abs(recording.q - recording.q[0]).max() < 1e-3
-    lowering = Signals(machine, [0, 1, 1.2], {"X_lift": [5.8, 5.8, 6.6]})
+    lowering = ValveSignals(machine, [0, 1, 1.2], {"X_lift": [5.8, 5.8, 6.6]})
     recording = crane.simulate(machine, lowering, duration=3.0)
     check_balances(machine, recording)
     assert recording.q[-1, LIFT] < recording.q[0, LIFT] - 0.01  # by its weight
 
 
 def test_valve_stuck_open_runs_into_the_end_stop(loaded):
-    stuck = Signals(loaded, [0.0], {"X_lift": [2.8]})
+    stuck = ValveSignals(loaded, [0.0], {"X_lift": [2.8]})
     recording = crane.simulate(loaded, stuck, duration=15.0)
     check_balances(loaded, recording)
     upper = loaded.upper[LIFT]
@@ -365,7 +365,7 @@ def test_numbers_too_small_to_divide_by_are_refused():
 
 
 def test_a_cylinder_needs_limits(patu):
-    endless = patu.driven_by(patu.active)
+    endless = patu.with_active_joints(patu.active)
     object.__setattr__(endless, "upper", np.where(np.arange(4) == 0, np.inf, patu.upper))
     with pytest.raises(crane.CraneError, match="'slew' has no limits, a cylinder needs"):
         endless.replace(hydraulics=patu.hydraulics)
@@ -373,11 +373,11 @@ def test_a_cylinder_needs_limits(patu):
 
 def test_signals_that_cannot_be_are_refused(patu):
     with pytest.raises(crane.CraneError, match="no valve for 'q2'"):
-        Signals(patu, [0.0, 1.0], {"q2": [5.8, 5.8]})
+        ValveSignals(patu, [0.0, 1.0], {"q2": [5.8, 5.8]})
     with pytest.raises(crane.CraneError, match="does not increase"):
-        Signals(patu, [0.0, 0.0], {"X_lift": [5.8, 5.8]})
+        ValveSignals(patu, [0.0, 0.0], {"X_lift": [5.8, 5.8]})
     with pytest.raises(crane.CraneError, match="finite"):
-        Signals(patu, [0.0, 1.0], {"X_lift": [5.8, np.nan]})
+        ValveSignals(patu, [0.0, 1.0], {"X_lift": [5.8, np.nan]})
     with pytest.raises(crane.CraneError, match="-1 to 1"):
         joystick(patu, {"X_lift": [(0, 1.5)]})
     for pairs in ([], [(0, 0), (1,)], [("a", "b")]):
@@ -387,10 +387,10 @@ def test_signals_that_cannot_be_are_refused(patu):
         with pytest.raises(crane.CraneError, match="give times up to 4000 s"):
             joystick(patu, {"X_lift": pairs})
     with pytest.raises(crane.CraneError, match="real numbers"):
-        Signals(patu, ["a", "b"], {})
+        ValveSignals(patu, ["a", "b"], {})
     with pytest.raises(crane.CraneError, match=r"pressure of the tank is -50000 Pa"):
-        Signals(patu, [0.0], {}, tank=[-5e4])
+        ValveSignals(patu, [0.0], {}, tank=[-5e4])
     with pytest.raises(crane.CraneError, match="period"):
-        crane.simulate(patu, Sampled(lambda *_: [5.8] * 4, patu, 0.0015), duration=0.1)
+        crane.simulate(patu, SampledCommand(lambda *_: [5.8] * 4, patu, 0.0015), duration=0.1)
     with pytest.raises(crane.CraneError, match="has no valves"):
         ValvePD(crane.load("mini_forwarder"), None)

@@ -8,22 +8,22 @@ from scipy.integrate import solve_ivp
 
 import crane
 from crane.common.errors import InputError, RecordingError
-from crane.hydraulics.components import Counterbalance, Valve
+from crane.hydraulics.components import CounterbalanceValve, Valve
 from crane.identification.hydraulics.cylinder_friction import (
     direction_difference,
     identify_cylinder_friction,
 )
 from crane.identification.hydraulics.cylinder_signals import (
     cylinder_signals,
-    noise_level,
-    opening,
+    noise_std,
     spool_position,
+    valve_opening,
 )
-from crane.identification.hydraulics.orifice_rows import OrificeRows, terms
-from crane.identification.hydraulics.orifices import identify_orifices
-from crane.identification.hydraulics.valve import identify_valve
-from crane.identification.signals.steady import steady, steady_means
-from crane.identification.signals.weak_form import Windows
+from crane.identification.hydraulics.orifice_coefficients import identify_orifices
+from crane.identification.hydraulics.orifice_equations import OrificeEquations, chamber_terms
+from crane.identification.hydraulics.valve_curve import identify_valve
+from crane.identification.signals.steady_samples import steady_means, steady_samples
+from crane.identification.signals.weak_form import WeakFormWindows
 
 pytestmark = pytest.mark.slow
 
@@ -213,20 +213,20 @@ def test_parameters_without_noise(machine, quick, other, method):
     found = identify_orifices(machine, recorded(quick), "boom", method)
     np.testing.assert_allclose(found.values, X, rtol=1e-8)
     judged = found.predict(recorded(other))
-    assert judged.relative < 1e-5 and found.training[0].relative < 1e-5
+    assert judged.relative_error < 1e-5 and found.training_sides[0].relative_error < 1e-5
     assert found.bulk_modulus == pytest.approx(BETA, rel=1e-8)
-    assert len(judged.time) == len(judged.left) == len(judged.right) > 500
+    assert len(judged.time) == len(judged.predicted) == len(judged.measured) > 500
 
 
 @pytest.mark.parametrize("method", ["weak", "chambers", "ls"])
 def test_rows_of_a_recording_are_made_once(machine, quick, method, monkeypatch):
     """And what both chambers' equations say together is (29)."""
-    made, init = [], OrificeRows.__init__
-    monkeypatch.setattr(OrificeRows, "__init__", lambda *a: made.append(a) or init(*a))
+    made, init = [], OrificeEquations.__init__
+    monkeypatch.setattr(OrificeEquations, "__init__", lambda *a: made.append(a) or init(*a))
     run = recorded(quick)
     found = identify_orifices(machine, run, "boom", method)
     assert len(made) == 1
-    (both,), alone = found.training, found.predict(run)
+    (both,), alone = found.training_sides, found.predict(run)
     assert len(made) == 2
     for name in ("time", "left", "right"):
         one, other = getattr(both, name), getattr(alone, name)
@@ -243,7 +243,7 @@ def test_several_recordings_count_together(machine, quick, other):
     rng = np.random.default_rng(0)
     runs = [recorded(data, 1.0, rng) for data in (quick, other)]
     one, both = (identify_orifices(machine, part, "boom") for part in (runs[0], runs))
-    assert (both.std < 0.95 * one.std).all() and len(both.training) == 2
+    assert (both.std < 0.95 * one.std).all() and len(both.training_sides) == 2
     np.testing.assert_allclose(both.values[1:], X[1:], rtol=0.01)
 
 
@@ -269,7 +269,7 @@ def test_noise_like_the_paper_s(machine, slow, method):
     low, high = found.interval().T
     assert ((low < X) & (high > X)).all()
     judged = found.predict(recorded([c[:count] for c in slow]))
-    assert judged.relative < 0.01
+    assert judged.relative_error < 0.01
     assert 0.7 < found.misfit < 1.5  # quantisation adds little to this noise
 
 
@@ -407,19 +407,19 @@ def test_flows_at_reversed_pressure_differences(machine):
     time = np.arange(100) * 1e-3
     one = np.ones(100)
     run = recorded((time, 0.2 * one, 0 * one, (SUPPLY + 4e5) * one, (TANK - 9e4) * one, one))
-    rows = terms(machine, "boom", cylinder_signals(machine, run, "boom"))[1]
+    rows = chamber_terms(machine, "boom", cylinder_signals(machine, run, "boom"))[1]
     assert rows[0, 0, 0] * (HOSE_A + AREA_A * 0.2) == pytest.approx(np.sqrt(4e5))
     assert rows[1, 1, 0] * (HOSE_B + AREA_B * 0.3) == pytest.approx(-np.sqrt(9e4))
     assert (rows[:, 2:] == 0).all()
     kept = with_parts(machine, valve={"margin": 7e5})
-    assert (terms(kept, "boom", cylinder_signals(kept, run, "boom"))[1][0, 0] == 0).all()
+    assert (chamber_terms(kept, "boom", cylinder_signals(kept, run, "boom"))[1][0, 0] == 0).all()
     run = recorded((time, 0.2 * one, 0 * one, 50e5 * one, 50e5 * one, one))
-    rows = terms(kept, "boom", cylinder_signals(kept, run, "boom"))[1]
+    rows = chamber_terms(kept, "boom", cylinder_signals(kept, run, "boom"))[1]
     assert rows[0, 0, 0] * (HOSE_A + AREA_A * 0.2) == pytest.approx(-np.sqrt(7e5))
 
 
 def holding(machine):
-    valve = Counterbalance(pressure=1e7, pilot_ratio=4, range=1e6, coefficient=1e-6)
+    valve = CounterbalanceValve(pressure=1e7, pilot_ratio=4, range=1e6, coefficient=1e-6)
     return with_parts(machine, cylinder={"counterbalance_a": valve})
 
 
@@ -466,40 +466,47 @@ def test_unknown_sensor(machine, quick):
 def test_windows_differentiate_and_average():
     step = 5e-3
     time = np.arange(2000) * step
-    w = Windows.over(2000, step, 0.1)
+    w = WeakFormWindows.create(2000, step, 0.1)
     centre = time[w.centres]
     assert w.phi.shape == (2, 65)  # 64 steps, as 0.1 s are too few
     # a centred weight of width b passes a slow sine with a factor, slope and mean alike
     omega = 3.0
-    mean, slope = w.apply(w.phi, np.sin(omega * time)), w.apply(w.slope, np.sin(omega * time))
-    passed = w.apply(w.phi, np.cos(omega * time))
+    mean, slope = (
+        w.integrate(w.phi, np.sin(omega * time)),
+        w.integrate(w.phi_derivative, np.sin(omega * time)),
+    )
+    passed = w.integrate(w.phi, np.cos(omega * time))
     np.testing.assert_allclose(slope, omega * passed, rtol=0, atol=5e-8 * omega)
     np.testing.assert_allclose(mean[0] / np.sin(omega * centre), mean[1] / np.sin(omega * centre))
-    np.testing.assert_allclose(w.apply(w.slope, 4 + 7 * time), 7, rtol=1e-10)
-    np.testing.assert_allclose(w.apply(w.phi, 4 + 7 * time), [4 + 7 * centre] * 2, rtol=1e-12)
+    np.testing.assert_allclose(w.integrate(w.phi_derivative, 4 + 7 * time), 7, rtol=1e-10)
+    np.testing.assert_allclose(w.integrate(w.phi, 4 + 7 * time), [4 + 7 * centre] * 2, rtol=1e-12)
     # halves share no sample
-    assert not (w.phi[0] * w.phi[1]).any() and not (w.slope[0] * w.slope[1]).any()
+    assert (
+        not (w.phi[0] * w.phi[1]).any() and not (w.phi_derivative[0] * w.phi_derivative[1]).any()
+    )
 
 
 def test_spread_is_the_transpose_of_apply():
     rng = np.random.default_rng(0)
-    w = Windows.over(500, 1e-3, 0.1)
+    w = WeakFormWindows.create(500, 1e-3, 0.1)
     f, rows = rng.standard_normal(500), rng.standard_normal((2, len(w.centres), 3))
-    forward = np.einsum("hk,hkp->p", w.apply(w.slope, f), rows)
-    np.testing.assert_allclose(f @ w.spread(w.slope, rows, 500), forward, rtol=1e-10)
+    forward = np.einsum("hk,hkp->p", w.integrate(w.phi_derivative, f), rows)
+    np.testing.assert_allclose(
+        f @ w.apply_transpose(w.phi_derivative, rows, 500), forward, rtol=1e-10
+    )
 
 
 def test_windows_within_one_label():
     labels = np.zeros(1000)
     labels[430:] = 1
-    w = Windows.over(1000, 1e-3, 0.064)
-    crossing = (w.centres - w.reach < 430) & (w.centres + w.reach >= 430)
-    np.testing.assert_array_equal(w.within(labels), ~crossing)
+    w = WeakFormWindows.create(1000, 1e-3, 0.064)
+    crossing = (w.centres - w.half_width < 430) & (w.centres + w.half_width >= 430)
+    np.testing.assert_array_equal(w.are_uniform(labels), ~crossing)
 
 
 def test_too_short_for_a_window():
     with pytest.raises(RecordingError, match="60 samples are fewer than the 65 of one window"):
-        Windows.over(60, 1e-2, 0.1)
+        WeakFormWindows.create(60, 1e-2, 0.1)
 
 
 def test_noise_level_sees_no_signal_and_no_jumps():
@@ -507,8 +514,8 @@ def test_noise_level_sees_no_signal_and_no_jumps():
     time = np.arange(10000) * 1e-3
     signal = 1e6 * np.sin(20 * time) + 1e6 * (time > 5)
     noisy = signal + 2e3 * rng.standard_normal(10000)
-    assert noise_level(noisy) == pytest.approx(2e3, rel=0.04)
-    assert noise_level(signal) < 1.0
+    assert noise_std(noisy) == pytest.approx(2e3, rel=0.04)
+    assert noise_std(signal) < 1.0
 
 
 def test_spool_follows_a_sine_and_a_ramp():
@@ -529,19 +536,19 @@ def test_spool_follows_a_sine_and_a_ramp():
 def test_opening_is_the_valve_s(machine):
     valve = machine.hydraulics.valves["boom"]
     u = np.linspace(-1.3, 1.3, 53)
-    np.testing.assert_allclose(opening(valve, u), [valve.opening(x) for x in u], atol=1e-15)
+    np.testing.assert_allclose(valve_opening(valve, u), [valve.opening(x) for x in u], atol=1e-15)
 
 
 def test_steady_looks_back():
     time = np.arange(1000) * 1e-2
     step = (time >= 5).astype(float)
-    kept = steady(time, 0.5, step)
+    kept = steady_samples(time, 0.5, step)
     assert not kept[:50].any() and kept[60:450].all() and kept[600:].all()
     assert not kept[500:545].any()
     with pytest.raises(RecordingError, match="no sample is steady for 0.5 s, record slower"):
-        steady(time, 0.5, np.sin(5 * time))
+        steady_samples(time, 0.5, np.sin(5 * time))
     with pytest.raises(InputError, match="settle is 0.01 s, give at least 0.02 s"):
-        steady(time, 0.01, step)
+        steady_samples(time, 0.01, step)
 
 
 # --- compensated valve ---------------------------------------------------------------------
@@ -584,7 +591,7 @@ def test_valve_without_noise(compensated, signal, end):
     # a ramp's lag of 50 ms moves each edge by 2 mV, up and down oppositely
     assert found.neutral == pytest.approx(MIDDLE, abs=2e-3)
     assert found.dead_band == pytest.approx(SHARE, abs=1e-3)
-    np.testing.assert_allclose(found.flows, FLOW, rtol=3e-3)
+    np.testing.assert_allclose(found.full_flows, FLOW, rtol=3e-3)
     assert found.values[0] == pytest.approx(MIDDLE - 3 * SHARE, abs=3e-3)
     assert found.values[1] == pytest.approx(MIDDLE + 3 * SHARE, abs=3e-3)
     grid = np.linspace(4.3, 7.3, 31)
@@ -602,7 +609,9 @@ def test_valve_intervals_cover(compensated):
     }  # fmt: skip
     inside = dict.fromkeys(truth, 0)
     for _ in range(draws):
-        table = identify_valve(compensated, driven(U, time, 5e-4, rng), "boom").table()
+        table = identify_valve(
+            compensated, driven(U, time, 5e-4, rng), "boom"
+        ).parameter_intervals()
         for name, value in truth.items():
             inside[name] += table[name][1] < value < table[name][2]
     for name, count in inside.items():
@@ -627,8 +636,8 @@ def test_valve_leaves_out_what_has_no_margin(compensated):
     run = driven(U, time, 0, None, speed=starved)
     served = driven(U, time, 0, None, speed=starved, **pressures)
     found = identify_valve(compensated, served, "boom")
-    np.testing.assert_allclose(found.flows, FLOW, rtol=3e-3)
-    assert abs(identify_valve(compensated, run, "boom").flows[1] / FLOW[1] - 1) > 0.1
+    np.testing.assert_allclose(found.full_flows, FLOW, rtol=3e-3)
+    assert abs(identify_valve(compensated, run, "boom").full_flows[1] / FLOW[1] - 1) > 0.1
 
 
 def test_valve_table(compensated):
@@ -643,11 +652,11 @@ def test_valve_s_derived_numbers_by_differences(compensated):
     time = np.arange(0, 42, 1e-2)
     run = driven(staircase(time), time, 5e-4, np.random.default_rng(0))
     found = identify_valve(compensated, run, "boom")
-    _, at, J = found.derived()
+    _, at, J = found.valve_parameters()
     for i, size in enumerate(1e-6 * np.abs(found.values)):
         step = np.zeros(4)
         step[i] = size
-        moved = dataclasses.replace(found, values=found.values + step).derived()[1]
+        moved = dataclasses.replace(found, values=found.values + step).valve_parameters()[1]
         np.testing.assert_allclose((moved - at) / size, J[:, i], rtol=1e-4, atol=1e-9)
 
 
@@ -680,7 +689,7 @@ def test_valve_whose_load_rings(compensated, frequency):
     )
     assert found.neutral == pytest.approx(MIDDLE, abs=3e-3)
     assert found.dead_band == pytest.approx(SHARE, abs=2e-3)
-    np.testing.assert_allclose(found.flows, FLOW, rtol=5e-3)
+    np.testing.assert_allclose(found.full_flows, FLOW, rtol=5e-3)
     low, high, amplitude = found.ringing
     assert low == pytest.approx(frequency, rel=5e-3)
     assert high == pytest.approx(frequency, rel=5e-3)
@@ -697,7 +706,7 @@ def test_means_over_periods_leave_what_does_not_ring(compensated):
     assert found.ringing is None and "rings" not in found.to_text()
     U, v = run.channels["voltage_boom"], run.v[:, 0]
     means = steady_means(time, 0.5, U, v)
-    np.testing.assert_array_equal(means.kept, steady(time, 0.5, U, v))
+    np.testing.assert_array_equal(means.kept, steady_samples(time, 0.5, U, v))
     assert means.answer is v
     drift = np.where(time > 20, 0.05 * np.sin(0.3 * time), 0.0)  # no period within a held signal
     with pytest.raises(RecordingError, match="no sample is steady"):

@@ -8,8 +8,8 @@ from hydraulic_rig import COMPENSATED, ORIFICE, rig
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
-from crane.common.magnitudes import TURNING, USUAL, doubt
-from crane.control import Signals
+from crane.common.plausible_ranges import PLAUSIBLE_RANGES, ROTARY_RANGES, implausible_value_text
+from crane.control import ValveSignals
 from crane.formats.check import check
 from crane.hydraulics import Supply
 
@@ -27,9 +27,9 @@ def told(folder, **numbers):
     report = check(folder / "rig.yaml")
     assert len(report.findings) == 1, report.findings
     (finding,) = report.findings
-    assert finding.error == bool(refused)
+    assert finding.is_error == bool(refused)
     line = refused or lines[0]
-    assert line == f"{finding.file}:{finding.line}: {finding.what}" and "\n" not in line
+    assert line == f"{finding.file}:{finding.line}: {finding.message}" and "\n" not in line
     written = (folder / "rig.yaml").read_text().splitlines()[finding.line - 1]
     assert written.split(":")[0].strip() in line  # points at the key
     return line, bool(refused)
@@ -141,17 +141,17 @@ def test_parts_and_signals_by_hand():
         Supply(pressure=350)
     machine = crane.load("patu655")
     with pytest.raises(InputError, match="at most, far below the tank's: looks like bar"):
-        Signals(machine, [0.0, 1.0], {}, supply=[92, 95])
+        ValveSignals(machine, [0.0, 1.0], {}, supply=[92, 95])
     with pytest.raises(InputError, match=r"signals are a list, give those of each valve by its j"):
-        Signals(machine, [0.0, 1.0], [0.0, 1.0])
-    Signals(machine, [0.0, 1.0], {}, supply=[0.5e5, 9e6])  # the pump is switched on
+        ValveSignals(machine, [0.0, 1.0], [0.0, 1.0])
+    ValveSignals(machine, [0.0, 1.0], {}, supply=[0.5e5, 9e6])  # the pump is switched on
 
 
-@pytest.mark.parametrize("name", sorted({*USUAL, *TURNING}))
+@pytest.mark.parametrize("name", sorted({*PLAUSIBLE_RANGES, *ROTARY_RANGES}))
 def test_proposals_are_usual(name):
     """Whatever unit is proposed, the number as it is to be written gives no doubt again."""
     for turning in (False, True):
         for value in np.logspace(-12, 14, 80):
-            text = doubt(name, float(f"{value:.3g}"), turning)
+            text = implausible_value_text(name, float(f"{value:.3g}"), turning)
             for words in text.split("write ")[1:]:
-                assert not doubt(name, float(words.split()[0]), turning), text
+                assert not implausible_value_text(name, float(words.split()[0]), turning), text

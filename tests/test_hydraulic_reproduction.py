@@ -12,7 +12,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import RecordingError
-from crane.identification.excitation.fourier import Fourier
+from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
@@ -69,7 +69,7 @@ def test_x_with_noise_predicts_the_recording_left_out(ideal, logged, method):
         assert worst(X)[1:].max() < 0.05
         assert inside(X, 0.999)[0]  # of 95 % one draw of noise of twenty is left out
         # noise of the stroke's derivative over a window is what remains
-        assert X.predict(logged[name]).relative < 0.02
+        assert X.predict(logged[name]).relative_error < 0.02
 
 
 def test_derivatives_lose_the_modulus_not_the_coefficients(ideal, logged):
@@ -83,7 +83,7 @@ def test_derivatives_lose_the_modulus_not_the_coefficients(ideal, logged):
 def test_intervals_cover_where_the_spool_lags(tmp_path):
     """Its equation colours the voltage's noise, which differences between samples do not show."""
     machine = experiment.crane_of("rigid")
-    motion = Fourier(experiment.LIFTS["1"].coefficients, 20.0, 2)
+    motion = FourierTrajectory(experiment.LIFTS["1"].coefficients, 20.0, 2)
     happened = experiment.perform(machine, motion)
     draws, held = 20, np.zeros(5)
     for seed in range(draws):
@@ -145,7 +145,7 @@ def test_seven_parameters_are_the_three_bodies(plant):
     v, a = random.normal(size=(2, 60, 3))
     motion = mechanics.Motion(np.arange(60.0), q, v, a, 0 * q)
     seven = mechanics.Seven(plant.joints)
-    at = mechanics.Samples(q, v, a, q, q)
+    at = mechanics.MotionSamples(q, v, a, q, q)
     three = mechanics.forces_of(plant.joints, motion, mechanics.BODIES)
     np.testing.assert_allclose(seven.columns(at) @ seven.nominal, three, atol=1e-8)
     assert np.linalg.matrix_rank(seven.columns(at).reshape(-1, 7)) == 7
@@ -160,7 +160,7 @@ def motions(plant, tmp_path_factory):
     folder, out = tmp_path_factory.mktemp("motions"), {}
     for seed, name in enumerate(("learn", "set 1")):
         whole = experiment.MOTIONS[name]
-        motion = Fourier(whole.coefficients, whole.period, 2)
+        motion = FourierTrajectory(whole.coefficients, whole.period, 2)
         read = experiment.measured(plant, experiment.perform(plant, motion), folder, seed)
         out[name] = mechanics.joint_motion(plant, read, motion.period)
     return out
@@ -241,7 +241,7 @@ def test_motions_stay_in_the_paper_s_ranges():
 
 
 def test_valve_of_the_machine_as_published(tmp_path):
-    table = circuit.staircase("X_ext", circuit.LEVEL, tmp_path).table()
+    table = circuit.staircase("X_ext", circuit.LEVEL, tmp_path).parameter_intervals()
     for name, true in (("neutral", 5.8), ("dead_band", 0.1143), ("flow up", 40 / 6e4)):
         value, low, high = table[name]
         assert low < true < high

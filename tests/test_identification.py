@@ -8,12 +8,20 @@ import pytest
 
 import crane
 from crane.common.errors import InputError
-from crane.identification.mechanics.base import base_parameters, group, random_samples
-from crane.identification.mechanics.friction import Along, Presliding, friction
-from crane.identification.mechanics.inertias import Inertial, RotorInertia
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.passive import GasScale, SpringForce
-from crane.identification.mechanics.term import Direction
+from crane.identification.mechanics.base_parameters import (
+    base_parameters,
+    group_parameters,
+    random_samples,
+)
+from crane.identification.mechanics.force_element_terms import ForceElementTerm, GasSpringTerm
+from crane.identification.mechanics.friction_terms import (
+    PreslidingFriction,
+    VelocityFriction,
+    friction_term,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
+from crane.identification.mechanics.model_term import ForceDirection
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 FINGERS = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
@@ -25,7 +33,7 @@ def mini():
 
 
 def inertial(machine):
-    return Model(machine, [Inertial(machine)])
+    return IdentificationModel(machine, [InertialTerm(machine)])
 
 
 def with_gravity(machine, gravity):
@@ -76,13 +84,13 @@ def test_measured_arms():
     assert base_parameters(model).rank == 45
     arm = [i for i, name in enumerate(model.names) if not name.startswith(("barrel", "rod"))]
     W = model.regressor(random_samples(model, 300, seed=1)).reshape(-1, len(model.names))
-    assert group([model.names[i] for i in arm], W[:, arm], np.ones(len(arm))).rank == 36
+    assert group_parameters([model.names[i] for i in arm], W[:, arm], np.ones(len(arm))).rank == 36
 
 
 def test_the_mini_forwarder(mini):
     """55 inertial; with four of friction per drive and eight viscous 75."""
     assert base_parameters(inertial(mini)).rank == 55
-    base = base_parameters(Model(mini))
+    base = base_parameters(IdentificationModel(mini))
     assert base.rank == 75
     assert {"link1.m", "link1.Ixx", "link1.mz"} < set(base.unobservable)
     assert not any(name.startswith("link7.") for name in base.unobservable)
@@ -215,7 +223,7 @@ def test_their_rank_depends_on_where_the_first_link_has_its_com(tmp_path, off_li
 
 
 def test_base_parameters_carry_everything(mini):
-    model = Model(mini)
+    model = IdentificationModel(mini)
     base = base_parameters(model)
     samples = random_samples(model, 60, seed=5)
     W = model.regressor(samples)
@@ -234,29 +242,29 @@ def test_the_model_is_the_inverse_dynamics(mini):
         mini.replace(forces=(crane.ForceElement("q3", stiffness=2.0, rest=1.0, damping=0.1),)),
         mini.replace(gas_springs=(crane.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7),)),
     ):
-        model = Model(machine)
+        model = IdentificationModel(machine)
         samples = random_samples(model, 40, seed=7)
         tau = crane.Dynamics(machine).inverse(samples.q_a, samples.v_a, samples.a_a, friction=True)
-        found = model.regressor(samples) @ model.nominal + model.known(samples)
+        found = model.regressor(samples) @ model.nominal + model.known_forces(samples)
         assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
 
 
 def test_gas_and_springs_of_unknown_scale(mini):
     gas = crane.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7, 1.3)
     machine = mini.replace(friction={}, gas_springs=(gas,))
-    model = Model(machine, [Inertial(machine), GasScale(machine, "q7")])
+    model = IdentificationModel(machine, [InertialTerm(machine), GasSpringTerm(machine, "q7")])
     samples = random_samples(model, 40, seed=8)
     tau = crane.Dynamics(machine).inverse(samples.q_a, samples.v_a, samples.a_a)
-    found = model.regressor(samples) @ model.nominal + model.known(samples)
+    found = model.regressor(samples) @ model.nominal + model.known_forces(samples)
     assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
     assert model.names[-1] == "q7.gas_scale" and model.nominal[-1] == 1.0
     spring = mini.replace(friction={}, forces=(crane.ForceElement("q3", stiffness=2.0),))
-    shaped = Model(
+    shaped = IdentificationModel(
         mini.replace(friction={}, forces=()),
-        [Inertial(mini), SpringForce(mini, "q3", lambda q: -q, "stiffness", 2.0)],
+        [InertialTerm(mini), ForceElementTerm(mini, "q3", lambda q: -q, "stiffness", 2.0)],
     )
     tau = crane.Dynamics(spring).inverse(samples.q_a, samples.v_a, samples.a_a)
-    found = shaped.regressor(samples) @ shaped.nominal + shaped.known(samples)
+    found = shaped.regressor(samples) @ shaped.nominal + shaped.known_forces(samples)
     bare = crane.Dynamics(mini.replace(friction={})).passive(samples.q_a, samples.v_a)
     assert np.abs(found - tau).max() < 1e-10 * np.abs(tau).max() and np.isfinite(bare).all()
 
@@ -264,12 +272,12 @@ def test_gas_and_springs_of_unknown_scale(mini):
 def test_friction_along_a_coupled_motor():
     """A motor that turns with the sum of two joints brakes both of them alike."""
     arm = crane.load("ur5_robot").replace(friction={})
-    motor = Direction("motor6", {"wrist_2_joint": 1.0, "wrist_3_joint": 1.0})
-    model = Model(
+    motor = ForceDirection("motor6", {"wrist_2_joint": 1.0, "wrist_3_joint": 1.0})
+    model = IdentificationModel(
         arm,
         [
-            friction(arm, motor, ("coulomb", "viscous"), smoothing=0.0, stribeck=(0.1,)),
-            RotorInertia(arm, motor),
+            friction_term(arm, motor, ("coulomb", "viscous"), smoothing=0.0, stribeck=(0.1,)),
+            RotorInertiaTerm(arm, motor),
         ],
     )
     rng = np.random.default_rng(9)
@@ -286,11 +294,11 @@ def test_friction_along_a_coupled_motor():
 
 def test_presliding_winds_up_over_a_distance():
     arm = crane.load("ur5_robot").replace(friction={})
-    term = Presliding(arm, "elbow_joint", 0.02)
+    term = PreslidingFriction(arm, "elbow_joint", 0.02)
     way = np.concatenate([np.linspace(0, 0.1, 200), np.linspace(0.1, 0.07, 100)])
     q = np.zeros((300, 6))
     q[:, 2] = way
-    at = Model(arm, [term]).samples(q, 0 * q, 0 * q)
+    at = IdentificationModel(arm, [term]).samples(q, 0 * q, 0 * q)
     z = term.columns(at)[:, 2, 0]
     np.testing.assert_allclose(z[:200], 1 - np.exp(-way[:200] / 0.02), atol=1e-12)
     top = z[199]
@@ -303,14 +311,17 @@ def test_presliding_winds_up_over_a_distance():
 
 def test_what_is_no_model(mini):
     for make, message in (
-        (lambda: Model(mini, [Inertial(mini), Inertial(mini)]), "two terms have the parameter"),
-        (lambda: friction(mini, "X9"), "joint 'X9' is unknown"),
-        (lambda: friction(mini, "X1", ("columb",)), "friction 'columb' is unknown"),
-        (lambda: GasScale(mini, "X1"), "joint 'X1' has no gas spring"),
-        (lambda: Presliding(mini, "X1", 0.0), "the length of presliding of 'X1' is 0"),
         (
-            lambda: Model(
-                mini, [Along(mini, Direction("m", {"q4": 1.0}), {"c": np.sign})]
+            lambda: IdentificationModel(mini, [InertialTerm(mini), InertialTerm(mini)]),
+            "two terms have the parameter",
+        ),
+        (lambda: friction_term(mini, "X9"), "joint 'X9' is unknown"),
+        (lambda: friction_term(mini, "X1", ("columb",)), "friction 'columb' is unknown"),
+        (lambda: GasSpringTerm(mini, "X1"), "joint 'X1' has no gas spring"),
+        (lambda: PreslidingFriction(mini, "X1", 0.0), "the length of presliding of 'X1' is 0"),
+        (
+            lambda: IdentificationModel(
+                mini, [VelocityFriction(mini, ForceDirection("m", {"q4": 1.0}), {"c": np.sign})]
             ).regressor(random_samples(inertial(mini), 3)),
             "'m' combines 'q4', which is not active",
         ),

@@ -20,14 +20,14 @@ import crane
 from crane import cli
 from crane.cli.runs import read_run, write_identification
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
-from crane.identification.mechanics.division import divided
-from crane.identification.mechanics.friction import friction
+from crane.identification.mechanics.force_element_terms import ForceElementTerm
+from crane.identification.mechanics.friction_terms import friction_term
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertias import Inertial, body_names
-from crane.identification.mechanics.passive import SpringForce
-from crane.identification.mechanics.payload import identify_payload
-from crane.identification.mechanics.terms import default_terms
-from crane.identification.signals.motion import Motion
+from crane.identification.mechanics.identify_payload import identify_payload
+from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
+from crane.identification.mechanics.locked_body_division import divide_locked_bodies
+from crane.identification.mechanics.term_selection import default_terms
+from crane.identification.signals.signal_processing import Motion
 
 HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -59,7 +59,7 @@ def found(mini):
 def same_forces(result, machine, q, v, a):
     """Mass matrix, bias and friction against the regressor and what it predicts."""
     dynamics = crane.Dynamics(machine)
-    inertial = Inertial(result.described)
+    inertial = InertialTerm(result.described)
     bodies = result.parameters[: 10 * len(result.model.bodies)]
 
     def forces(q, v, a):
@@ -97,7 +97,7 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
     told = dict(zip(found.names, found.values.tolist(), strict=True))
     assert len(noted) > 3 and {float(value) for _, value, _ in noted} <= set(told.values())
     assert written.tasks == mini.tasks and written.end_stops == mini.end_stops
-    assert written.friction["X2"].drives  # as described, of which nothing is told either
+    assert written.friction["X2"].is_driving  # as described, of which nothing is told either
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         crane.load(file)
@@ -195,7 +195,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
     plain = identify(mini, motion(mini))
     parameters = found.parameters.copy()
     parameters[found.model.names.index("X1.viscous")] = -1.0
-    spring = [*default_terms(mini), SpringForce(mini, "q1", np.sin, "spring")]
+    spring = [*default_terms(mini), ForceElementTerm(mini, "q1", np.sin, "spring")]
     bodies = found.parameters.copy()
     bodies[4] = -1.0
     changed = crane.load("mini_forwarder", {"link7.mass": 0.3})
@@ -211,8 +211,8 @@ def test_what_cannot_be_written(mini, found, tmp_path):
             identify(
                 mini, motion(mini), feasible=True,
                 terms=[
-                    Inertial(mini), friction(mini, "q1"), friction(mini, "X2"),
-                    friction(mini, "X1", smoothing=0.01),
+                    InertialTerm(mini), friction_term(mini, "q1"), friction_term(mini, "X2"),
+                    friction_term(mini, "X1", smoothing=0.01),
                 ],
             ),
             "the model has friction over other velocities than the machine's",
@@ -390,7 +390,9 @@ def test_friction_that_is_not_as_described_is_no_load(mini):
     assert low < 0.2 < high and high - low < 0.02
     for i, joint in enumerate(mini.active):
         wanted = mini.friction[joint].coulomb
-        assert estimate.friction[joint] == pytest.approx(wanted, rel=0.1, abs=0.2 * NOISE[i])
+        assert estimate.friction_corrections[joint] == pytest.approx(
+            wanted, rel=0.1, abs=0.2 * NOISE[i]
+        )
 
 
 def test_motion_one_way_does_not_tell_friction_from_weight(mini):
@@ -407,7 +409,7 @@ def test_motion_one_way_does_not_tell_friction_from_weight(mini):
         right = identify_payload(mini, one_way(rougher(mini, factor).with_payload(LOAD), 0.02))
         low, high = right.interval()[0]
         assert low < 0.2 < high and high - low < 0.05
-    assert right.friction == {}
+    assert right.friction_corrections == {}
 
 
 def test_one_speed_each_way_tells_friction_and_a_load_as_a_point(mini):
@@ -427,7 +429,7 @@ def test_one_speed_each_way_tells_friction_and_a_load_as_a_point(mini):
     low, high = estimate.interval()[0]
     assert np.isnan(estimate.com).all() and low < 0.2 < high and high - low < 0.05
     wanted = 2 * mini.friction["X1"].coulomb
-    assert estimate.friction["X1"] == pytest.approx(wanted, rel=0.1)
+    assert estimate.friction_corrections["X1"] == pytest.approx(wanted, rel=0.1)
     assert "load on link7_tip, taken as a point there" in estimate.to_text()
 
 
@@ -437,9 +439,9 @@ def test_a_lift_that_was_recorded_is_weighed():
     machine = crane.load("patu655", lock={"slew": 0.0, "X_ext": 0.0})
     estimate = identify_payload(machine, read_run(RAW, machine, COLUMNS))
     low, high = estimate.interval()[0]
-    mass, band = estimate.static
+    mass, band = estimate.static_mass
     assert low < 211.4 < high and low < mass < high and high - low < 250
-    assert np.isnan(estimate.com).all() and estimate.friction == {}
+    assert np.isnan(estimate.com).all() and estimate.friction_corrections == {}
     # in the first seconds weights that are not as described count for more than the load
     with pytest.raises(RecordingError, match="no load weighs less than nothing"):
         identify_payload(machine, read_run(RAW, machine, COLUMNS, (0.0, 2.0)))
@@ -470,12 +472,12 @@ def test_forces_at_rest_are_compared(mini):
     hold["tau"][-rests:] = tau
     time = 4e-3 * np.arange(len(hold["q"]))
     estimate = identify_payload(mini, Motion(time, **hold))
-    mass, band = estimate.static
-    assert abs(mass - 0.2) < band and estimate.doubt == ""
+    mass, band = estimate.static_mass
+    assert abs(mass - 0.2) < band and estimate.warning == ""
     assert re.search(r"^mass by the forces at rest: 0\.\d+ \+- ", estimate.to_text(), re.M)
     hold["tau"][-rests:] = tau * [1, 3, 3]
     doubted = identify_payload(mini, Motion(time, **hold))
-    assert "the forces at rest say" in doubted.doubt and doubted.doubt in doubted.to_text()
+    assert "the forces at rest say" in doubted.warning and doubted.warning in doubted.to_text()
 
 
 # --- locked machines -------------------------------------------------------------------------
@@ -496,7 +498,7 @@ def test_a_locked_machine_is_written_with_all_its_joints(mini, tmp_path):
     assert written.joints == mini.joints and written.active == mini.active
     assert written.friction["X2"] == mini.friction["X2"]
     assert all(inertia.mass > 0 for inertia in written.model.inertias[1:])
-    again = crane.load(file, lock=result.described.locks)
+    again = crane.load(file, lock=result.described_machine.locked_joints)
     found = crane.Dynamics(again).inverse(q, v, a, friction=True)
     wanted = result.model.regressor(result.model.samples(q, v, a)) @ result.parameters
     assert np.abs(found - wanted).max() < 1e-9 * np.abs(wanted).max()
@@ -505,7 +507,7 @@ def test_a_locked_machine_is_written_with_all_its_joints(mini, tmp_path):
 def test_a_machine_identified_as_described_is_divided_as_described():
     arm = crane.load("ur5_robot")
     locked = crane.load("ur5_robot", lock={"elbow_joint": 0.7, "shoulder_pan_joint": -0.4})
-    parts = divided(locked, crane.Dynamics(locked).parameters, arm)
+    parts = divide_locked_bodies(locked, crane.Dynamics(locked).parameters, arm)
     wanted = crane.Dynamics(arm).parameters.reshape(-1, 10)
     assert parts.keys() == set(body_names(arm))
     for name, parameters in zip(body_names(arm), wanted, strict=True):

@@ -13,15 +13,15 @@ from scipy.interpolate import CubicSpline
 import crane
 from crane.common.errors import InputError, RecordingError
 from crane.identification.estimation.estimators import least_squares
-from crane.identification.excitation.excite import excite
-from crane.identification.mechanics.base import base_parameters, random_samples
-from crane.identification.mechanics.feasible import pseudo_inertia
-from crane.identification.mechanics.friction import friction
+from crane.identification.excitation.periodic_excitation import excite
+from crane.identification.mechanics.base_parameters import base_parameters, random_samples
+from crane.identification.mechanics.feasible_parameters import pseudo_inertia
+from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertias import Inertial
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.signals.motion import Motion
+from crane.identification.mechanics.inertial_terms import InertialTerm
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
+from crane.identification.signals.signal_processing import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(motions.motion, step=2e-3)
@@ -44,13 +44,13 @@ def scales(model):
 
 def test_base_parameters_come_back_from_exact_forces(mini):
     """To 1e-8 of the bodies' masses and sizes; the regressor has rank 75."""
-    model = Model(mini)
+    model = IdentificationModel(mini)
     base = base_parameters(model)
     assert base.rank == 75
     at = random_samples(model, 1500, seed=3)
     tau = crane.Dynamics(mini).inverse(at.q_a, at.v_a, at.a_a, friction=True)
     W = model.regressor(at)[:, :, base.independent].reshape(-1, base.rank)
-    found = least_squares(W, (tau - model.known(at)).ravel()).values
+    found = least_squares(W, (tau - model.known_forces(at)).ravel()).values
     error = np.abs(found - base.values(model.nominal))
     assert (error / np.sqrt(base.grouping**2 @ scales(model) ** 2)).max() < 1e-8
 
@@ -74,7 +74,7 @@ def test_noise_is_all_that_is_left(mini, method):
 @pytest.mark.parametrize("method", ["ols", "wls"])
 def test_intervals_cover_the_truth(mini, method):
     """Of 12 recordings, 90 to 99 % of the 95 % intervals."""
-    model = Model(mini)
+    model = IdentificationModel(mini)
     given, covered = motion(mini, step=4e-3), []
     for seed in range(12):
         result = identify(mini, noisy(given, seed), method=method, bandwidth=30.0)
@@ -98,7 +98,7 @@ def test_intervals_cover_the_truth_of_rigs_as_users_identify_them():
     for seed in range(100, 112):
         rig = Rig(machine, seed, Tolerances(pins=0.0), sensors)
         result = identify(machine, rig.run(path))
-        truth = result.base.values(Model(rig.plant).nominal)
+        truth = result.base.values(IdentificationModel(rig.plant).nominal)
         low, high = result.interval().T
         covered.append((low <= truth) & (truth <= high))
     assert 0.90 < np.mean(covered) < 0.99
@@ -129,13 +129,13 @@ def test_what_smoothing_takes_is_not_looked_for(mini):
         return crane.Recording(given.time, mini.active, q, 0 * q, noisy(given, 8).tau, units)
 
     coarse = smoothed_motion(mini, recording(given.q + noise))
-    assert 1.0 < coarse.passed < 20.0
+    assert 1.0 < coarse.passband < 20.0
     apart = np.diff(identify(mini, coarse).training.time[:2])[0]
-    assert 0.25 / coarse.passed < apart < 0.5 / coarse.passed
+    assert 0.25 / coarse.passband < apart < 0.5 / coarse.passband
     assert np.diff(identify(mini, given).training.time[:2])[0] < 0.1 * apart
     still = given.q + noise
     still[:, 0] = 0.3 + noise[:, 0]
-    assert smoothed_motion(mini, recording(still)).passed > 0.8 * coarse.passed
+    assert smoothed_motion(mini, recording(still)).passband > 0.8 * coarse.passband
 
 
 def test_where_friction_settles_rows_begin_to_count(mini):
@@ -151,8 +151,8 @@ def test_where_friction_settles_rows_begin_to_count(mini):
         machine = mini.replace(friction={**mini.friction, joint: law})
         fit = identify(machine, given, bandwidth=20.0, prior=0.3).training
         near = np.abs(given.v[:: round((fit.time[1] - fit.time[0]) / 4e-3), 0])
-        assert near[fit.moving[:, 0]].min() > wanted
-        assert fit.moving[near > 1.5 * wanted, 0].mean() > 0.9
+        assert near[fit.is_moving[:, 0]].min() > wanted
+        assert fit.is_moving[near > 1.5 * wanted, 0].mean() > 0.9
 
 
 def test_a_prior_holds_what_forces_do_not_tell(mini):
@@ -161,7 +161,7 @@ def test_a_prior_holds_what_forces_do_not_tell(mini):
     assert result.parameters is not None and len(result.parameters) == 130
     bodies = result.parameters[:110] - result.model.nominal[:110]
     assert np.abs(bodies / scales(result.model)[:110]).max() < 0.5
-    assert result.training.stacked < 0.01
+    assert result.training.overall_relative_error < 0.01
     np.testing.assert_allclose(
         result.values, result.base.values(result.parameters), rtol=1e-12, atol=1e-15
     )
@@ -175,7 +175,7 @@ def test_feasible_bodies_can_exist(mini):
     friction_of = dict(zip(result.model.names[110:], result.parameters[110:], strict=True))
     assert min(v for k, v in friction_of.items() if k.endswith((".coulomb", ".viscous"))) >= -1e-9
     plain = identify(mini, given)
-    assert result.training.stacked < 1.5 * plain.training.stacked
+    assert result.training.overall_relative_error < 1.5 * plain.training.overall_relative_error
 
 
 def test_predict_is_the_inverse_dynamics_of_what_was_found(mini):
@@ -195,8 +195,8 @@ def test_a_resting_joint_is_left_out(mini):
     result = identify(mini, noisy(Motion(given.time, q, v, a, tau), 6))
     assert result.base.rank < 60
     assert not any(name.startswith("q1.") for name in result.names)
-    assert np.all(result.training.relative[1:] < 0.02)
-    assert np.isnan([result.training.rmse[0], result.training.relative[0]]).all()
+    assert np.all(result.training.relative_error[1:] < 0.02)
+    assert np.isnan([result.training.rmse[0], result.training.relative_error[0]]).all()
 
 
 @pytest.mark.slow
@@ -207,7 +207,7 @@ def test_recordings_of_simulations_serve(mini):
     recording = crane.simulate(mini, crane.ComputedTorque(mini, path), path(0.0)[:2])
     slow = [0.03, 5e-4, 5e-4]
     result = identify(mini, recording, prior=0.1, slow=slow)
-    assert result.training.stacked < 5e-3
+    assert result.training.overall_relative_error < 5e-3
 
 
 PRIOR = "the prior's relative standard deviation"
@@ -237,12 +237,12 @@ def test_what_cannot_be_identified(mini):
         ),
         (lambda: identify(other, recording), RecordingError, "'shoulder_pan_joint', 'sho"),
         (
-            lambda: identify(mini, given, feasible=True, terms=[friction(mini, "X1")]),
+            lambda: identify(mini, given, feasible=True, terms=[friction_term(mini, "X1")]),
             InputError,
             "the model has no bodies",
         ),
         (
-            lambda: identify(mini, given, slow=[1e3, 1e3, 1e3], terms=[Inertial(mini)]),
+            lambda: identify(mini, given, slow=[1e3, 1e3, 1e3], terms=[InertialTerm(mini)]),
             RecordingError,
             "no joint moves faster than",
         ),
@@ -289,4 +289,4 @@ def test_feasible_estimates_settle_on_exact_forces_too(mini, level):
     q, v, a = path(time)
     tau = crane.Dynamics(mini).inverse(q, v, a, friction=True)
     result = identify(mini, noisy(Motion(time, q, v, a, tau), 1, level), feasible=True)
-    assert result.feasible and result.training.stacked < 0.02
+    assert result.feasible and result.training.overall_relative_error < 0.02

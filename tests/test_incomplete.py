@@ -267,7 +267,7 @@ def test_free_joints_get_no_force_and_computed_torque_moves_the_others(tmp_path)
     machine, told = loaded(swinging(tmp_path), active=["lift"], free=["swing"])
     assert told == []
     assert (machine.active, machine.free) == (("lift", "swing"), ("swing",))
-    assert machine.undriven == ()
+    assert machine.undriven_joints == ()
     reference = crane.point_to_point([0.0, 0.0], [0.4, 0.0], 1.0)
     run = crane.simulate(machine, crane.ComputedTorque(machine, reference))
     assert np.abs(run.tau[:, 1]).max() == 0.0
@@ -278,7 +278,7 @@ def test_free_joints_get_no_force_and_computed_torque_moves_the_others(tmp_path)
     plain = crane.simulate(machine, crane.ComputedTorque(machine, reference), backend="pinocchio")
     assert plain.q == pytest.approx(run.q, abs=1e-10)
     assert "reference_swing" not in run.channels
-    assert crane.formats.recalled(run.machine).free == ("swing",)
+    assert crane.formats.load_from_expression(run.machine).free == ("swing",)
 
 
 def test_gains_and_tasks_leave_free_joints_alone(tmp_path):

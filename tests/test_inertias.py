@@ -14,7 +14,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError
-from crane.description.inertia import inertia_problem, nearest_inertia
+from crane.description.inertia_feasibility import inertia_problem, nearest_inertia
 from crane.formats.check import check
 
 GRBDA = Path(__file__).parents[2] / "shared" / "data" / "third_party" / "grbda"
@@ -286,7 +286,7 @@ def test_what_no_form_excuses_stays_refused(arm, axis, message, tmp_path):
     with warnings.catch_warnings(), pytest.raises(DescriptionError, match=message):
         warnings.simplefilter("ignore")
         crane.load(path)
-    assert any(message in str(finding) for finding in check(path).findings if finding.error)
+    assert any(message in str(finding) for finding in check(path).findings if finding.is_error)
 
 
 def test_check_and_strict_refuse_the_form(tmp_path):

@@ -82,7 +82,7 @@ def steps(monkeypatch):
     """How many steps were done in machine code and how many in Python."""
     done = {"compiled": 0, "python": 0}
     run, advance = (
-        crane.simulation.integration.CompiledStepper.run,
+        crane.simulation.integration.RungeKuttaStepper.run,
         crane.simulation.integration.PythonStepper.advance,
     )
 
@@ -95,7 +95,7 @@ def steps(monkeypatch):
         done["python"] += 1
         return advance(self, *rest)
 
-    monkeypatch.setattr(crane.simulation.integration.CompiledStepper, "run", counted_run)
+    monkeypatch.setattr(crane.simulation.integration.RungeKuttaStepper, "run", counted_run)
     monkeypatch.setattr(crane.simulation.integration.PythonStepper, "advance", counted_advance)
     return done
 
@@ -127,7 +127,7 @@ CONTROLS = {
 @pytest.mark.parametrize("name", CONTROLS)
 def test_machine_code_python_and_pinocchio_step_alike(forwarder, path, steps, name):
     control = CONTROLS[name](forwarder, path)
-    plain = control or crane.control.Free(forwarder)
+    plain = control or crane.control.ZeroForce(forwarder)
     settings = {"duration": 0.2, "step": 1e-3}
     if name == "pi":  # not at rest, with an offset
         start = path(0.0)[0] + [0.1, 0.001, -0.0005]
@@ -152,7 +152,7 @@ def test_other_machines_step_alike(name, steps, request):
         simulate(machine, control, duration=0.05, backend=backend)
         for control, backend in (
             (None, "compiled"),
-            (InPython(crane.control.Free(machine)), "compiled"),
+            (InPython(crane.control.ZeroForce(machine)), "compiled"),
             (None, "pinocchio"),
         )
     ]
@@ -215,7 +215,9 @@ def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
     whole = simulate(forwarder, control, duration=0.253)
     assert steps["python"] == 0
     for chunk in (1, 7, 11, 252, 253, 254):
-        monkeypatch.setattr("crane.simulation.integration.steps._CHUNK", chunk)
+        monkeypatch.setattr(
+            "crane.simulation.integration.fixed_step_integrator._STEPS_PER_REPORT", chunk
+        )
         shares = []
         parts = simulate(forwarder, control, duration=0.253, progress=shares.append)
         assert off(parts, whole) < 1e-12
@@ -238,7 +240,7 @@ def test_durations_around_whole_chunks(springy, steps, count):
 def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monkeypatch):
     control = crane.PI(forwarder, path)
     whole = simulate(forwarder, control, duration=0.1)
-    run = crane.simulation.integration.CompiledStepper.run
+    run = crane.simulation.integration.RungeKuttaStepper.run
     left = []
 
     def hesitant(self, times, *rest):
@@ -247,7 +249,7 @@ def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monk
         left.append(len(few))
         return run(self, few, *rest)
 
-    monkeypatch.setattr(crane.simulation.integration.CompiledStepper, "run", hesitant)
+    monkeypatch.setattr(crane.simulation.integration.RungeKuttaStepper, "run", hesitant)
     parts = simulate(forwarder, control, duration=0.1)
     assert len(left) > 5
     assert off(parts, whole) < 1e-11
@@ -298,7 +300,7 @@ def test_a_first_step_that_fails_is_told_alike(forwarder, steps, speed):
     start = (np.array([0.0, 0.015, 0.015]), np.array([0.0, speed, 0.0]))
     messages = {
         failing(steps, forwarder, control, start, duration=0.1)
-        for control in (None, InPython(crane.control.Free(forwarder)))
+        for control in (None, InPython(crane.control.ZeroForce(forwarder)))
     }
     assert len(messages) == 1
     assert messages.pop().startswith("at t = ")
@@ -312,7 +314,9 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
     wanted = failing(steps, forwarder, control, **settings, backend="pinocchio")
     before = round(float(wanted.split()[3]) / 5e-3)  # "at t = 0.088 s: .."
     for chunk in (1, 2, 3, before - 1, before):
-        monkeypatch.setattr("crane.simulation.integration.steps._CHUNK", chunk)
+        monkeypatch.setattr(
+            "crane.simulation.integration.fixed_step_integrator._STEPS_PER_REPORT", chunk
+        )
         found = failing(steps, forwarder, control, **settings)
         assert found[:50] == wanted[:50]
 
@@ -320,8 +324,8 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
 def test_long_formulas_step_in_python(steps, monkeypatch):
     machine = crane.load("mini_forwarder")  # with nothing compiled yet
     start = np.array([0.1, 0.012, 0.016])
-    monkeypatch.setattr(crane.codegen.program, "MOST", 10)
-    monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
+    monkeypatch.setattr(crane.codegen.program, "MAX_OPERATIONS", 10)
+    monkeypatch.setattr(crane.closure.compiled_closure, "_SHARED_CODE", {})
     slow = simulate(machine, None, start, duration=0.02)
     assert steps == {"compiled": 0, "python": 20}
     monkeypatch.undo()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from crane.identification.estimation.estimators import huber, least_squares, weighted
+from crane.identification.estimation.estimators import huber, least_squares, weighted_least_squares
 from crane.identification.estimation.jackknife import Jackknife
-from crane.identification.estimation.noise import Noise
+from crane.identification.estimation.noise_model import NoiseModel
 
 
 def test_leaving_out_in_closed_form_is_leaving_out():
@@ -16,18 +16,18 @@ def test_leaving_out_in_closed_form_is_leaving_out():
     y = W @ np.arange(5.0) + (1 + np.abs(W[:, 0])) * rng.standard_normal(len(W))
     Q, R = np.linalg.qr(W)
     theta = np.linalg.solve(R, Q.T @ y)
-    noise = Noise.of(rng.standard_normal(400), np.arange(400))
+    noise = NoiseModel.fit(rng.standard_normal(400), np.arange(400))
     jackknife = Jackknife(samples, [noise], 5)
     e = y - W @ theta
     for rows in (slice(300, None), slice(0, 300)):  # as they are read, in any order
         jackknife.add(samples[rows], Q[rows].T, e[rows], np.full(len(e[rows]), True))
-    edges = [*jackknife._starts.tolist(), np.inf]
+    edges = [*jackknife._segment_starts.tolist(), np.inf]
     without = []
     for low, high in zip(edges[:-1], edges[1:], strict=True):
         rest = (samples < low) | (samples >= high)
         without.append(np.linalg.lstsq(W[rest], y[rest])[0])
     K = len(without)
-    assert jackknife.freedom == K - 1 and K >= 20
+    assert jackknife.degrees_of_freedom == K - 1 and K >= 20
     off = without - np.mean(without, axis=0)
     exact = (K - 1) / K * off.T @ off
     inverse = np.linalg.inv(R)
@@ -41,11 +41,11 @@ def test_how_long_noise_is_correlated():
     e = u.copy()
     for k in range(1, len(e)):
         e[k] += 0.9 * e[k - 1]
-    long, white = (Noise.of(x, np.arange(len(x))).correlated for x in (e, u))
+    long, white = (NoiseModel.fit(x, np.arange(len(x))).correlation_time for x in (e, u))
     assert long == pytest.approx(1.81 / 0.19, rel=0.1) and white == pytest.approx(1, abs=0.01)
 
 
-@pytest.mark.parametrize("estimator", [least_squares, weighted, huber])
+@pytest.mark.parametrize("estimator", [least_squares, weighted_least_squares, huber])
 def test_intervals_where_noise_depends_on_the_motion(estimator):
     """Noise that grows with a column: 95 % intervals hold for that column's parameter too."""
     rng, time = np.random.default_rng(2), np.arange(1500)

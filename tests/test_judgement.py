@@ -63,7 +63,7 @@ def test_a_piston_beyond_its_cylinder_is_told():
     lift = machine.active.index("X_lift")
 
     def against(machine):
-        levers = crane.Signals(machine, [0.0, 1.0], {"X_lift": [0.0, 4.0]})
+        levers = crane.ValveSignals(machine, [0.0, 1.0], {"X_lift": [0.0, 4.0]})
         return told(machine, levers, duration=16.0, step=2e-3)
 
     found, lines = against(machine.replace(end_stops=soft))

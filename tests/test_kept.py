@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 import crane
-from crane.closure.traced import Bodies
-from crane.codegen import TooLongError, package, program
-from crane.codegen.kept import place_of
-from crane.codegen.llvm import engine
-from crane.common import cache
-from crane.dynamics.traced import Sweep
+from crane.closure.kinematics_formulas import PositionKinematics
+from crane.codegen import FormulaTooLongError, package_digest, program
+from crane.codegen.llvm import machine_code
+from crane.codegen.program_cache import cache_entry_name
+from crane.common import file_cache
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
 
 PACKAGE = Path(crane.__file__).parent
 
@@ -37,9 +37,9 @@ def another_processor():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(llvm, "get_host_cpu_name", lambda: "generic")
         patch.setattr(llvm, "get_host_cpu_features", NoFeatures)
-        engine.settings.cache_clear()
+        machine_code.compiler_settings.cache_clear()
         yield
-    engine.settings.cache_clear()
+    machine_code.compiler_settings.cache_clear()
 
 
 def ask(factor=3.0):
@@ -81,8 +81,10 @@ def test_a_later_program_is_found(place):
 
 def test_what_is_found_is_called_as_what_was_built(place):
     one, two = kept.toy(), kept.toy()
-    assert two.outputs("formula") == one.outputs("formula") and two.address("each")
-    assert two.longest == one.longest > kept.LONG
+    assert two.formula_outputs("formula") == one.formula_outputs(
+        "formula"
+    ) and two.function_address("each")
+    assert two.max_formula_length == one.max_formula_length > kept.LONG
     with pytest.raises(TypeError, match="'each' takes 3 arguments, not 2"):
         two.call("each", 1, np.zeros(2))
     with pytest.raises(KeyError):
@@ -98,16 +100,16 @@ def test_other_processes_find_it(place):
 
 
 def test_a_formula_that_is_too_long_is_known_to_be(place, monkeypatch):
-    monkeypatch.setattr(program, "MOST", 100)
+    monkeypatch.setattr(program, "MAX_OPERATIONS", 100)
     built = []
     for _ in range(2):
-        with pytest.raises(TooLongError):
+        with pytest.raises(FormulaTooLongError):
             kept.toy(built=built)
     assert len(built) == 1
-    monkeypatch.setattr(program, "MOST", 10_000)
+    monkeypatch.setattr(program, "MAX_OPERATIONS", 10_000)
     assert ask() and not ask()
-    monkeypatch.setattr(program, "MOST", 100)
-    with pytest.raises(TooLongError):
+    monkeypatch.setattr(program, "MAX_OPERATIONS", 100)
+    with pytest.raises(FormulaTooLongError):
         ask()
 
 
@@ -123,10 +125,10 @@ def test_places_are_apart_where_programs_are(place):
         np.int32(1), np.zeros(0), np.zeros((0, 1)), np.array([-0.0]), np.array([0.0]),
         Pair(1, 2), Pair(2, 1), Pair(1, (2,)), ("a", "b"), ("a, b",), ("a'", "b"), ("a", "'b"),
     ]  # fmt: skip
-    places = [place_of(("toy", x)) for x in told]
+    places = [cache_entry_name(("toy", x)) for x in told]
     assert None not in places and len({*places}) == len(places)
-    assert places == [place_of(("toy", x)) for x in told]
-    assert place_of(None) is None
+    assert places == [cache_entry_name(("toy", x)) for x in told]
+    assert cache_entry_name(None) is None
 
 
 @pytest.mark.parametrize(
@@ -134,7 +136,7 @@ def test_places_are_apart_where_programs_are(place):
 )
 def test_what_says_nothing_lasting_is_refused(place, value):
     with pytest.raises(TypeError, match="cannot be written as data"):
-        place_of(("toy", (1, value)))
+        cache_entry_name(("toy", (1, value)))
 
 
 DAMAGES = {
@@ -240,8 +242,8 @@ def test_the_folder_is_bounded(place, monkeypatch):
     killed = place / ".left.1.part"
     killed.write_bytes(bytes(one))
     (place / "folder").mkdir()
-    monkeypatch.setattr(cache, "MOST", 4 * one)
-    monkeypatch.setattr(cache, "_left", {})  # a process that has not looked yet
+    monkeypatch.setattr(file_cache, "MAX_CACHE_SIZE", 4 * one)
+    monkeypatch.setattr(file_cache, "_remaining_bytes", {})  # a process that has not looked yet
     for factor in range(4, 12):
         for file in place.iterdir():  # a while later
             os.utime(file, (file.stat().st_mtime - 10,) * 2)
@@ -308,7 +310,7 @@ def test_a_package_that_changed_before_it_was_read_finds_nothing(place, monkeypa
     """What its files say is kept, but it is not what was loaded."""
     assert ask() and not ask()
     monkeypatch.setattr(crane, "LOADED", 0.0)
-    package._digest.cache_clear()
+    package_digest._files_digest.cache_clear()
     assert ask() and ask()
 
 
@@ -319,32 +321,32 @@ def another(*_):
 @pytest.mark.parametrize(
     "owner, name, value",
     [
-        (crane.dynamics.traced, "effects", another),
-        (Sweep, "mass", property(another)),
-        (Bodies, "frame", staticmethod(another)),
-        (Sweep, "kinetic", cached_property(another)),
-        (engine, "_target", lambda: None),
-        (crane.closure.compiled, "Loops", type("Loops", (), {})),
-        (crane.dynamics.compiled, "QUANTITIES", {"inverse": another}),
+        (crane.dynamics.dynamics_formulas, "effects", another),
+        (DynamicsFormulas, "mass", property(another)),
+        (PositionKinematics, "frame", staticmethod(another)),
+        (DynamicsFormulas, "kinetic", cached_property(another)),
+        (machine_code, "_target", lambda: None),
+        (crane.closure.compiled_closure, "Loops", type("Loops", (), {})),
+        (crane.dynamics.compiled_dynamics, "QUANTITIES", {"inverse": another}),
     ],
 )
 def test_a_patched_package_finds_nothing(place, owner, name, value):
     assert ask() and not ask()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(owner, name, value)
-        assert package.package_digest() is None
+        assert package_digest.package_digest() is None
     assert not ask()
 
 
 def test_nor_does_one_with_another_entry_or_module(place, monkeypatch):
     assert ask() and not ask()
-    table = crane.dynamics.compiled.QUANTITIES
+    table = crane.dynamics.compiled_dynamics.QUANTITIES
     with monkeypatch.context() as patch:
         patch.setitem(table, next(iter(table)), another)
-        assert package.package_digest() is None
-    other = ModuleType("crane.dynamics.compiled")
+        assert package_digest.package_digest() is None
+    other = ModuleType("crane.dynamics.compiled_dynamics")
     other.effects = another
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, other.__name__, other)
-        assert package.package_digest() is None
-    assert package.package_digest()
+        assert package_digest.package_digest() is None
+    assert package_digest.package_digest()

@@ -15,18 +15,18 @@ import pytest
 from test_compiled import dressed
 
 import crane
-from crane.closure import compiled as loops
-from crane.closure.exactness import Surplus
-from crane.closure.traced import folded
+from crane.closure import compiled_closure as loops
+from crane.closure.constraint_tolerances import RedundancyGap
+from crane.closure.kinematics_formulas import folding_pattern
 from crane.codegen import Program
-from crane.codegen.kept import place_of
-from crane.codegen.llvm.text import text_of
-from crane.dynamics import compiled as quantities
-from crane.motion.kinematics import _FastFrame, _FastPoint
+from crane.codegen.llvm.module_emitter import emit_module
+from crane.codegen.program_cache import cache_entry_name
+from crane.dynamics import compiled_dynamics as quantities
+from crane.motion.kinematics import _CompiledFrame, _CompiledPoint
 
 DATA = Path(__file__).parent / "data"
 MACHINES = ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf")
-# what formulas may read of a machine: `FastClosure._key` has it, or follows from what it has
+# what formulas may read of a machine: `CompiledClosure._cache_key` has it, or follows from what it has
 READ = {
     "equations": {
         "axis1", "axis2", "is_translation", "loop_of_row", "sign", "factors", "offsets", "loops",
@@ -68,7 +68,7 @@ def text(build):
     """The formulas that a program is built of."""
     program = Program()
     build(program)
-    return text_of(program.functions.values())
+    return emit_module(program.functions.values())
 
 
 def formulas(machine, fast):
@@ -77,19 +77,22 @@ def formulas(machine, fast):
     n = len(machine.active)
     yield "loops", lambda program: fast._build(program, fast._signs(fast._home))
     for name in quantities.QUANTITIES:
-        rest = dynamics.pattern, n, dynamics.form
-        yield name, lambda p, name=name, rest=rest: quantities._build(p, name, fast, *rest)
+        rest = dynamics.constant_pattern, n, dynamics.formula_structure
+        yield (
+            name,
+            lambda p, name=name, rest=rest: quantities._build_quantity(p, name, fast, *rest),
+        )
     if machine.tip:
-        for kind in (_FastPoint, _FastFrame):
+        for kind in (_CompiledPoint, _CompiledFrame):
             frame = kind(machine, machine.frame(machine.tip))
-            frame._closure = fast
-            yield kind.__name__, frame._build
+            frame._compiled_closure = fast
+            yield kind.__name__, frame._build_program
 
 
 @pytest.mark.parametrize("name", [*MACHINES, "mini_forwarder"])
 def test_formulas_read_nothing_else(name):
     machine, seen = load(name), set()
-    fast = copy.copy(machine.closure.fast)
+    fast = copy.copy(machine.closure.compiled_closure)
     fast._equations = Spy(fast._equations, "equations", seen)
     fast._structure = Spy(fast._structure, "structure", seen)
     fast.geometry = Spy(fast.geometry, "geometry", seen)
@@ -129,8 +132,8 @@ def changed(value):
 
 
 def test_whatever_changes_of_a_machine_changes_the_key(place, tmp_path):
-    fast = load("stewart.urdf").closure.fast
-    coupled = load_coupled(tmp_path).closure.fast
+    fast = load("stewart.urdf").closure.compiled_closure
+    coupled = load_coupled(tmp_path).closure.compiled_closure
     equations, structure, geometry = fast._equations, fast._structure, fast.geometry
     (rows, columns), *blocks = structure.blocks
     loop = dataclasses.replace(equations.loops[0], type="fixed")
@@ -138,30 +141,33 @@ def test_whatever_changes_of_a_machine_changes_the_key(place, tmp_path):
         *alone("equations", equations, "axis1", "axis2", "is_translation", "loop_of_row", "sign"),
         *alone("geometry", geometry, "parents", "revolute", "turns", "frame_bodies"),
         {"equations": {"loops": (loop, *equations.loops[1:])}},
-        {"structure": {"rows": structure.rows[::-1]}},
-        {"structure": {"redundant": np.append(structure.redundant, 0)}},
+        {"structure": {"rows": structure.independent_rows[::-1]}},
+        {"structure": {"redundant": np.append(structure.redundant_rows, 0)}},
         {"structure": {"blocks": ((rows[::-1], columns), *blocks)}},
         {"structure": {"blocks": ((rows, columns[::-1]), *blocks)}},
         {"structure": {"blocks": (*structure.blocks, (rows, columns))}},
-        {"structure": {"surplus": Surplus(2.0 * structure.surplus.allowed)}},
+        {"structure": {"surplus": RedundancyGap(2.0 * structure.redundancy.tolerance)}},
         {"geometry": {"flyers": (1,)}},
-        {"_active": fast._active[::-1]},
-        {"_passive": fast._passive[::-1]},
-        {"signs": -fast._signs(fast._home)},
+        {"_active": fast._active_columns[::-1]},
+        {"_passive": fast._passive_columns[::-1]},
+        {"signs": -fast._determinant_signs(fast._home)},
     ]
     for index in (0, 9, -1):
         for value in (0.0, 1.0, -1.0, -0.0, 0.5):
-            numbers = with_entry(geometry.numbers, index, value)
-            if folded(numbers) != folded(geometry.numbers):
+            numbers = with_entry(geometry.constants, index, value)
+            if folding_pattern(numbers) != folding_pattern(geometry.constants):
                 different.append({"geometry": {"numbers": numbers}})
-    places = [place_of(keys(fast)), *(place_of(keys(fast, **change)) for change in different)]
+    places = [
+        cache_entry_name(keys(fast)),
+        *(cache_entry_name(keys(fast, **change)) for change in different),
+    ]
     for name in ("factors", "offsets"):
         values = changed(getattr(coupled._equations, name))
-        places.append(place_of(keys(coupled, equations={name: values})))
-    places.append(place_of(keys(coupled)))
+        places.append(cache_entry_name(keys(coupled, equations={name: values})))
+    places.append(cache_entry_name(keys(coupled)))
     same = [different[i - 1] for i in range(1, len(places)) if places[i] in places[:i]]
     assert None not in places and not same and len(places) > 25
-    assert place_of(keys(fast)) == places[0]
+    assert cache_entry_name(keys(fast)) == places[0]
 
 
 def load_coupled(folder):
@@ -188,16 +194,20 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, 2.0, 0.3, -0.7, np.nan, np.inf, 1e300)
 @pytest.mark.parametrize("name", ["loops", "inverse with friction", "energy", "regressor"])
 def test_numbers_that_are_not_told_change_no_formula(name, dressed_crank):
     """Where numbers say the same to the key, the formulas are the same to the letter."""
-    fast, dynamics = dressed_crank.closure.fast, crane.Dynamics(dressed_crank)
+    fast, dynamics = dressed_crank.closure.compiled_closure, crane.Dynamics(dressed_crank)
     base = fast.geometry.numbers if name == "loops" else dynamics.numbers
     random, texts = np.random.default_rng(3), {}
     for _ in range(60):
         some = random.integers(len(base), size=random.integers(1, 4))
         for values in (base, with_entry(base, some, random.choice(SPECIAL, len(some)))):
-            texts.setdefault(folded(values), set()).add(text_with(name, fast, dynamics, values))
+            texts.setdefault(folding_pattern(values), set()).add(
+                text_with(name, fast, dynamics, values)
+            )
     for some in random.integers(len(base), size=20):  # and with numbers that are no special ones
         values = with_entry(base, some, base[some] * 1.25)
-        texts.setdefault(folded(values), set()).add(text_with(name, fast, dynamics, values))
+        texts.setdefault(folding_pattern(values), set()).add(
+            text_with(name, fast, dynamics, values)
+        )
     assert len(texts) > 30 and all(len(same) == 1 for same in texts.values())
 
 
@@ -211,7 +221,7 @@ def text_with(name, fast, dynamics, values):
         except ZeroDivisionError:  # no machine
             return "singular"
     rest = values, len(dynamics.machine.active), dynamics.form
-    return text(lambda program: quantities._build(program, name, fast, *rest))
+    return text(lambda program: quantities._build_quantity(program, name, fast, *rest))
 
 
 @pytest.fixture(scope="module")
@@ -270,8 +280,8 @@ def results(machine):
         assert one.backend == "compiled"
         for name in quantities.QUANTITIES if formulation == "exact" else ("inverse", "forward"):
             q = machine.closure.solve(q_a)
-            out.append(one.at(name, q, v_a, x))
-            again.append(two.at(name, q, v_a, x).reshape(out[-1].shape))
+            out.append(one.evaluate_closed(name, q, v_a, x))
+            again.append(two.evaluate_closed(name, q, v_a, x).reshape(out[-1].shape))
     q = machine.closure.solve(q_a)
     out.append(machine.closure.gamma(q))
     again.append(np.array([machine.closure.motion(row, np.zeros(n))[0] for row in q]))
@@ -288,7 +298,7 @@ def results(machine):
 
 
 def counted(kept, built, depends, build):
-    """`Program.kept`, and what it depends on if it has to be built."""
+    """`Program.from_cache`, and what it depends on if it has to be built."""
 
     def told(program):
         built.append(depends)
@@ -303,8 +313,8 @@ def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeyp
     """Each finds only what is its own, whatever was kept before it, the second time all of it."""
     built, first = [], []
     # something of the standard library, so that the package does not look patched
-    monkeypatch.setattr(Program, "kept", partial(counted, Program.kept, built))
-    loops._SHARED.clear()  # machines of other tests may still be there
+    monkeypatch.setattr(Program, "kept", partial(counted, Program.from_cache, built))
+    loops._SHARED_CODE.clear()  # machines of other tests may still be there
     for number, machine in enumerate(variants(tmp_path)):
         found, wanted = results(machine)
         for one, two in zip(found, wanted, strict=True):
@@ -313,7 +323,7 @@ def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeyp
         first.append(found)
     assert len(built) > 100
     built.clear()
-    loops._SHARED.clear()
+    loops._SHARED_CODE.clear()
     for machine, found in zip(variants(tmp_path), first, strict=True):
         assert all(map(np.array_equal, results(machine)[0], found))
     assert not built
@@ -323,7 +333,7 @@ EVERYTHING = """
 import json, sys, warnings
 import numpy as np
 import crane
-from crane.codegen.kept import Note
+from crane.codegen.program_cache import Note
 from crane.common import cache
 warnings.simplefilter("ignore")
 crane.LOADED += 3600.0

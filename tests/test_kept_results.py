@@ -12,12 +12,12 @@ from broken import DATA
 from work import at_most
 
 import crane
-from crane.closure.exactness import Surplus
-from crane.codegen import kept_result, results
-from crane.codegen.kept import place_of
-from crane.common import cache
+from crane.closure.constraint_tolerances import RedundancyGap
+from crane.codegen import cached_result, result_cache
+from crane.codegen.program_cache import cache_entry_name
+from crane.common import file_cache
 from crane.common.serialization import serialize
-from crane.description import bundled
+from crane.description import bundled_machines
 
 MINI = {
     "another length": {"changes": {"link3_G.x": 0.1}},
@@ -33,7 +33,7 @@ def fresh(monkeypatch):
     """Say that this is a process that has imported nothing."""
 
     def begin():
-        monkeypatch.setattr(results, "sys", SimpleNamespace(modules={}))
+        monkeypatch.setattr(result_cache, "sys", SimpleNamespace(modules={}))
 
     yield begin
 
@@ -49,22 +49,22 @@ def test_it_is_found_once(place):
         found.append(1)
         return ("x", np.array([0.1, np.nan, -0.0]))
 
-    first = kept_result(("what", 1.0), find, "no.such.module", ())
-    again = kept_result(("what", 1.0), find, "no.such.module", ())
+    first = cached_result(("what", 1.0), find, "no.such.module", ())
+    again = cached_result(("what", 1.0), find, "no.such.module", ())
     assert len(found) == len(kept(place)) == 1
     assert first[0] == again[0] and first[1].tobytes() == again[1].tobytes()
-    kept_result(("what", 2.0), find, "no.such.module", ())
+    cached_result(("what", 2.0), find, "no.such.module", ())
     assert len(found) == len(kept(place)) == 2
     kept(place)[0].write_bytes(b"damaged")
     for number in (1.0, 2.0):
-        assert np.isnan(kept_result(("what", number), find, "no.such.module", ())[1][1])
+        assert np.isnan(cached_result(("what", number), find, "no.such.module", ())[1][1])
     assert len(found) == 3
 
 
 def test_it_is_not_kept_where_its_module_is_there_already(place):
     found = []
     for _ in range(2):
-        kept_result("what", lambda: found.append(1), "numpy", ())
+        cached_result("what", lambda: found.append(1), "numpy", ())
     assert len(found) == 2 and not kept(place)
 
 
@@ -74,15 +74,15 @@ def test_what_fails_is_not_kept(place):
 
     for _ in range(2):
         with pytest.raises(crane.CraneError, match="no"):
-            kept_result("what", fail, "no.such.module", ())
+            cached_result("what", fail, "no.such.module", ())
     assert not kept(place)
 
 
 def test_another_build_of_what_finds_it_is_another_place(place, monkeypatch):
-    kept_result("what", lambda: 1, "no.such.module", ())
-    build = cache.build_of
-    monkeypatch.setattr(cache, "build_of", _Newer(build("scipy")))
-    assert kept_result("what", lambda: 2, "no.such.module", ()) == 2
+    cached_result("what", lambda: 1, "no.such.module", ())
+    build = file_cache.package_build
+    monkeypatch.setattr(file_cache, "package_build", _Newer(build("scipy")))
+    assert cached_result("what", lambda: 2, "no.such.module", ()) == 2
 
 
 class _Newer:
@@ -96,13 +96,13 @@ class _Newer:
         return time + (package == "scipy"), size
 
 
-@pytest.mark.parametrize("content", [b"", b"12345678{", serialize(Surplus())])
+@pytest.mark.parametrize("content", [b"", b"12345678{", serialize(RedundancyGap())])
 def test_an_entry_that_cannot_be_read_is_made_anew(place, content):
-    kept_result("what", lambda: (1.0, None), "no.such.module", ())
+    cached_result("what", lambda: (1.0, None), "no.such.module", ())
     name = kept(place)[0].name
-    cache.write(name, content)
-    assert kept_result("what", lambda: (2.0, None), "no.such.module", ()) == (2.0, None)
-    assert kept_result("what", lambda: (3.0, None), "no.such.module", ()) == (2.0, None)
+    file_cache.write_entry(name, content)
+    assert cached_result("what", lambda: (2.0, None), "no.such.module", ()) == (2.0, None)
+    assert cached_result("what", lambda: (3.0, None), "no.such.module", ()) == (2.0, None)
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -132,7 +132,7 @@ def test_a_single_call_takes_the_short_way_in_a_later_process(place, fresh):
 def variants():
     yield "mini_forwarder", {}
     yield from (("mini_forwarder", options) for options in MINI.values())
-    for name in sorted(bundled()):
+    for name in sorted(bundled_machines()):
         if name != "mini_forwarder":
             yield name, {}
     for name in ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf"):
@@ -150,14 +150,14 @@ def test_machines_are_what_they_would_be_without(place, fresh):
             machine = crane.load(name, **options)
             assert _said(machine.closure.structure) == _said(one.structure), (name, options)
             assert machine.home.tobytes() == one.home.tobytes()
-            assert _said(machine.closure.sought) == _said(one.sought)
+            assert _said(machine.closure.home_search) == _said(one.home_search)
         counts.append(len(kept(place)))
     assert counts[0] == counts[1] > len(MINI)
 
 
 def _said(value):
     """Everything in it, to the last bit."""
-    return repr(place_of(("all", value)))
+    return repr(cache_entry_name(("all", value)))
 
 
 @pytest.mark.slow

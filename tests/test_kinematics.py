@@ -61,7 +61,7 @@ def test_a_machine_of_a_single_joint(tmp_path):
     assert tip.jacobian([0.2]) == pytest.approx(np.array([[0.0], [0.0], [1.0]]))
     assert tip.position([0.3]) == pytest.approx([0, 0, 0.3])
     space = crane.workspace(machine, 100, "load_x")
-    assert np.ptp(space.tips, axis=0) == pytest.approx([0, 0, STROKES], abs=1e-12)
+    assert np.ptp(space.tip_positions, axis=0) == pytest.approx([0, 0, STROKES], abs=1e-12)
 
 
 def test_stacks_equal_single_samples(mini, tip):
@@ -173,7 +173,7 @@ def test_bad_arguments(mini, slider_crank, stewart, tip):
         (lambda: tip.inverse([0.3, np.nan, 0.0]), "position is nan at y"),
         (lambda: tip.position([0.3, 0.0]), "q_a has the shape"),
         (lambda: tip.bias([0, 0.01, 0.01], [0, np.inf, 0]), "v_a is inf at X1"),
-        (lambda: tip.inverse([0.3, 0.0, 0.0], guess=[0.0, 0.01]), "guess has the shape"),
+        (lambda: tip.inverse([0.3, 0.0, 0.0], initial_guess=[0.0, 0.01]), "guess has the shape"),
         (lambda: crane.Kinematics(stewart), "machine 'stewart' has no tip, name a frame"),
         (lambda: crane.Kinematics(mini, "link7_tp"), "did you mean 'link7_tip'"),
         (lambda: tip.inverse(np.zeros((0, 3))), "empty"),

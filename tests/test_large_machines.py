@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import crane
-from crane.closure import exactness
+from crane.closure import constraint_tolerances
 
 FREEDOMS = {  # loops and freedoms of so many joints
     "chain": lambda joints: ((joints - 1) // 3, 1 + (joints - 1) // 3),
@@ -85,13 +85,13 @@ BRANCHES = (
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_loops_of_their_own_are_analysed_together(monkeypatch):
     """24 four-bars on a floating root take as many closings as one of them."""
-    steps, whole = [], exactness.least_squares_step
+    steps, whole = [], constraint_tolerances.least_squares_step
 
     def counted(jacobian, phi):
         steps.append(len(phi))
         return whole(jacobian, phi)
 
-    monkeypatch.setattr(exactness, "least_squares_step", counted)
+    monkeypatch.setattr(constraint_tolerances, "least_squares_step", counted)
     machine = crane.load(BRANCHES)
     assert len(machine.closure.equations.loops) == 24 and machine.model.nv == 78
     assert len(steps) < 250, len(steps)  # 2,485 when each direction was tried by itself
@@ -100,12 +100,12 @@ def test_loops_of_their_own_are_analysed_together(monkeypatch):
 def test_groups_share_no_equation(tmp_path):
     machine = crane.load(families.write("tree", 40, tmp_path))
     equations = machine.closure.equations
-    group, of_row = equations.groups(np.arange(machine.model.nv))
-    for row, one in zip(equations.scaled(machine.home)[1], of_row, strict=True):
+    group, of_row = equations.coupled_groups(np.arange(machine.model.nv))
+    for row, one in zip(equations.evaluate_scaled(machine.home)[1], of_row, strict=True):
         assert (group[np.abs(row) > 1e-9] == one).all()
     for one in np.unique(of_row):
         names = {equations.names[i] for i in equations.loop_of_row[of_row == one]}
-        alone = equations.part(names)
+        alone = equations.subset(names)
         phi, jacobian = equations.evaluate(machine.home)
         own, slopes = alone.evaluate(machine.home)
         assert (own == phi[of_row == one]).all() and (slopes == jacobian[of_row == one]).all()

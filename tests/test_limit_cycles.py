@@ -8,10 +8,10 @@ from hydraulic_rig import rig
 from scipy.integrate import solve_ivp
 
 import crane
-from crane.hydraulics.load_sensing import driven_swings, least_sensing
-from crane.hydraulics.sources import Supply
+from crane.hydraulics.load_sensing_stability import least_sensing_ratio, unstable_frequency_range
+from crane.hydraulics.supply_and_engine import Supply
 from crane.recordings.limit_cycles import limit_cycles, ringing, sustained
-from crane.recordings.summary import summarize
+from crane.recordings.recording_summary import summarize
 
 TIME = np.arange(0.0, 10.0, 2e-3)
 SENSING = {
@@ -24,7 +24,7 @@ MODULUS = 1.2e9  # of the rig's oil [Pa]
 
 def lifted(folder, mass=3000.0, level=0.8, duration=4.0, **supply):
     machine = rig(folder, valve=VALVE, mass=mass, supply=SENSING | supply)
-    lever = crane.Signals(machine, [0.0, 0.1, 0.3, duration], {"x": [0.0, 0.0, level, level]})
+    lever = crane.ValveSignals(machine, [0.0, 0.1, 0.3, duration], {"x": [0.0, 0.0, level, level]})
     return machine, crane.simulate(machine, lever, duration=duration, step=1e-3)
 
 
@@ -84,7 +84,7 @@ def test_load_sensing_without_damping_rings_and_is_told(tmp_path):
     assert largest.amplitude == pytest.approx(np.ptp(left) / 2, rel=0.25) and np.ptp(left) > 3e6
     assert "pressures ring" in summarize(run).to_markdown()
     report = crane.check(machine.path)
-    (told,) = [one.what for one in report.findings if "'sensing'" in one.what]
+    (told,) = [one.message for one in report.findings if "'sensing'" in one.message]
     assert "0 to 39 Hz" in told and "0.08 or more" in told and report.status == 1
 
 
@@ -127,7 +127,7 @@ def test_driven_swings_are_where_the_admittance_is_active():
         flow = -g * (s * (s + a) + square * late * s / (1 + late * s))
         flow = flow / (s * s + (a + b * g) * s + square + a * b * g)
         active = (flow.real > 1e-9 * np.abs(flow)).any(axis=0)
-        band = driven_swings(supply, MODULUS)
+        band = unstable_frequency_range(supply, MODULUS)
         if band is None:
             assert not active.any()
             continue
@@ -142,7 +142,7 @@ def test_no_load_swings_up_from_the_least_sensing_on():
     """Eigenvalues of pump, valve and a mass on a cylinder, whatever they are; some do below it."""
     rng, grown = np.random.default_rng(5), 0
     for supply in supplies(60):
-        least = least_sensing(supply, MODULUS)
+        least = least_sensing_ratio(supply, MODULUS)
         for share in (0.02, 1.01):
             some = replace(supply, sensing=max(share * least, 1e-6))
             for _ in range(20):
@@ -174,7 +174,7 @@ def test_no_load_swings_up_from_the_least_sensing_on():
 def test_bundled_machines_do_not_ring(name, task, droop):
     changes = {"supply.droop": droop} if droop else {}
     machine = crane.load(name, changes=changes)
-    loaded = machine.under(*machine.tasks[task].loads)
+    loaded = machine.with_external_forces(*machine.tasks[task].loads)
     duration = machine.tasks[task].duration or None
     run = crane.simulate(loaded, crane.joystick(loaded, task), duration=duration, step=5e-3)
     assert ringing(run) == ""

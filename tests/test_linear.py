@@ -9,7 +9,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.simulation.linear.outside import Outside
+from crane.simulation.linear.external_force_derivatives import LinearizedExternalForces
 
 
 def quiet(call, *args, **options):
@@ -36,7 +36,7 @@ def test_a_load_on_its_oil(tmp_path):
     rings = [mode for mode in model.modes if mode.pole.imag > 0]
     assert len(rings) == 1
     undamped = crane.linearize(machine.replace(friction={}))
-    (ring,) = (mode for mode in undamped.modes if mode.rings)
+    (ring,) = (mode for mode in undamped.modes if mode.is_oscillatory)
     assert ring.damping == 0 and str(ring.damping) == "0.0"  # not what rounding leaves
     assert f"| {ring.frequency:.4g} | 0 |  | x |" in undamped.to_text()
     assert "nothing answers voltage_x there; a velocity opens valves" in undamped.to_text()
@@ -56,9 +56,11 @@ def pulled(machine):
 
     class Held(crane.ExternalForce):
         def wrench(self, here):
-            return [-2e3 * here.place[0] - 50 * here.velocity[0], 0.0, -300.0], [0.0, 40.0, 0.0]
+            return [-2e3 * here.position[0] - 50 * here.velocity[0], 0.0, -300.0], [0.0, 40.0, 0.0]
 
-    return machine.under(crane.Wrench(machine.tip, (800.0, 0.0, -1500.0)), Held(machine.tip, "b"))
+    return machine.with_external_forces(
+        crane.Wrench(machine.tip, (800.0, 0.0, -1500.0)), Held(machine.tip, "b")
+    )
 
 
 def test_forces_from_outside_are_part_of_it():
@@ -74,7 +76,9 @@ def test_forces_from_outside_are_part_of_it():
     def acceleration(q_a, v_a):
         place, speed = kinematics.position(q_a), kinematics.jacobian(q_a) @ v_a
         push = [800.0 - 2e3 * place[0] - 50 * speed[0], 0.0, -1800.0, 0.0, 40.0, 0.0]
-        return dynamics.forward(q_a, v_a, model.u + dynamics.applied(q_a, {machine.tip: push}))
+        return dynamics.forward(
+            q_a, v_a, model.u + dynamics.project_wrenches(q_a, {machine.tip: push})
+        )
 
     for i in range(n):
         way = 1e-4 * np.eye(n)[i]
@@ -93,8 +97,8 @@ def test_stiffness_under_a_constant_force_is_symmetric():
     for name, force in (("mini_forwarder", (2, 1, -5)), ("excavator", (1e4, 0, -2e4))):
         machine = quiet(crane.load, name)
         q_a = machine.home[machine.closure.active]
-        loaded = machine.under(crane.Wrench(machine.tip, force))
-        stiffness = Outside(loaded).slopes(q_a, 0 * q_a)[:, : len(q_a)]
+        loaded = machine.with_external_forces(crane.Wrench(machine.tip, force))
+        stiffness = LinearizedExternalForces(loaded).jacobian(q_a, 0 * q_a)[:, : len(q_a)]
         off = np.abs(stiffness - stiffness.T).max()
         assert off < 1e-10 * np.abs(stiffness).max() and np.abs(stiffness).max() > 0
 
@@ -116,7 +120,7 @@ def test_what_remembers_its_way_is_left_out_and_told():
     machine = crane.load("excavator")
     foot = crane.Contact(machine.tip, lateral_stiffness=1e6)
     with pytest.warns(CraneWarning, match=f"remember their way .*left out: {machine.tip}"):
-        crane.linearize(machine.under(foot), drive="forces")
+        crane.linearize(machine.with_external_forces(foot), drive="forces")
 
 
 def test_a_mass_on_a_spring_under_a_force(tmp_path):
@@ -164,7 +168,7 @@ def test_small_motions_under_forces_are_the_simulation(patu, velocity):
     for share in (1e-2, 1e-3):
         moved, inputs = share * state, share * np.array([0.0, push, 0.0, 0.0])
 
-        class Given(crane.Law):
+        class Given(crane.ControlLaw):
             def __init__(self, forces):
                 super().__init__(patu)
                 self.settings = forces
@@ -196,7 +200,7 @@ def test_small_motions_on_the_valves_are_the_simulation(patu):
     start[n + 1 : n + 3] = 1e-4, -2e-4
     at = dict(zip(model.states, model.x, strict=True))
     held = {j: (at[f"pressure_{j}_a"], at[f"pressure_{j}_b"]) for j in patu.active}
-    controllers = (crane.ValveDrive(patu, crane.Signals(patu, [0.0], {}), held),) * 2
+    controllers = (crane.ValveDrive(patu, crane.ValveSignals(patu, [0.0], {}), held),) * 2
     found = deviations(
         patu, model, controllers, (q_a, np.zeros(n)), (q_a, start[n : 2 * n]), times
     )
@@ -228,7 +232,7 @@ def test_a_valve_that_is_open_answers_its_signal(tmp_path):
     drives = [
         crane.ValveDrive(
             machine,
-            crane.Signals(machine, [0.0, 1e-9, 1.0], {"x": [u, u + more, u + more]}),
+            crane.ValveSignals(machine, [0.0, 1e-9, 1.0], {"x": [u, u + more, u + more]}),
             {"x": tuple(pressures)},
         )
         for more in (0.0, step)
@@ -293,8 +297,8 @@ def test_files_and_python_control(patu, tmp_path):
     "options, said",
     [
         ({"drive": "valve"}, "drive 'valve' is unknown"),
-        ({"at": {"X_lft": 0.2}}, "at: 'X_lft' is no active joint"),
-        ({"at": {"X_lift": 2.0}}, "outside of its limits"),
+        ({"operating_point": {"X_lft": 0.2}}, "at: 'X_lft' is no active joint"),
+        ({"operating_point": {"X_lift": 2.0}}, "outside of its limits"),
         ({"outputs": ["tip_w"]}, "output 'tip_w' is unknown"),
         ({"velocity": {"X_ext": 5.0}}, "cannot be trimmed there"),
     ],
@@ -341,10 +345,10 @@ def test_the_command_writes_model_pictures_and_page(tmp_path):
 
 def test_what_rings_is_shown_within_the_strokes(patu):
     model = quiet(crane.linearize, patu)
-    motion = model.motion()
+    motion = model.mode_animation()
     assert motion.task == "modes in slow motion"
-    rings = [mode.frequency for mode in model.modes if mode.rings]
+    rings = [mode.frequency for mode in model.modes if mode.is_oscillatory]
     assert list(dict.fromkeys(motion.channels["mode_frequency"])) == rings
     assert (motion.q >= patu.lower).all() and (motion.q <= patu.upper).all()
     assert np.abs(np.diff(motion.q, axis=0)).max() < 0.02
-    assert crane.linearize(crane.load("tx40"), drive="forces").motion() is not None
+    assert crane.linearize(crane.load("tx40"), drive="forces").mode_animation() is not None

@@ -86,7 +86,7 @@ def test_energy_of_large_machines_is_kept(name):
 def test_sarrus_plate_goes_straight_up():
     machine = loaded("sarrus")
     closure = machine.closure
-    assert len(closure.structure.redundant) == 1
+    assert len(closure.structure.redundant_rows) == 1
     plate = machine.frame("plate")
     data = machine.model.createData()
     places = []

@@ -18,9 +18,9 @@ from work import at_most
 import crane
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.recordings.recording import Recording
+from crane.view.live.live_session import Session, round_up_to_nice
 from crane.view.live.playback import Playback
-from crane.view.live.session import Session, round_up
-from crane.view.live.words import numbers, warning
+from crane.view.live.readout_panel import readout_html, warning_html
 
 MAIN = "from crane.cli import main; main()"
 
@@ -56,12 +56,12 @@ def test_a_thousand_moves_keep_the_loops_closed(request, name):
         value = rng.uniform(session.lower[index], session.upper[index])
         posture = session.move(machine.active[index], value)
         assert posture.residual < 1e-9
-        assert float(machine.closure.residual(posture.q)) < 1e-9
+        assert float(machine.closure.residual(posture.configuration)) < 1e-9
         others = np.arange(len(machine.active)) != index
         np.testing.assert_array_equal(posture.q_a[others], before.q_a[others])
-        if not posture.refused:
+        if not posture.refusal:
             assert posture.q_a[index] == value
-        refused += bool(posture.refused)
+        refused += bool(posture.refusal)
     assert (refused > 0) == (name == "five_bar")
 
 
@@ -70,13 +70,13 @@ def test_the_numbers_are_those_of_the_machine(mini):
     session.move("q1", 0.7)
     posture = session.move("X1", 0.011)
     dynamics, kinematics = crane.Dynamics(mini), crane.Kinematics(mini)
-    np.testing.assert_allclose(posture.q, mini.closure.solve(posture.q_a), atol=1e-12)
+    np.testing.assert_allclose(posture.configuration, mini.closure.solve(posture.q_a), atol=1e-12)
     np.testing.assert_allclose(posture.gravity, dynamics.gravity(posture.q_a), atol=1e-9)
     np.testing.assert_allclose(posture.tip, kinematics.position(posture.q_a), atol=1e-12)
-    gamma = mini.closure.gamma(posture.q)
-    one, other = posture.gain_of
-    assert abs(posture.gain) == np.abs(gamma[mini.closure.passive]).max()
-    assert posture.gain == gamma[mini.column(one), mini.active.index(other)]
+    gamma = mini.closure.gamma(posture.configuration)
+    one, other = posture.gain_joints
+    assert abs(posture.largest_gain) == np.abs(gamma[mini.closure.passive]).max()
+    assert posture.largest_gain == gamma[mini.column(one), mini.active.index(other)]
 
 
 @given(shares=st.lists(st.floats(0, 1), min_size=3, max_size=3), mass=st.floats(0, 1))
@@ -87,25 +87,25 @@ def test_payload_adds_the_weight_that_virtual_work_says(mini, shares, mass):
     ):
         session.move(joint, low + share * (high - low))
     bare = session.posture.gravity
-    loaded = session.load(mass)
+    loaded = session.set_payload(mass)
     lever = crane.Kinematics(mini).jacobian(loaded.q_a)[2]
     np.testing.assert_allclose(loaded.gravity - bare, 9.81 * mass * lever, atol=1e-9)
-    np.testing.assert_allclose(session.load(0.0).gravity, bare, atol=1e-12)
+    np.testing.assert_allclose(session.set_payload(0.0).gravity, bare, atol=1e-12)
 
 
 def test_at_the_edge_the_machine_stops_and_names_the_loop(five_bar):
     """The two arms of a five-bar are in line there; see the closed form of its reach."""
     session = Session(five_bar)
     posture = session.move("a", 2.0)
-    assert posture.refused == (
+    assert posture.refusal == (
         "a stops at 50.06 deg: beyond it loop 'meeting' leaves its assembly branch or cannot be "
         "closed"
     )
     with pytest.raises(crane.CraneError):
         five_bar.closure.solve([posture.q_a[0] + 1e-3, 0.0])
-    assert posture.residual < 1e-9 and posture.condition > 100
+    assert posture.residual < 1e-9 and posture.condition_number > 100
     assert session.move("a", 2.0).q_a[0] == pytest.approx(posture.q_a[0], abs=1e-4)
-    assert session.move("a", 0.0).refused == ""
+    assert session.move("a", 0.0).refusal == ""
 
 
 @pytest.mark.parametrize("name", ["five_bar", "stewart"])
@@ -117,20 +117,20 @@ def test_there_is_a_way_back_from_every_edge(request, name):
         index = rng.integers(len(machine.active))
         joint, before = machine.active[index], session.posture
         value = rng.choice([session.lower[index], session.upper[index]])
-        if not session.move(joint, value).refused:
+        if not session.move(joint, value).refusal:
             continue
         edges += 1
         back = session.move(joint, before.q_a[index])
-        assert back.refused == ""
-        np.testing.assert_allclose(back.q, before.q, atol=1e-6)
+        assert back.refusal == ""
+        np.testing.assert_allclose(back.configuration, before.configuration, atol=1e-6)
 
 
 def test_a_long_move_never_jumps_to_where_the_loops_close_again(five_bar):
     session = Session(five_bar)
     for value in np.linspace(1.0, np.pi, 20):
         posture = session.move("a", value)
-        assert posture.refused and posture.q_a[0] < 0.9
-        session.home()
+        assert posture.refusal and posture.q_a[0] < 0.9
+        session.go_home()
 
 
 def test_wrong_moves(mini, five_bar):
@@ -142,27 +142,27 @@ def test_wrong_moves(mini, five_bar):
     with pytest.raises(InputError, match="the value of X1 is nan m"):
         session.move("X1", float("nan"))
     with pytest.raises(InputError, match="must not be negative"):
-        session.load(-1.0)
+        session.set_payload(-1.0)
     with pytest.raises(InputError, match="'five_bar' has no tip"):
-        Session(five_bar).load(1.0)
-    np.testing.assert_array_equal(session.posture.q, mini.home)
+        Session(five_bar).set_payload(1.0)
+    np.testing.assert_array_equal(session.posture.configuration, mini.home)
 
 
 def test_slider_ends(mini, five_bar):
     session = Session(mini)
     np.testing.assert_array_equal(session.lower, mini.lower)
     np.testing.assert_array_equal(session.upper, mini.upper)
-    assert session.heaviest == 1.0  # half of 1.287 kg, rounded up
+    assert session.max_payload == 1.0  # half of 1.287 kg, rounded up
     np.testing.assert_allclose(Session(five_bar).upper, np.pi)
-    assert [round_up(x) for x in (0.9, 1.0, 1.1, 23, 0.051)] == [1, 1, 2, 50, 0.1]
+    assert [round_up_to_nice(x) for x in (0.9, 1.0, 1.1, 23, 0.051)] == [1, 1, 2, 50, 0.1]
 
 
 def test_poses_are_those_of_forward_kinematics(mini):
     session = Session(mini)
     posture = session.move("X2", 0.021)
     data = mini.model.createData()
-    pin.framesForwardKinematics(mini.model, data, posture.q)
-    for link, pose in zip(["link3", "base"], session.poses(["link3", "base"]), strict=True):
+    pin.framesForwardKinematics(mini.model, data, posture.configuration)
+    for link, pose in zip(["link3", "base"], session.link_poses(["link3", "base"]), strict=True):
         np.testing.assert_array_equal(pose, data.oMf[mini.frame(link)].homogeneous)
 
 
@@ -170,14 +170,14 @@ def test_playback_runs_straight_between_samples(mini, recording):
     playback = Playback(mini, recording)
     assert (playback.start, playback.end) == (2.0, 3.0)
     for t in (2.0, 2.04, 2.5, 3.0):
-        q_a, tau = playback.at(t)
+        q_a, tau = playback.interpolate(t)
         expected = [0.1 * t, 0.02 - 0.003 * t, 0.01 + 0.002 * t]
         np.testing.assert_allclose(q_a, expected, atol=1e-12)
         np.testing.assert_allclose(tau, 10 * np.array(expected), atol=1e-12)
-    np.testing.assert_array_equal(playback.at(9.0)[0], recording.q[-1])
+    np.testing.assert_array_equal(playback.interpolate(9.0)[0], recording.q[-1])
     session = Session(mini)
-    posture = session.place(playback.at(2.55)[0])
-    assert posture.refused == "" and posture.residual < 1e-9
+    posture = session.set_active_coordinates(playback.interpolate(2.55)[0])
+    assert posture.refusal == "" and posture.residual < 1e-9
 
 
 def test_playback_of_another_machine(patu, recording):
@@ -187,11 +187,11 @@ def test_playback_of_another_machine(patu, recording):
 
 def test_words_have_every_number(mini):
     session = Session(mini)
-    text = numbers(mini, session.load(0.2), 0.2, np.array([1.5, 2.5, 3.5]))
+    text = readout_html(mini, session.set_payload(0.2), 0.2, np.array([1.5, 2.5, 3.5]))
     for word in (*mini.joints, "recorded", "3.5 N", "payload", "rad/m"):
         assert word in text
-    assert "payload" not in numbers(mini, session.load(0.0), 0.0)
-    assert warning("") == "" and "&lt;b&gt;" in warning("<b>")
+    assert "payload" not in readout_html(mini, session.set_payload(0.0), 0.0)
+    assert warning_html("") == "" and "&lt;b&gt;" in warning_html("<b>")
 
 
 def begin(*arguments, code=MAIN):
@@ -216,20 +216,20 @@ def group_is_empty(group):
 def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
     """Projected corners of all shapes: within the window, and of one upright in its upper part."""
     pytest.importorskip("viser")
-    from crane.view.live.door import Door
-    from crane.view.live.serve import start, stop
-    from crane.view.live.stage import Stage, _corners
-    from crane.view.page.visuals import read_visuals
+    from crane.view.live.access_control import AccessGuard
+    from crane.view.live.live_scene import LiveScene, _shape_corners
+    from crane.view.live.live_server import start_server, stop_server
+    from crane.view.page.machine_visuals import read_visuals
 
     session = Session(patu)
-    server = start(Door("127.0.0.1"), 0)
+    server = start_server(AccessGuard("127.0.0.1"), 0)
     try:
-        look_at, position = Stage(server, session).view(aspect)
+        look_at, position = LiveScene(server, session).camera_view(aspect)
     finally:
-        stop(server)
+        stop_server(server)
     forward = (look_at - position) / np.linalg.norm(look_at - position)
     right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
-    ways = (_corners(read_visuals(patu), session) - position) @ np.column_stack(
+    ways = (_shape_corners(read_visuals(patu), session) - position) @ np.column_stack(
         [right, np.cross(right, forward), forward]
     )
     half = np.tan(np.radians(20))
@@ -263,23 +263,23 @@ def test_a_slider_moves_the_picture_with_little_work(patu):
     pytest.importorskip("viser")
     from queue import SimpleQueue
 
-    from crane.view.live.door import Door
-    from crane.view.live.page import Page
-    from crane.view.live.serve import start, stop
+    from crane.view.live.access_control import AccessGuard
+    from crane.view.live.live_page import LivePage
+    from crane.view.live.live_server import start_server, stop_server
 
     session = Session(patu)
-    server = start(Door("127.0.0.1"), 0)
+    server = start_server(AccessGuard("127.0.0.1"), 0)
     try:
-        page, rng = Page(server, session, None, SimpleQueue()), np.random.default_rng(0)
+        page, rng = LivePage(server, session, None, SimpleQueue()), np.random.default_rng(0)
         for i in range(300):
             joint = patu.active[i % len(patu.active)]
             unit = 180 / np.pi if patu.unit(joint) == "rad" else 1000.0
             low, high = unit * patu.lower[i % 4], unit * patu.upper[i % 4]
             with at_most(4_000):
-                page.work([(f"joint {joint}", rng.uniform(low, high))])
+                page.process_requests([(f"joint {joint}", rng.uniform(low, high))])
             assert session.posture.residual < 1e-9
     finally:
-        stop(server)
+        stop_server(server)
 
 
 def protocol():

@@ -14,8 +14,8 @@ import pytest
 from conftest import DATA
 
 import crane
-from crane.view.live.door import Door
-from crane.view.live.session import Session
+from crane.view.live.access_control import AccessGuard
+from crane.view.live.live_session import Session
 
 pytest.importorskip("viser")
 
@@ -23,14 +23,14 @@ pytest.importorskip("viser")
 @pytest.fixture(scope="module")
 def live():
     """Port, door, page and notes of a view that is served."""
-    from crane.view.live.page import Page
-    from crane.view.live.serve import start, stop
+    from crane.view.live.live_page import LivePage
+    from crane.view.live.live_server import start_server, stop_server
 
-    door, requests = Door("127.0.0.1"), SimpleQueue()
-    server = start(door, 0)
-    page = Page(server, Session(crane.load(DATA / "slider_crank.yaml")), None, requests)
+    door, requests = AccessGuard("127.0.0.1"), SimpleQueue()
+    server = start_server(door, 0)
+    page = LivePage(server, Session(crane.load(DATA / "slider_crank.yaml")), None, requests)
     yield server.get_port(), door, page, requests
-    stop(server)
+    stop_server(server)
 
 
 def connect(port, path, **headers):
@@ -94,21 +94,23 @@ def test_those_with_the_address_come_in(live):
 
 
 def test_hosts():
-    inside = Door("127.0.0.1").inside
-    assert Door("0.0.0.0").alone is Door("crane.example").alone is False
-    assert Door("::1").alone is Door("localhost").alone is True
+    inside = AccessGuard("127.0.0.1").authorized_path
+    assert (
+        AccessGuard("0.0.0.0").is_local_only is AccessGuard("crane.example").is_local_only is False
+    )
+    assert AccessGuard("::1").is_local_only is AccessGuard("localhost").is_local_only is True
     for host, wanted in {
         "192.0.2.1:80": True,
         "[2001:db8::1]:80": True,
         "x.example": False,
     }.items():
-        door = Door("0.0.0.0")
-        assert (door.inside(f"/{door.token}/", [host], []) == "/") is wanted
+        door = AccessGuard("0.0.0.0")
+        assert (door.authorized_path(f"/{door.token}/", [host], []) == "/") is wanted
         assert inside("/", [host], []) is None
-    door = Door("crane.example")
-    assert door.inside(f"/{door.token}/x", ["crane.example:80"], []) == "/x"
-    assert door.inside(f"/{door.token}/", [], []) is None
-    assert door.inside(f"/{door.token}/", ["[::1"], []) is None
+    door = AccessGuard("crane.example")
+    assert door.authorized_path(f"/{door.token}/x", ["crane.example:80"], []) == "/x"
+    assert door.authorized_path(f"/{door.token}/", [], []) is None
+    assert door.authorized_path(f"/{door.token}/", ["[::1"], []) is None
 
 
 BAD = [[1.0, 2.0], "0.1", None, float("nan"), float("inf"), 1e308, -5.0, 10**400, True, {"a": 1}]

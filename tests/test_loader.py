@@ -8,8 +8,8 @@ import wheel_loader
 from scipy.optimize import brentq
 
 import crane
-from crane.dynamics.statics import Statics
-from crane.ratings.pivots import toggle
+from crane.dynamics.statics import StaticsEvaluator
+from crane.ratings.pivot_joints import toggle
 from crane.ratings.strokes import Strokes
 
 
@@ -145,12 +145,12 @@ def test_break_out_is_what_moments_about_the_pins_give(loader):
         assert one.home == pytest.approx(by_hand[one.joint], rel=1e-9)
         lever = Linkage(*one.lever)
         by_hand = lever.most(lever.path(one.joint), [one.joint])
-        assert one.alone == pytest.approx(by_hand[one.joint], rel=1e-9)
+        assert one.isolated_force == pytest.approx(by_hand[one.joint], rel=1e-9)
         at = Linkage(*one.q_a)
         by_hand = at.most(at.path(one.joint), [one.joint])
         assert one.force == pytest.approx(min(by_hand.values()), rel=1e-9)
-        for cause, force in one.each.items():
-            assert force == pytest.approx(by_hand[cause.what], rel=1e-9)
+        for cause, force in one.forces_by_factor.items():
+            assert force == pytest.approx(by_hand[cause.element], rel=1e-9)
 
 
 def test_the_radius_is_about_the_centre_that_the_lip_turns_about(loader):
@@ -175,7 +175,7 @@ def test_the_radius_is_about_the_centre_that_the_lip_turns_about(loader):
 def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
     """Bellcrank and link in line: the cylinder moves and the bucket does not."""
     found = crane.breakout(with_toggle, bucket="X_tilt")
-    assert found.bucket.alone == np.inf
+    assert found.bucket.isolated_force == np.inf
     at = Linkage(*found.bucket.lever, wheel_loader.TOGGLE)
     line = unit(at.eye - at.link)
     assert abs(cross(unit(at.link - at.crank), line)) < 1e-6
@@ -183,7 +183,10 @@ def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
     at = Linkage(*found.bucket.q_a, wheel_loader.TOGGLE)  # the lift cylinder gives way before
     by_hand = at.most(at.path("X_tilt"), ["X_tilt"])
     assert found.bucket.force == pytest.approx(min(by_hand.values()), rel=1e-9)
-    assert (found.bucket.cause.what, found.bucket.cause.why) == ("X_lift", "holding pressure")
+    assert (found.bucket.limiting_factor.element, found.bucket.limiting_factor.reason) == (
+        "X_lift",
+        "holding pressure",
+    )
     home = Linkage(wheel_loader.LIFTED, wheel_loader.TILTED, wheel_loader.TOGGLE)
     by_hand = home.most(home.path("X_tilt"), ["X_tilt"])
     assert found.bucket.home == pytest.approx(by_hand["X_tilt"], rel=1e-9)
@@ -194,7 +197,7 @@ def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
 
 def test_a_toggle_is_beside_it_alone(with_toggle):
     """Within a hundredth of the stroke, and not where the lever is least or without end."""
-    strokes = Strokes(Statics(with_toggle))
+    strokes = Strokes(StaticsEvaluator(with_toggle))
     closure = with_toggle.closure
     lift = wheel_loader.LIFTED
 
@@ -229,6 +232,6 @@ def test_a_machine_with_one_stroke_left_digs():
     whole = crane.breakout(crane.load("excavator"))
     locked = crane.load("excavator", lock={"X_boom": 0.8, "X_arm": 0.5})
     found = crane.breakout(locked, bucket="X_bucket")
-    assert found.bucket.force == pytest.approx(found.bucket.alone, rel=1e-9)
-    assert found.bucket.alone == pytest.approx(whole.bucket.alone, rel=1e-9)
+    assert found.bucket.force == pytest.approx(found.bucket.isolated_force, rel=1e-9)
+    assert found.bucket.isolated_force == pytest.approx(whole.bucket.isolated_force, rel=1e-9)
     assert found.arm is None

@@ -208,12 +208,12 @@ def test_a_misspelt_quantity_is_refused_where_the_machine_is_named(log, tmp_path
 def test_channels_of_their_own_are_kept(log, tmp_path):
     """What differs by more than a slip, by a number, or is a node of the circuit."""
     machine = crane.load("patu655")
-    nodes = [f"pressure_{x.replace('.', '_')}" for x in machine.hydraulics.nodes]
+    nodes = [f"pressure_{x.replace('.', '_')}" for x in machine.hydraulics.node_names]
     own = [name for name in nodes if name not in PATU]
     text = PATU + "".join(f"{name} [bar] = 1\n" for name in own)
     done = typed("import", log, columns(tmp_path, text), "--out", tmp_path / "run.csv")
     assert (done.returncode, done.stderr) == (0, "")
-    units = timeseries.read(tmp_path / "run.csv").units
+    units = timeseries.read_table(tmp_path / "run.csv").units
     assert {"pressure_X_grip_a", "pressure_pump", "X_9", *own} < set(units)
 
 
@@ -247,5 +247,5 @@ def test_the_measured_arms_come_as_their_owners_wrote_them():
     np.testing.assert_allclose(table.values[:, 7:], tau, rtol=1e-12, atol=1e-12)
 
     table = read_log(DATA / "patu655" / "lifting_first_half.csv", COLUMNS / "patu655.txt")
-    assert timeseries.spellings("m")[0] == table.units["X_lift"]
+    assert timeseries.accepted_units("m")[0] == table.units["X_lift"]
     assert table.values[0, 1] == pytest.approx(0.942197 - 0.820)

@@ -11,13 +11,14 @@ from typed import typed
 
 import crane
 from crane.cli.runs import read_run, write_run
-from crane.common import scratch
+from crane.common import scratch_arrays
 from crane.recordings.recording import Recording
 
 MEASURED = """
 import json, resource, sys
 from crane.cli import main
-import crane.view.page.build, crane.view.plots.recording, crane.formats, crane.simulation
+import crane.view.page.report_page, crane.view.plots.recording_figure
+import crane.formats, crane.simulation
 base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 try:
     main()
@@ -29,9 +30,9 @@ finally:
 @pytest.fixture
 def small(monkeypatch):
     """Scratch files for short recordings, too, in blocks of a few samples."""
-    monkeypatch.setattr(scratch, "_LARGE", 1)
-    monkeypatch.setattr(scratch, "AT_ONCE", 64)
-    monkeypatch.setattr("crane.recordings.timeseries._ROWS_AT_ONCE", 50)
+    monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
+    monkeypatch.setattr(scratch_arrays, "BLOCK_SIZE", 64)
+    monkeypatch.setattr("crane.recordings.timeseries._BLOCK_ROWS", 50)
 
 
 @pytest.mark.parametrize("suffix", ["csv", "npz"])
@@ -39,9 +40,9 @@ def test_what_is_in_scratch_files_is_the_same(mini, tmp_path, monkeypatch, reque
     control = crane.PI(mini, crane.task_trajectory(mini, "lift"))
     plain = crane.simulate(mini, control, duration=0.3, label="lift")
     request.getfixturevalue("small")
-    before = len(scratch._maps)
+    before = len(scratch_arrays._memory_maps)
     found = crane.simulate(mini, control, duration=0.3, label="lift")
-    assert len(scratch._maps) > before
+    assert len(scratch_arrays._memory_maps) > before
     path = tmp_path / f"run.{suffix}"
     getattr(found, f"to_{suffix}")(path)
     again = Recording.read(path)
@@ -52,16 +53,16 @@ def test_what_is_in_scratch_files_is_the_same(mini, tmp_path, monkeypatch, reque
         for name in ("units", "channel_units", "machine", "task", "controller", "ideal", "free"):
             assert getattr(other, name) == getattr(plain, name)
     del found, again, other, one
-    scratch.release()
-    assert len(scratch._maps) == before  # files go with the arrays
+    scratch_arrays.release_pages()
+    assert len(scratch_arrays._memory_maps) == before  # files go with the arrays
 
 
 def test_what_was_released_is_still_there(small):
-    values = scratch.empty(1000, 3)
+    values = scratch_arrays.empty_array(1000, 3)
     values[:] = np.arange(3000.0).reshape(1000, 3)
-    scratch.release()
+    scratch_arrays.release_pages()
     np.testing.assert_array_equal(values, np.arange(3000.0).reshape(1000, 3))
-    squares = scratch.in_blocks(lambda part: values[part] ** 2, 1000)
+    squares = scratch_arrays.compute_in_blocks(lambda part: values[part] ** 2, 1000)
     np.testing.assert_array_equal(squares, values**2)
 
 
@@ -69,10 +70,14 @@ def test_where_there_is_no_room_it_is_in_memory(small, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(scratch.os, "posix_fallocate", full)
-    before = len(scratch._maps)
-    values = scratch.empty(10, 2)
-    assert values.shape == (10, 2) and values.flags.f_contiguous and len(scratch._maps) == before
+    monkeypatch.setattr(scratch_arrays.os, "posix_fallocate", full)
+    before = len(scratch_arrays._memory_maps)
+    values = scratch_arrays.empty_array(10, 2)
+    assert (
+        values.shape == (10, 2)
+        and values.flags.f_contiguous
+        and len(scratch_arrays._memory_maps) == before
+    )
 
 
 def test_a_run_as_npz_is_viewed_and_takes_the_place_of_a_csv(tmp_path):

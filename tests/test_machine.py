@@ -19,7 +19,7 @@ from oracles import (
 
 import crane
 from crane.common.errors import InputError, LimitError, MechanismError
-from crane.description import examples
+from crane.description import example_robots
 
 ELEVEN = {"q1", "q2", "q3", "q4", "X1", "q6", "q7", "q9", "q10", "X2", "q11"}
 
@@ -33,7 +33,7 @@ def test_mini_forwarder_is_what_the_paper_describes(mini):
     assert {mini.unit(joint) for joint in ("X1", "X2")} == {"m"}
     assert {mini.unit(joint) for joint in ELEVEN - {"X1", "X2"}} == {"rad"}
     assert set(mini.tasks) == {"loading", "return", "lift"} and set(mini.control) == {*mini.active}
-    assert mini.tip == "link7_tip" and mini.reference == "mini_forwarder"
+    assert mini.tip == "link7_tip" and mini.load_name == "mini_forwarder"
     assert pin.computeTotalMass(mini.model) == pytest.approx(1.2874, abs=1e-12)
 
 
@@ -204,9 +204,9 @@ class TestDrivenBy:
 
     def test_postures_are_the_same(self, mini, strokes):
         """Strokes from the angles that the closed form has at them."""
-        driven = mini.driven_by(["q1", "q2", "q3"])
+        driven = mini.with_active_joints(["q1", "q2", "q3"])
         assert driven.active == ("q1", "q2", "q3")
-        assert driven.joints == mini.joints and driven.reference == mini.reference
+        assert driven.joints == mini.joints and driven.load_name == mini.load_name
         assert np.abs(driven.home - mini.home).max() < 1e-14
         joints, _ = mini_forwarder(*strokes.T[1:])
         q = driven.closure.solve(np.column_stack([strokes[:, 0], joints["q2"], joints["q3"]]))
@@ -216,7 +216,7 @@ class TestDrivenBy:
         assert not driven.upper.flags.writeable
 
     def test_rows_of_the_strokes_are_dx_dq(self, mini, strokes):
-        driven = mini.driven_by(["q1", "q2", "q3"])
+        driven = mini.with_active_joints(["q1", "q2", "q3"])
         gamma = driven.closure.gamma(mini.closure.solve(strokes))
         slopes = mini_forwarder_gamma(*strokes.T[1:])  # dq/dx
         expected = np.linalg.inv(np.stack([slopes["q2"], slopes["q3"]], axis=1))
@@ -226,7 +226,7 @@ class TestDrivenBy:
 
     def test_lever_of_a_cylinder_in_a_triangle(self, mini):
         """B, C and the rod eye D, which turns with q9 about C: dX1/dq9 is the arm of D about C."""
-        driven = mini.driven_by(["q1", "q9", "q3"])
+        driven = mini.with_active_joints(["q1", "q9", "q3"])
         angle = driven.home[driven.column("q9")] + np.linspace(-0.4, 0.4, 41)
         q3 = np.full_like(angle, driven.home[driven.column("q3")])
         q = driven.closure.solve(np.column_stack([0 * angle, angle, q3]))
@@ -239,7 +239,7 @@ class TestDrivenBy:
 
     def test_torques_are_the_forces_times_dx_dq(self, mini, strokes):
         """Equations (18), (19), in any motion; at rest also the slope of the potential."""
-        driven = mini.driven_by(["q1", "q2", "q3"])
+        driven = mini.with_active_joints(["q1", "q2", "q3"])
         random = np.random.default_rng(6)
         v_a, a_a = random.uniform(-0.05, 0.05, (2, *strokes.shape))
         q = mini.closure.solve(strokes)
@@ -258,18 +258,18 @@ class TestDrivenBy:
         assert np.abs(held[:, 1:] - at_rest).max() < 1e-12 * np.abs(at_rest).max()
 
     def test_what_belongs_to_the_old_joints_is_dropped(self, mini):
-        driven = mini.driven_by(("q1", "q2", "q3"))
+        driven = mini.with_active_joints(("q1", "q2", "q3"))
         assert driven.control == {} and set(driven.tasks) == set(mini.tasks)  # all of the tip
         assert driven.friction == mini.friction and driven.end_stops == mini.end_stops
-        turned_round = mini.driven_by(["X2", "q1", "X1"])
+        turned_round = mini.with_active_joints(["X2", "q1", "X1"])
         assert turned_round.control == mini.control
         assert np.array_equal(turned_round.lower, mini.lower[[2, 0, 1]])
 
     def test_tasks_of_active_joints_are_dropped(self, edited):
         machine = edited("four_bar.yaml")
         assert set(machine.tasks) == {"swing", "reach"}
-        assert set(machine.driven_by(["crank"]).tasks) == {"swing", "reach"}
-        assert set(machine.driven_by(["rocker"]).tasks) == {"reach"}
+        assert set(machine.with_active_joints(["crank"]).tasks) == {"swing", "reach"}
+        assert set(machine.with_active_joints(["rocker"]).tasks) == {"reach"}
 
     def test_circuit_keeps_the_cylinders_that_still_drive(self, tmp_path):
         path = copy_machine(MINI, tmp_path)
@@ -286,9 +286,9 @@ class TestDrivenBy:
             MINI,
         ).apply(tmp_path)
         machine = crane.load(path)
-        assert machine.driven_by(["q1", "q2", "q3"]).hydraulics is None
-        assert machine.driven_by(["q1", "X2", "q2"]).hydraulics.joints == ("X2",)
-        circuit = machine.driven_by(["X2", "X1", "q1"]).hydraulics
+        assert machine.with_active_joints(["q1", "q2", "q3"]).hydraulics is None
+        assert machine.with_active_joints(["q1", "X2", "q2"]).hydraulics.joints == ("X2",)
+        circuit = machine.with_active_joints(["X2", "X1", "q1"]).hydraulics
         assert list(circuit.cylinders) == list(circuit.valves) == ["X2", "X1"]
         assert circuit.supply == machine.hydraulics.supply
 
@@ -306,14 +306,14 @@ class TestDrivenBy:
     )
     def test_joints_that_cannot_drive(self, mini, names, error, text):
         with pytest.raises(error, match=text):
-            mini.driven_by(names)
+            mini.with_active_joints(names)
 
 
 @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 @pytest.mark.parametrize("name", ["talos_reduced", "ur5_robot", "hyq_no_sensors", "kinova"])
 def test_a_tree_is_what_pinocchio_makes_of_the_urdf(name):
     """Joints, frames and their order, placements to the last digit, inertias to rounding."""
-    path = examples().get(name)
+    path = example_robots().get(name)
     if path is None:
         pytest.skip("example-robot-data is not installed")
     ours, theirs = crane.load(name).model, pin.buildModelFromUrdf(str(path))

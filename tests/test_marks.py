@@ -9,10 +9,10 @@ import pytest
 
 import crane
 from crane.common.errors import CraneWarning
-from crane.formats.visuals.visuals import Box, Cylinder
-from crane.view.page.marks import full_arrows, springs
+from crane.formats.visuals.urdf_shapes import BoxShape, CylinderShape
+from crane.view.page.force_markers import full_arrow_forces, spring_markers
+from crane.view.page.machine_visuals import read_visuals, sliding_body_visuals
 from crane.view.page.scene import build_scene, link_poses
-from crane.view.page.visuals import read_visuals, sliding
 
 DATA = Path(__file__).parent / "data"
 SPRINGS = """forces:
@@ -36,8 +36,8 @@ def sprung(tmp_path_factory):
 
 def test_springs_are_drawn_from_frame_to_frame(sprung):
     q = sprung.closure.solve(np.array([[1.0], [1.4], [0.7]]))
-    found = {tuple(spring["parts"]): spring for spring in springs(sprung, q)}
-    assert len(springs(sprung, q)) == 5  # that of the joint has no place
+    found = {tuple(spring["parts"]): spring for spring in spring_markers(sprung, q)}
+    assert len(spring_markers(sprung, q)) == 5  # that of the joint has no place
     assert set(found) == {("coil", "strut"), ("strut",), ("line",)}
     for parts, links in ((("coil", "strut"), ("guide", "slider")), (("line",), None)):
         one, links = found[parts], links or ("base", "rod_middle")
@@ -74,18 +74,18 @@ def test_ends_of_springs_are_in_the_picture(sprung, tmp_path):
 
 
 def test_a_body_that_slides_and_is_not_drawn_is_a_block_along_its_axis(sprung):
-    assert [visual.link for visual in sliding(sprung, ())] == ["slider"]
-    (block,) = (visual for visual in read_visuals(sprung) if isinstance(visual.shape, Box))
+    assert [visual.link for visual in sliding_body_visuals(sprung, ())] == ["slider"]
+    (block,) = (visual for visual in read_visuals(sprung) if isinstance(visual.shape, BoxShape))
     np.testing.assert_allclose(block.placement[:3, 3], 0)
     assert block.shape.size[0] > block.shape.size[1] == block.shape.size[2]  # along x, as s
-    assert sliding(sprung, [sprung.model.getJointId("s")]) == []
+    assert sliding_body_visuals(sprung, [sprung.model.getJointId("s")]) == []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         for name in ("mini_forwarder", "patu655", "excavator"):  # all have shapes of their own
             machine = crane.load(name)
             links = {visual.link for visual in read_visuals(machine)}
             drawn = {machine.model.frames[machine.frame(link)].parentJoint for link in links}
-            assert sliding(machine, drawn) == []
+            assert sliding_body_visuals(machine, drawn) == []
 
 
 def test_a_cylinder_that_is_not_drawn_has_a_rod_that_stays_in_its_barrel(tmp_path):
@@ -100,14 +100,14 @@ def test_a_cylinder_that_is_not_drawn_has_a_rod_that_stays_in_its_barrel(tmp_pat
         <limit lower="0.1" upper="0.7" effort="1" velocity="1"/></joint></robot>"""
     )
     machine = crane.load(tmp_path / "cylinder.urdf")
-    (rod,) = sliding(machine, ())
-    assert rod.link == "rod" and isinstance(rod.shape, Cylinder)
+    (rod,) = sliding_body_visuals(machine, ())
+    assert rod.link == "rod" and isinstance(rod.shape, CylinderShape)
     ends = [(rod.placement @ [0, 0, z * rod.shape.length, 1])[:3] for z in (0.5, -0.5)]
     np.testing.assert_allclose(ends, [[0, 0, 0], [0.6, 0, 0]], atol=1e-15)  # against the axis
     text = (tmp_path / "cylinder.urdf").read_text().replace('lower="0.1" upper="0.7"', "{}")
     (tmp_path / "endless.urdf").write_text(text.format('lower="-1000" upper="1000"'))
-    (block,) = sliding(crane.load(tmp_path / "endless.urdf"), ())
-    assert isinstance(block.shape, Box)  # such limits are placeholders
+    (block,) = sliding_body_visuals(crane.load(tmp_path / "endless.urdf"), ())
+    assert isinstance(block.shape, BoxShape)  # such limits are placeholders
 
 
 def test_arrows_are_in_proportion_to_what_joints_can():
@@ -116,11 +116,11 @@ def test_arrows_are_in_proportion_to_what_joints_can():
         machine = crane.load("mini_forwarder")
     limits = {"q1": 1.765, "X1": 80.0, "X2": 80.0}
     peaks = {"q1": 0.011, "X1": 40.0, "X2": 10.0}
-    full = full_arrows(machine, peaks)
+    full = full_arrow_forces(machine, peaks)
     shares = {joint: peak / full[joint] for joint, peak in peaks.items()}
     expected = {joint: peaks[joint] / limits[joint] / 0.5 for joint in peaks}
     assert shares == pytest.approx(expected)
-    assert full_arrows(machine, dict.fromkeys(peaks, 0.0)) == pytest.approx(limits)
+    assert full_arrow_forces(machine, dict.fromkeys(peaks, 0.0)) == pytest.approx(limits)
 
 
 def test_without_limits_torques_are_forces_on_the_longest_body(tmp_path):
@@ -130,9 +130,9 @@ def test_without_limits_torques_are_forces_on_the_longest_body(tmp_path):
         urdf = (DATA / "slider_crank" / f"{part}.urdf").read_text()
         (tmp_path / f"{part}.urdf").write_text(urdf.replace('effort="50"', 'effort="0"'))
     machine = crane.load(tmp_path / "free.yaml", active=["theta"])
-    assert full_arrows(machine, {"theta": 6.0}) == pytest.approx({"theta": 6.0})
+    assert full_arrow_forces(machine, {"theta": 6.0}) == pytest.approx({"theta": 6.0})
     sliding = crane.load(tmp_path / "free.yaml", active=["s"])
     peaks = {"theta": 6.0, "s": 10.0}  # 6 N m on a rod of 0.3 m are 20 N
     for one in (machine, sliding):
-        full = full_arrows(one, peaks)
+        full = full_arrow_forces(one, peaks)
         assert full == pytest.approx({"theta": 6.0, "s": 20.0})

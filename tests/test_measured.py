@@ -15,8 +15,8 @@ from typed import typed
 import crane
 from crane.cli.runs import read_run
 from crane.common.errors import CraneError, CraneWarning, RecordingError
-from crane.recordings import postures
-from crane.recordings.measured import check_pressures, read_measured
+from crane.recordings import measured_configurations
+from crane.recordings.measured_recordings import check_pressures, read_measured
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table
 
@@ -431,7 +431,7 @@ def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, 
     """Nor does what an error calls a sample: it counts from the first of all."""
     file = write(tmp_path, columns)
     whole = read_measured(machine, file)
-    monkeypatch.setattr(postures, "_AT_ONCE", 50)
+    monkeypatch.setattr(measured_configurations, "_BLOCK_SAMPLES", 50)
     blocks = read_measured(machine, file)
     for name in ("q", "v", "tau"):
         assert close(getattr(blocks, name), getattr(whole, name), 1e-12)

@@ -13,7 +13,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.description import bundled
+from crane.description import bundled_machines
 from crane.formats.check import check
 
 WRONG = (0.7, 0.8, 0.9, 0.95, 0.99, 1.01, 1.05, 1.1, 1.2, 1.3)
@@ -112,7 +112,7 @@ def test_the_line_names_the_gap_and_the_length(tmp_path):
     value = linkage.lengths()["bell.x"]
     path = linkage.write(tmp_path, wrong={"bell.x": 0.85 * value})
     report = check(path)
-    (line,) = [one.what for one in report.findings if one.error]
+    (line,) = [one.message for one in report.findings if one.is_error]
     assert report.status == 2
     assert line == (
         "the loops close only far from the home that is said: lift is 2.88 rad off, loop 'lift' "
@@ -179,7 +179,7 @@ def orientations(machine):
     slopes = closure.equations.evaluate(machine.home)[1]
     return {
         frozenset(closure.passive[columns].tolist()): np.linalg.slogdet(
-            slopes[np.ix_(structure.rows[rows], closure.passive[columns])]
+            slopes[np.ix_(structure.independent_rows[rows], closure.passive[columns])]
         )[0]
         for rows, columns in structure.blocks
     }
@@ -187,7 +187,7 @@ def orientations(machine):
 
 def copy_bundled(name, folder):
     """A copy of a bundled machine and its URDFs."""
-    path = bundled()[name]
+    path = bundled_machines()[name]
     shutil.copytree(path.parent / "urdf" / name, folder / "urdf" / name)
     return shutil.copy(path, folder / path.name)
 
@@ -225,6 +225,6 @@ def test_a_geared_rotor_is_no_matter_of_assembly(tmp_path):
         assert spin == pytest.approx(50 * crank) and abs(spin) > 32
 
 
-@pytest.mark.parametrize("name", bundled())
+@pytest.mark.parametrize("name", bundled_machines())
 def test_bundled_machines_are_what_they_say(name):
-    assert crane.load(name).closure.sought is None
+    assert crane.load(name).closure.home_search is None

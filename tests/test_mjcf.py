@@ -14,7 +14,7 @@ from linkages import WRITERS, assert_same, postures, rewritten
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.formats.check import check
-from crane.formats.mjcf.left_out import touching
+from crane.formats.mjcf.unsupported_features import colliding_geoms
 
 TREE = """<mujoco model="tree">
   <compiler angle="degree" eulerseq="zyx"/>
@@ -307,7 +307,7 @@ def test_shapes_that_can_touch_are_those_that_mujoco_finds(seed):
     mujoco.mj_forward(model, data)
     found = {int(geom) for contact in data.contact for geom in contact.geom}
     off = {"FILTERPARENT"} if root.find("option") is not None else set()
-    assert set(touching(model, off)) == found
+    assert set(colliding_geoms(model, off)) == found
 
 
 MANY = [  # instead of the first body of a file, and what is told
@@ -419,11 +419,11 @@ def test_a_key_far_from_closed_is_refused_and_taken_where_that_is_asked_for(tmp_
         crane.load(path)
     anyway = {"nearest_assembly": True}
     report = check(path, arguments=anyway)
-    (sought,) = [one.what for one in report.findings if "home was sought" in one.what]
+    (sought,) = [one.message for one in report.findings if "home was sought" in one.message]
     assert sought.endswith("keep it with crane convert, then crane check --write-home")
-    assert report.next.startswith("crane convert ") and not report.errors
+    assert report.next_command.startswith("crane convert ") and not report.errors
     machine = crane.load(path, arguments=anyway)
-    again = crane.load(machine.reference, arguments=machine.arguments)
+    again = crane.load(machine.load_name, arguments=machine.arguments)
     assert np.abs(again.home - machine.home).max() == 0
 
 

@@ -28,7 +28,7 @@ def test_a_path_of_the_tip_with_its_inclination(tmp_path):
     motion = crane.read_path(machine, path)
     kinematics = crane.Kinematics(machine)
     q_a, v_a, _ = motion([0.0, 2.0, 5.0])
-    places = kinematics.positions(machine.closure.solve(q_a))
+    places = kinematics.positions_at_configurations(machine.closure.solve(q_a))
     np.testing.assert_allclose(places, [[8, 0, 0.3], [7, 0.5, 0.3], [6, 0, 0.3]], atol=1e-9)
     angles = [float(np.rad2deg(kinematics.inclination(q))) for q in q_a]
     np.testing.assert_allclose(angles, [-70, -80, -70], atol=1e-8)

@@ -15,7 +15,7 @@ import yaml
 
 import crane
 from crane.common.errors import CraneError
-from crane.description.sources import bundled
+from crane.description.machine_lookup import bundled_machines
 
 VALUES = ("two", [1, 2], {"strange": 1}, True, None, -1, 0, 1e30, "", [])
 # a posture, a link or a pin that was changed, and where the loops do not close any more
@@ -66,17 +66,17 @@ def judge(folder, name, data, way, value):
     outer = {where[way[:i]][0] for i in range(1, len(way))} | {1}
     words = {key.removesuffix("s") for key in way if isinstance(key, str)} | {str(value)}
     for found in report.findings:
-        if not found.error or any(text in found.what for text in _OPEN):
+        if not found.is_error or any(text in found.message for text in _OPEN):
             continue
         here = found.file == path.name and (first <= found.line <= last or found.line in outer)
-        if not here and not any(word in found.what for word in words if word):
+        if not here and not any(word in found.message for word in words if word):
             return f"{way} = {value!r}: {found}"
     return None
 
 
 def cases(name, count, seed):
     """Ways and values of a machine file, all of them or some."""
-    data = yaml.safe_load(Path(bundled()[name]).read_text())
+    data = yaml.safe_load(Path(bundled_machines()[name]).read_text())
     ways = [way for way, *_ in places(yaml.compose(yaml.dump(data, Dumper=_Plain)))]
     kept = [x for x in VALUES if x is not None or "extends" not in data]
     every = [(way, value) for way in ways for value in kept]
@@ -85,7 +85,7 @@ def cases(name, count, seed):
 
 
 def run(tmp_path, name, count, seed=0):
-    source = Path(bundled()[name]).parent
+    source = Path(bundled_machines()[name]).parent
     (tmp_path / "urdf").symlink_to(source / "urdf")
     data, chosen = cases(name, count, seed)
     if "extends" in data and not (tmp_path / data["extends"]).exists():
@@ -94,13 +94,13 @@ def run(tmp_path, name, count, seed=0):
     assert not wrong, "\n".join(wrong[:40])
 
 
-@pytest.mark.parametrize("name", sorted(bundled()))
+@pytest.mark.parametrize("name", sorted(bundled_machines()))
 def test_some_mutations(tmp_path, name):
     run(tmp_path, name, 12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [60, pytest.param(None, marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", sorted(bundled()))
+@pytest.mark.parametrize("name", sorted(bundled_machines()))
 def test_mutations(tmp_path, name, count):
     run(tmp_path, name, count, seed=1)

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import crane
-from crane.common import shown, waiting
-from crane.common.waiting import SHARES, telling
-from crane.identification.calibration.result import Channel as Sensed
-from crane.identification.calibration.result import Fitted
-from crane.simulation.replays import Channel
-from crane.studies.sway import SwayRow
-from crane.view import cells, notebook
+from crane.common import one_line_repr, progress
+from crane.common.progress import PROGRESS, progress_reporter
+from crane.identification.calibration.calibration_result import CalibrationChannel as Sensed
+from crane.identification.calibration.calibration_result import FittedParameter
+from crane.simulation.recording_replay import ChannelComparison
+from crane.studies.residual_sway_study import SwayRow
+from crane.view import notebook, notebook_progress
 
 SOURCE = Path(__file__).parents[1]
 EVIL = "<script>alert(1)</script> \"&' </iframe> ![i](http://a.b/c.png) --> <!--"
@@ -110,7 +110,7 @@ def test_a_recording_has_its_page_its_plots_and_its_numbers(mini, run):
     assert len(html) < 3_000_000
     (inner,) = found.inner
     assert inner.startswith("<!DOCTYPE html>") and inner.rstrip().endswith("</html>")
-    assert inner == notebook.page(mini, run, share=notebook._SHARE)
+    assert inner == notebook.report_html(mini, run, frame_share=notebook._FRAME_SHARE)
     assert 'sandbox="allow-scripts"' in html and "allow-same-origin" not in html
     assert len(found.addresses) == 1 and "-90.00 to 0.31 deg" in found.text
 
@@ -125,7 +125,7 @@ def stretched(run, count, **changes):
 
 def test_long_recordings_are_no_longer_pages(mini, run):
     sizes = [
-        len(notebook.page(mini, stretched(run, count), share=notebook._SHARE))
+        len(notebook.report_html(mini, stretched(run, count), frame_share=notebook._FRAME_SHARE))
         for count in (12_000, 120_000)
     ]
     assert sizes[1] < 1.05 * sizes[0] < 3_500_000
@@ -156,7 +156,7 @@ def test_names_stay_text(mini, run):
     )  # fmt: skip
     assert EVIL in looked_at(study).text
     values = np.array([0.0, 1.0])
-    assert "&lt;script" in crane.Comparison(values, (Channel(EVIL, "m", values, values),)
+    assert "&lt;script" in crane.Comparison(values, (ChannelComparison(EVIL, "m", values, values),)
                                             )._repr_html_()  # fmt: skip
 
 
@@ -168,7 +168,9 @@ def test_a_comparison_of_nothing_says_so():
 
 def test_markdown_makes_tables_and_no_addresses():
     text = f"# title\n\nof `a_b` and {EVIL} <http://x.y>\n\n- one\n\n| a | b |\n| --- | ---: |\n"
-    found = Parsed("".join(notebook._blocks(text + "| **x** | 2 |\n", notebook._markdown)))
+    found = Parsed(
+        "".join(notebook._split_blocks(text + "| **x** | 2 |\n", notebook._render_markdown))
+    )
     assert not found.addresses and "script" not in found.tags and "title" not in found.text
     assert {"code", "li", "table", "strong"} <= set(found.tags) and EVIL in found.text
 
@@ -177,7 +179,7 @@ def results(mini, run):
     """Of each class that is shown, one that takes little."""
     patu, digger = crane.load("patu655"), crane.load("excavator")
     swing = crane.ValvePD(patu, crane.task_trajectory(patu, "swing"))
-    account = crane.power_account(patu, crane.simulate(patu, swing, duration=0.2))
+    account = crane.power_balance(patu, crane.simulate(patu, swing, duration=0.2))
     values = run.time, run.q[:, 0]
     by = ["link7.mass"]
     lift = crane.PI(mini, crane.task_trajectory(mini, "lift"))
@@ -192,11 +194,11 @@ def results(mini, run):
     yield account
     yield crane.PowerComparison({"one": account, "two": account})
     yield crane.linearize(patu)
-    yield crane.sensitivities(mini, lift, by=by, duration=0.1)
-    yield crane.gradient(mini, lift, duration=0.1, of=np.ones((101, 3)), by=by)
-    yield crane.Comparison(values[0], (Channel("q1", "rad", values[1], values[1]),))
+    yield crane.sensitivities(mini, lift, parameters=by, duration=0.1)
+    yield crane.gradient(mini, lift, duration=0.1, functional=np.ones((101, 3)), parameters=by)
+    yield crane.Comparison(values[0], (ChannelComparison("q1", "rad", values[1], values[1]),))
     channel = (run.time < 7.0, values[1], 1.1 * values[1], values[1])
-    fitted = Fitted("link7.mass", 0.2, 0.21, 0.01, False, False, "kg")
+    fitted = FittedParameter("link7.mass", 0.2, 0.21, 0.01, False, False, "kg")
     sensor = Sensed("a.csv", "q1", "rad", run.time, *channel)
     yield crane.Calibration(mini, (fitted,), (sensor,), {by[0]: 0.21}, (), 7)
     yield crane.excite(mini, starts=1, harmonics=2, period=4.0)
@@ -234,28 +236,54 @@ def instances(mini, run):
     phase = crane.Phase("out", {"X_ext": 0.6}, {"X_ext": 0.3}, 5.0)
     soil = next(iter(crane.SOILS.values()))
     joint = crane.SwayStudy("swing", (SwayRow(0.0, "flat", 0.0, 1.0, 1.0, 0.01, 0.5),))
-    fitted = Fitted("link7.mass", 0.2, 0.21, 0.01, False, False, "kg")
+    fitted = FittedParameter("link7.mass", 0.2, 0.21, 0.01, False, False, "kg")
     return [
-        mini, mini.closure, run, lift, swing, soil, joint, pd, phase,
+        mini,
+        mini.closure,
+        run,
+        lift,
+        swing,
+        soil,
+        joint,
+        pd,
+        phase,
         crane.Batch(zeros, *(np.zeros((3, 2, n)) for n in (3, 3, 3, 4)), {}, {}),
-        crane.Buckling(patu), crane.Calibration(mini, (fitted,), (), {}, (), 1),
-        crane.ComputedTorque(mini, lift), crane.Contact("tip"),
-        crane.Cutting("tip", soil, 1.0, 0.5, [0, 0, 1], [1, 0, 0]), crane.Dynamics(mini),
-        crane.EndStop("x", 1e6), crane.ExternalForce("tip"), crane.ForceElement("x", 10.0),
-        crane.Friction(1.0), crane.GasSpring("x", 1e-3, 1e6, 1e-4), crane.Ground(),
-        crane.Kinematics(mini), crane.Law(mini), crane.PDGains(1.0, 2.0), crane.PI(mini, lift),
-        crane.PIGains(1.0, 2.0), crane.Payload("tip", 10.0),
-        crane.PhasedWrench("tip", [[0, 0, 1.0]] * 2, phases=[0, 1]), crane.Phases(patu, [phase]),
-        crane.Pushing("tip", lambda t, *state: np.zeros(6)), crane.Reactions(mini),
-        crane.Rope(("a", "b"), 1.0, 1e5), crane.Rule("own", "mine"),
-        crane.Sampled(lambda t, *state: np.zeros(4), patu), crane.Sensor(),
-        crane.Signals(patu, [0, 1], {x: zeros for x in patu.hydraulics.joints}),
-        crane.Sway(grapple), crane.TipVelocity(patu, lambda t: np.zeros(3)),
+        crane.Buckling(patu),
+        crane.Calibration(mini, (fitted,), (), {}, (), 1),
+        crane.ComputedTorque(mini, lift),
+        crane.Contact("tip"),
+        crane.SoilCutting("tip", soil, 1.0, 0.5, [0, 0, 1], [1, 0, 0]),
+        crane.Dynamics(mini),
+        crane.EndStop("x", 1e6),
+        crane.ExternalForce("tip"),
+        crane.ForceElement("x", 10.0),
+        crane.Friction(1.0),
+        crane.GasSpring("x", 1e-3, 1e6, 1e-4),
+        crane.Ground(),
+        crane.Kinematics(mini),
+        crane.ControlLaw(mini),
+        crane.PDGains(1.0, 2.0),
+        crane.PI(mini, lift),
+        crane.PIGains(1.0, 2.0),
+        crane.Payload("tip", 10.0),
+        crane.PhasedWrench("tip", [[0, 0, 1.0]] * 2, phases=[0, 1]),
+        crane.LeverPhases(patu, [phase]),
+        crane.WrenchFunction("tip", lambda t, *state: np.zeros(6)),
+        crane.Reactions(mini),
+        crane.Rope(("a", "b"), 1.0, 1e5),
+        crane.Rule("own", "mine"),
+        crane.SampledCommand(lambda t, *state: np.zeros(4), patu),
+        crane.Sensor(),
+        crane.ValveSignals(patu, [0, 1], {x: zeros for x in patu.hydraulics.joints}),
+        crane.Sway(grapple),
+        crane.TipVelocity(patu, lambda t: np.zeros(3)),
         crane.Transmission(mini),
         crane.Torques("X", "q", 1e4, 0.1, 5.0, 300.0, 1.0, 1.5e4, 1e4),
-        crane.ValveDrive(patu, pd), crane.ValveFeedforward(patu, swing),
-        crane.via_attitudes([0, 1], [[0, 0, 0], [0, 0, 1.0]]), crane.Wrench("tip", (0, 0, 1.0)),
-    ]  # fmt: skip
+        crane.ValveDrive(patu, pd),
+        crane.ValveFeedforward(patu, swing),
+        crane.via_attitudes([0, 1], [[0, 0, 0], [0, 0, 1.0]]),
+        crane.Wrench("tip", (0, 0, 1.0)),
+    ]
 
 
 def test_every_class_is_shown_in_one_line(mini, run):
@@ -274,7 +302,7 @@ def test_every_class_is_shown_in_one_line(mini, run):
 # Those that take seconds: `results`, and tests of what makes them.
 RESULTS = {
     "Breakout", "Capacity", "Comparison", "Design", "Excitation", "Gradient", "Identification",
-    "LinearModel", "PowerAccount", "PowerComparison", "Sensitivities", "SignalExcitation",
+    "LinearModel", "PowerBalance", "PowerComparison", "Sensitivities", "SignalExcitation",
     "Study", "ToolForce", "WorkingRange", "Workspace",
 }  # fmt: skip
 
@@ -287,38 +315,38 @@ def test_lines_say_what_there_is(mini, run):
     assert repr(run).startswith("Recording of mini_forwarder: loading, 10 s in 10001 samples: 30 ")
     long = dataclasses.replace(mini, name=1000 * "a\nb")
     assert len(repr(long)) == 200 and "\n" not in repr(long) and repr(long).endswith("\u2026")
-    assert shown.shortened("a\nb") == "a b"
+    assert one_line_repr.shorten_to_line("a\nb") == "a b"
 
 
 @pytest.fixture
 def heard(monkeypatch):
     """Shares that somebody listens to."""
-    monkeypatch.setattr(SHARES, "listening", True)
-    yield SHARES
-    SHARES.forget()
+    monkeypatch.setattr(PROGRESS, "is_enabled", True)
+    yield PROGRESS
+    PROGRESS.reset()
 
 
 def test_only_the_outermost_call_tells_its_share(heard):
     def outer():
-        tell = telling(None)
+        tell = progress_reporter(None)
         tell(0.25)
         inner()
         assert heard.of(sys._getframe()) == 0.25
         given = [].append
-        assert telling(given) is given
+        assert progress_reporter(given) is given
 
     def inner():
-        assert telling(None) is None
+        assert progress_reporter(None) is None
         assert heard.of(sys._getframe()) == 0.25
 
     outer()
     assert heard.of(sys._getframe()) is None  # it has returned
-    again = telling(None)
+    again = progress_reporter(None)
     assert again is not None and heard.of(sys._getframe()) == 0.0
 
 
 def test_nobody_is_told_where_nobody_listens():
-    assert not SHARES.listening and telling(None) is None
+    assert not PROGRESS.is_enabled and progress_reporter(None) is None
 
 
 def test_calls_tell_shares_to_who_listens(heard, mini, monkeypatch):
@@ -345,13 +373,13 @@ def test_a_cell_that_takes_long_has_a_line_that_goes(monkeypatch, heard):
     shell = SimpleNamespace(events=SimpleNamespace(register=events.__setitem__))
     monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(
         display=lambda line, display_id: handle.update(line) or handle))  # fmt: skip
-    monkeypatch.setattr(waiting, "AFTER", 0.02)
-    monkeypatch.setattr(waiting, "EVERY", 0.02)
-    cells.watch_cells(shell)
+    monkeypatch.setattr(progress, "REPORT_DELAY", 0.02)
+    monkeypatch.setattr(progress, "REPORT_INTERVAL", 0.02)
+    notebook_progress.show_cell_progress(shell)
     busy = compile(
         "tell = telling(None)\ntell(0.5)\nwhile len(lines) < 3: sleep(0.01)", "x", "exec"
     )
-    names = {"__name__": "crane.studies.x", "telling": telling, "lines": handle.lines}
+    names = {"__name__": "crane.studies.x", "telling": progress_reporter, "lines": handle.lines}
     exec(busy, names | {"sleep": time.sleep})
     events["post_run_cell"](None)
     assert handle.lines[-1] == "" and len(handle.lines) > 3

@@ -10,10 +10,10 @@ from hydraulic_rig import COMPENSATED, rig
 
 import crane
 from crane.common.errors import CraneWarning
-from crane.description.changes import parameters
-from crane.description.number_units import number_unit
-from crane.formats.loading import Variants
-from crane.formats.machine_file.text import yaml_text
+from crane.description.parameter_changes import parameters
+from crane.description.parameter_units import parameter_unit
+from crane.formats.machine_file.yaml_text import format_yaml
+from crane.formats.machine_loading import MachineVariants
 
 WORDS = "fitted ±3e-9, 95 % (was -- 1: 2)\n# no"
 SAID = "fitted ±3e-9, 95 % (was -- 1: 2) # no"
@@ -27,7 +27,7 @@ def line_of(file, words):
 
 def numbers(machine):
     """All that a machine says in numbers, its tree's by links and joints that a file has."""
-    return parameters(Variants(machine).spec)
+    return parameters(MachineVariants(machine).spec)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_a_machine_with_notes_loads_as_it_was(crane_file, tmp_path):
         for what, value in (("zero", 0.0), ("scale", 1.0), ("delay", 0.0), ("noise", 0.0))
     }
     assert (again.home == plain.home).all()
-    for name, value in machine.changes.items():
+    for name, value in machine.parameter_changes.items():
         assert name == "payload.mass" or numbers(again)[name] == value, name
 
 
@@ -120,8 +120,8 @@ def test_text_with_notes_reads_as_without():
             "list": [{"k": 1.0, "deep": {"z": 0.1}}]}  # fmt: skip
     notes = {("a", "x y"): "one", ("a", "it's: #"): "two\nlines", ("list", 0, "k"): "#3",
              ("list", 0, "deep", "z"): "ß"}  # fmt: skip
-    text = yaml_text(data, notes)
-    assert yaml.safe_load(text) == data == yaml.safe_load(yaml_text(data))
+    text = format_yaml(data, notes)
+    assert yaml.safe_load(text) == data == yaml.safe_load(format_yaml(data))
     assert "x y: 1.0  # one\n" in text and "# two lines\n" in text and "k: 1.0  # #3\n" in text
 
 
@@ -140,4 +140,4 @@ def test_text_with_notes_reads_as_without():
     ],
 )  # fmt: skip
 def test_numbers_have_units(name, unit):
-    assert number_unit(crane.load("patu655").tree, name) == unit
+    assert parameter_unit(crane.load("patu655").tree, name) == unit

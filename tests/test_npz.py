@@ -9,7 +9,7 @@ import pytest
 
 from crane.common.errors import RecordingError
 from crane.recordings import npz
-from crane.recordings.timeseries import read
+from crane.recordings.timeseries import read_table
 
 TIME = np.arange(5) / 100
 
@@ -44,7 +44,7 @@ def test_columns_of_any_number_type(method, tmp_path):
         tmp_path, method, a=np.arange(5, dtype=np.int16), b=np.array([True, False, True, 0, 1]),
         c=np.linspace(0, 1, 5).astype(">f4"), d=np.arange(5, dtype=np.uint64),
     )  # fmt: skip
-    table = read(path)
+    table = read_table(path)
     assert list(table.units) == ["time", "a", "b", "c", "d"]
     expected = np.column_stack(
         [TIME, np.arange(5), [1, 0, 1, 0, 1], np.linspace(0, 1, 5).astype("f4"), np.arange(5)]
@@ -53,9 +53,9 @@ def test_columns_of_any_number_type(method, tmp_path):
 
 
 def test_long_columns_are_read_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr(npz, "_AT_ONCE", 7)
+    monkeypatch.setattr(npz, "_BLOCK_NUMBERS", 7)
     time = np.sqrt(np.arange(100))
-    table = read(written(tmp_path, time=time, a=time[::-1]))
+    table = read_table(written(tmp_path, time=time, a=time[::-1]))
     np.testing.assert_array_equal(table.values, np.column_stack([time, time[::-1]]))
 
 
@@ -94,7 +94,7 @@ def test_what_is_no_recording(arrays, message, method, tmp_path):
         path = tmp_path / "run.npz"
         np.savez(path, a=TIME)
     with pytest.raises(RecordingError) as caught:
-        read(path)
+        read_table(path)
     line = str(caught.value)
     assert line.startswith(f"{path}: ") and line.isprintable() and len(line) < 300
     assert message in line
@@ -117,24 +117,24 @@ def test_encrypted_and_damaged_archives(tmp_path):
         changed(path, data.find(b"PK\x03\x04") + offsets[0], value)
         changed(path, data.find(b"PK\x01\x02") + offsets[1], value)
         with pytest.raises(RecordingError, match=message):
-            read(path)
+            read_table(path)
     path = written(tmp_path, zipfile.ZIP_DEFLATED, a=np.random.default_rng(1).normal(size=5))
     data = path.read_bytes()
     changed(path, data.find(b"NUMPY", 200) - 4, bytes(20))
     with pytest.raises(RecordingError, match="run.npz: .*(is no npz file|is cut short)"):
-        read(path)
+        read_table(path)
     for length in (0, 30, len(data) // 2, len(data) - 5):
         path.write_bytes(data[:length])
         with pytest.raises(RecordingError, match="is no npz file of arrays"):
-            read(path)
+            read_table(path)
 
 
 def test_a_small_file_of_many_numbers(tmp_path, monkeypatch):
     """Zeros take no space in a zip: what they would take in memory is what counts."""
-    monkeypatch.setattr(npz, "MOST", 1000)
+    monkeypatch.setattr(npz, "MAX_NUMBERS", 1000)
     path = written(tmp_path, zipfile.ZIP_DEFLATED, time=np.arange(600.0), a=np.zeros(600))
     with pytest.raises(RecordingError, match="600 samples of 2 columns, give at most 1000 num"):
-        read(path)
-    monkeypatch.setattr(npz, "MOST_COLUMNS", 1)
+        read_table(path)
+    monkeypatch.setattr(npz, "MAX_COLUMNS", 1)
     with pytest.raises(RecordingError, match="holds 2 arrays, give at most 1"):
-        read(path)
+        read_table(path)

@@ -5,12 +5,25 @@ import pytest
 
 import crane
 from crane.cli.shared import by_joint
-from crane.common.errors import CraneError, InputError, RecordingError, at, one_line
-from crane.common.samples import FARTHEST, LARGEST, SMALLEST, as_count, as_number, as_seed
-from crane.common.shown import Brief
-from crane.common.units import number, quantity, reading
-from crane.recordings.summary import subject, title
-from crane.studies.run import Job, variant
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    RecordingError,
+    format_one_line,
+    prefix_location,
+)
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import (
+    MAX_COORDINATE,
+    MAX_QUANTITY,
+    MIN_QUANTITY,
+    as_count,
+    as_number,
+    as_seed,
+)
+from crane.common.units import display_unit, format_number, format_quantity
+from crane.recordings.recording_summary import recorded_machine_name, result_title
+from crane.studies.variant_study import StudyJob, measure_variant
 
 
 @pytest.mark.parametrize(
@@ -35,10 +48,10 @@ def test_numbers_that_no_machine_has(value, above, told):
 
 
 def test_numbers_within_bounds_are_kept():
-    for value in (0.0, -LARGEST, LARGEST, SMALLEST, 1e-300):
+    for value in (0.0, -MAX_QUANTITY, MAX_QUANTITY, MIN_QUANTITY, 1e-300):
         assert as_number(value, "x", "") == value
-    assert as_number(SMALLEST, "x", "", above=0) == SMALLEST
-    assert np.isfinite(LARGEST**2) and SMALLEST**2 > 0
+    assert as_number(MIN_QUANTITY, "x", "", greater_than=0) == MIN_QUANTITY
+    assert np.isfinite(MAX_QUANTITY**2) and MIN_QUANTITY**2 > 0
     assert as_count(np.int64(3), "n") == 3 and as_seed(0) == 0
 
 
@@ -63,7 +76,7 @@ def test_joints_by_name():
 
 
 @pytest.mark.parametrize("joint", ["s", "theta", "phi"])
-@pytest.mark.parametrize("value", [1e308, -1e308, 2 * FARTHEST])
+@pytest.mark.parametrize("value", [1e308, -1e308, 2 * MAX_COORDINATE])
 def test_locks_far_from_anything(slider_crank, joint, value):
     with pytest.raises(InputError, match=rf"lock '{joint}' at is .* m or rad, give a number from"):
         crane.load(slider_crank.path, lock={joint: value})
@@ -103,37 +116,47 @@ def test_work_beyond_all_bounds_is_refused_before_it_begins(slider_crank):
     ],
 )
 def test_quantities_are_read_without_exponents(value, unit, text):
-    assert quantity(value, unit, 4) == text
+    assert format_quantity(value, unit, 4) == text
 
 
 def test_units_are_chosen_by_the_peak():
-    assert reading("N", -2e3) == ("kN", 1e-3) and reading("N", 900.0) == ("N", 1.0)
-    assert reading("m", 0.3) == ("mm", 1e3) and reading("V", 5.0) == ("V", 1.0)
-    assert number(2.0) == "2" and number(0.0) == "0" and number(100.0) == "100"
+    assert display_unit("N", -2e3) == ("kN", 1e-3) and display_unit("N", 900.0) == ("N", 1.0)
+    assert display_unit("m", 0.3) == ("mm", 1e3) and display_unit("V", 5.0) == ("V", 1.0)
+    assert (
+        format_number(2.0) == "2" and format_number(0.0) == "0" and format_number(100.0) == "100"
+    )
 
 
 def test_lines_can_be_read():
-    assert one_line("a\nb\x1b[31m\udcff") == "a b [31m "
-    assert len(one_line("x" * 100_000)) < 1000
+    assert format_one_line("a\nb\x1b[31m\udcff") == "a b [31m "
+    assert len(format_one_line("x" * 100_000)) < 1000
     assert len(str(CraneError("x y " * 100_000))) < 4000
-    assert one_line("short and " + "y" * 900) == "short and " + "y" * 900
+    assert format_one_line("short and " + "y" * 900) == "short and " + "y" * 900
 
 
 def test_a_place_is_told_once():
-    assert at("run.csv", RecordingError("line 3: no number")) == "run.csv: line 3: no number"
-    assert at("run.csv", RecordingError("run.csv: is empty")) == "run.csv: is empty"
+    assert (
+        prefix_location("run.csv", RecordingError("line 3: no number"))
+        == "run.csv: line 3: no number"
+    )
+    assert prefix_location("run.csv", RecordingError("run.csv: is empty")) == "run.csv: is empty"
 
 
 def test_a_task_that_fails_in_a_study_is_named_once():
     """Its row says why once, not that the task's task cannot be done."""
-    found, reason = variant(Job("patu655", {"X_lift.upper": 0.2}, {}, ("reach",), False))
+    found, reason = measure_variant(
+        StudyJob("patu655", {"X_lift.upper": 0.2}, {}, ("reach",), False)
+    )
     assert not found and reason.count("task 'reach'") == 1 and "X_lift" in reason
 
 
 def test_titles():
     run = crane.Recording([0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"})
-    assert title("patu655", "swing") == "patu655: swing" and title("patu655") == "patu655"
-    assert subject(run) == ""
+    assert (
+        result_title("patu655", "swing") == "patu655: swing"
+        and result_title("patu655") == "patu655"
+    )
+    assert recorded_machine_name(run) == ""
     for machine, name in (
         ("patu655", "patu655"),
         ('patu655 with {"changes": {"payload.mass": 200.5}, "lock": {"slew": 0.0}}', "patu655"),
@@ -142,7 +165,7 @@ def test_titles():
         named = crane.Recording(
             [0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"}, machine=machine
         )
-        assert subject(named) == name
+        assert recorded_machine_name(named) == name
 
 
 def test_what_a_notebook_shows_is_short(mini):
@@ -164,7 +187,7 @@ def test_what_a_notebook_shows_is_short(mini):
 
 
 def test_brief_names_shapes():
-    class Thing(Brief):
+    class Thing(OneLineRepr):
         def __init__(self):
             self.name, self.values, self.parts, self.other = (
                 "a",

@@ -47,15 +47,15 @@ def test_ends_that_nothing_joins(tmp_path):
     )
     assert line.isprintable()
     report = check(tmp_path / "bars.urdf")
-    assert report.status == 1 and line.removeprefix("bars.urdf:6: ") == report.findings[0].what
+    assert report.status == 1 and line.removeprefix("bars.urdf:6: ") == report.findings[0].message
     # what it says is what closes it
-    assert report.proposed == [
+    assert report.proposed_loop_lines == [
         "loops:  # proposed, nothing closes them yet",
         "  - {name: foot, type: revolute, predecessor: closing_foot_1, successor: closing_foot_2, "
         "axis: [0, 0, 1]}  # 300 mm apart at home",
     ]
-    assert report.next == f"crane add loops {tmp_path / 'bars.urdf'}"
-    loops = yaml.safe_load("\n".join(report.proposed))["loops"]
+    assert report.next_command == f"crane add loops {tmp_path / 'bars.urdf'}"
+    loops = yaml.safe_load("\n".join(report.proposed_loop_lines))["loops"]
     text = {
         "name": "bars", "chains": [{"name": "bars", "urdf": "bars.urdf"}], "loops": loops,
         "active": ["hip_l", "hip_r"],
@@ -113,7 +113,7 @@ def test_robots_without_the_file_that_closes_them(name, tmp_path):
     count = len(set(re.findall(r'"(closedloop\d+)_[AB]"', text)))
 
     def told(path):
-        return [x.what for x in check(path).findings if "nothing closes" in x.what]
+        return [x.message for x in check(path).findings if "nothing closes" in x.message]
 
     (line,) = told(tmp_path / "robot.urdf")
     assert f"looks like {count} loops" in line

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from killed import killed_at
 
-import crane.common.exchange
+import crane.common.folder_exchange
+from crane.common.atomic_output import check_folder_is_writable, replace_file, replace_folder
 from crane.common.errors import OutputError
-from crane.common.output import check_folder, replacing, staging
 
 
 def test_file_appears_whole_at_the_end(tmp_path):
     path = tmp_path / "result.txt"
     path.write_text("old")
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text("new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
@@ -26,7 +26,7 @@ def test_file_appears_whole_at_the_end(tmp_path):
 def test_failure_leaves_what_was_there(tmp_path):
     path = tmp_path / "result.txt"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError), replacing(path) as part:
+    with pytest.raises(ZeroDivisionError), replace_file(path) as part:
         part.write_text("half")
         1 / 0  # noqa: B018
     assert path.read_text() == "old"
@@ -34,7 +34,7 @@ def test_failure_leaves_what_was_there(tmp_path):
 
 
 def test_permissions_follow_the_umask(tmp_path):
-    with replacing(tmp_path / "result.txt") as part:
+    with replace_file(tmp_path / "result.txt") as part:
         part.write_text("new")
     (tmp_path / "plain.txt").write_text("new")
     modes = {path.stat().st_mode for path in tmp_path.iterdir()}
@@ -52,17 +52,17 @@ def test_permissions_follow_the_umask(tmp_path):
 def test_bad_places(tmp_path, name, message):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match=message), replacing(tmp_path / name) as part:
+    with pytest.raises(OutputError, match=message), replace_file(tmp_path / name) as part:
         part.write_text("x")
 
 
 def test_folders_are_made_as_soon_as_there_is_something_to_put_there(tmp_path):
     path = tmp_path / "a" / "b" / "result.txt"
-    with pytest.raises(ZeroDivisionError), replacing(path) as part:
+    with pytest.raises(ZeroDivisionError), replace_file(path) as part:
         part.write_text("half")
         1 / 0  # noqa: B018
     assert os.listdir(tmp_path) == []
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text("new")
         assert part.parent == tmp_path
     assert path.read_text() == "new" and len(list(tmp_path.rglob("*"))) == 3
@@ -71,7 +71,7 @@ def test_folders_are_made_as_soon_as_there_is_something_to_put_there(tmp_path):
 def test_operating_system_error_is_told(tmp_path):
     with (
         pytest.raises(OutputError, match="No space left on device"),
-        replacing(tmp_path / "result.txt"),
+        replace_file(tmp_path / "result.txt"),
     ):
         raise OSError(28, "No space left on device")
 
@@ -81,7 +81,7 @@ def test_what_a_killed_process_left_of_a_file_goes_with_the_next(tmp_path):
     path.write_text("old")
 
     def write():
-        with replacing(path) as part:
+        with replace_file(path) as part:
             part.write_text("new" * 1000)
 
     call = 0
@@ -95,9 +95,9 @@ def test_what_a_killed_process_left_of_a_file_goes_with_the_next(tmp_path):
 
 
 def test_what_a_living_process_writes_stays(tmp_path):
-    with replacing(tmp_path / "result.txt") as part:
+    with replace_file(tmp_path / "result.txt") as part:
         part.write_text("first")
-        with replacing(tmp_path / "result.txt") as other:
+        with replace_file(tmp_path / "result.txt") as other:
             other.write_text("second")
         assert part.read_text() == "first"
     assert (tmp_path / "result.txt").read_text() == "first"
@@ -127,7 +127,7 @@ def tree(folder):
 
 
 def replace_all(target):
-    with staging(target, stale=["inner/*"]) as part:
+    with replace_folder(target, stale=["inner/*"]) as part:
         fill(part, {name: text for name, text in NEW.items() if text != "my own" and name != "my"})
 
 
@@ -135,7 +135,9 @@ def replace_all(target):
 def kernel(request, monkeypatch):
     """As it is, and one that exchanges no folders."""
     if request.param == "two renames":
-        monkeypatch.setattr(crane.common.exchange, "_at_once", lambda *paths: False)
+        monkeypatch.setattr(
+            crane.common.folder_exchange, "_exchange_atomically", lambda *paths: False
+        )
     return request.param
 
 
@@ -147,7 +149,7 @@ def test_a_folder_is_wholly_old_or_wholly_new_wherever_a_run_is_killed(tmp_path,
             seen.add("aside")
         else:
             assert tree(target) in (OLD, NEW), call
-        check_folder(target)  # as each command does at first
+        check_folder_is_writable(target)  # as each command does at first
         found = tree(target)
         assert found in (OLD, NEW), call
         seen.add("new" if found == NEW else "old")
@@ -201,10 +203,10 @@ def test_of_two_runs_into_a_new_folder_one_is_told(tmp_path, monkeypatch, there)
         monkeypatch.chdir(target)
     with (
         pytest.raises(OutputError, match=rf"^{target}: is there now, another program has filled"),
-        staging(target, force=False) as slower,
+        replace_folder(target, overwrite=False) as slower,
     ):
         (slower / "one").write_text("slower")
-        with staging(target, force=False) as faster:
+        with replace_folder(target, overwrite=False) as faster:
             (faster / "two").write_text("faster")
     assert tree(target) == {"two": "faster"}
     assert os.listdir(tmp_path) == ["run"]
@@ -213,9 +215,9 @@ def test_of_two_runs_into_a_new_folder_one_is_told(tmp_path, monkeypatch, there)
 def test_of_two_runs_that_replace_a_folder_the_last_is_there_whole(tmp_path, kernel):
     target = tmp_path / "run"
     for _ in range(2):
-        with staging(target, stale=["one", "two"]) as slower:
+        with replace_folder(target, stale=["one", "two"]) as slower:
             (slower / "one").write_text("slower")
-            with staging(target, stale=["one", "two"]) as faster:
+            with replace_folder(target, stale=["one", "two"]) as faster:
                 (faster / "two").write_text("faster")
         assert tree(target) == {"one": "slower"}
         assert os.listdir(tmp_path) == ["run"]

@@ -8,8 +8,8 @@ import pytest
 from typed import typed
 
 from crane import simulate
-from crane.recordings.overlay import differences
 from crane.recordings.recording import Recording
+from crane.recordings.recording_differences import joint_differences
 
 DATA = Path(__file__).parent / "data"
 
@@ -29,13 +29,13 @@ def test_the_largest_difference_is_found_in_either_run(start, bumps):
     first = moved(np.arange(11) / 10, bumps[0])
     times = [0.0, 0.59, 0.6, 0.61, 2.0] if any(bumps[1]) else [0.0, 2.0]
     second = moved(times, bumps[1], start)
-    q1, x1 = differences(first, second)
+    q1, x1 = joint_differences(first, second)
     assert (q1.joint, q1.unit, x1.joint, x1.unit) == ("q1", "rad", "X1", "m")
-    assert (q1.most, q1.time) == pytest.approx((0.02, 0.6), abs=1e-12)
-    assert (x1.most, x1.time) == pytest.approx((0.003, 0.6), abs=1e-12)
-    assert x1.words == ("3 mm", "0.6 s")
-    same = differences(first, first)
-    assert [one.most for one in same] == [0.0, 0.0]
+    assert (q1.largest, q1.time) == pytest.approx((0.02, 0.6), abs=1e-12)
+    assert (x1.largest, x1.time) == pytest.approx((0.003, 0.6), abs=1e-12)
+    assert x1.formatted == ("3 mm", "0.6 s")
+    same = joint_differences(first, first)
+    assert [one.largest for one in same] == [0.0, 0.0]
 
 
 def test_view_tells_it(slider_crank, tmp_path):

@@ -12,9 +12,9 @@ from packaging.requirements import Requirement
 from typed import typed
 
 import crane
-from crane.common import extras
+from crane.common import optional_libraries
 from crane.common.errors import InputError
-from crane.description import sources
+from crane.description import machine_lookup
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -66,13 +66,13 @@ def test_all_has_every_extra():
     assert f"{PROJECT['name']}[all]" in EXTRAS["dev"]
 
 
-@pytest.mark.parametrize("module", extras._LIBRARIES)
+@pytest.mark.parametrize("module", optional_libraries._LIBRARIES)
 def test_a_library_that_is_not_there_is_told_with_its_extra(module, monkeypatch):
-    name, extra = extras._LIBRARIES[module]
+    name, extra = optional_libraries._LIBRARIES[module]
     assert module in [Requirement(each).name for each in EXTRAS[extra]]
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError) as caught:
-        extras.library(module, "this")
+        optional_libraries.import_optional_library(module, "this")
     assert str(caught.value) == (
         f"this needs {name}, install it in the repository's folder: pip install '.[{extra}]'"
     )
@@ -107,10 +107,10 @@ def test_robots_are_found_where_conda_puts_them(monkeypatch, tmp_path):
 
     monkeypatch.setattr("importlib.metadata.files", unlisted)
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    assert sources.example_root.__wrapped__() is None
+    assert machine_lookup.example_root.__wrapped__() is None
     robots = tmp_path / "share" / "example-robot-data" / "robots"
     robots.mkdir(parents=True)
-    assert sources.example_root.__wrapped__() == robots
+    assert machine_lookup.example_root.__wrapped__() == robots
 
 
 def test_tables_of_the_pages_are_whole():

@@ -15,9 +15,9 @@ from work import at_most
 import crane
 from crane.common.errors import CraneWarning, RecordingError
 from crane.recordings.recording import Recording
-from crane.view.page.channels import Grid, columns, groups
-from crane.view.page.summary import limits_hit, mechanical_work, run_summary
-from crane.view.page.visuals import read_visuals
+from crane.view.page.machine_visuals import read_visuals
+from crane.view.page.page_channels import ThinningGrid, page_columns, plot_groups
+from crane.view.page.run_summary import mechanical_work, reached_limit_sentences, summarize_run
 
 DATA = Path(__file__).parent / "data"
 WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -86,20 +86,20 @@ def test_extremes_survive_thinning_out(machine):
     units = {joint: machine.unit(joint) for joint in machine.active}
     recording = Recording(time, machine.active, q, 0 * q, tau, units)
     frames = np.arange(0, len(time), 33)
-    grid = Grid.of(recording, frames)
-    _, found = line(groups(machine, recording, grid), "X1_force")
+    grid = ThinningGrid.from_recording(recording, frames)
+    _, found = line(plot_groups(machine, recording, grid), "X1_force")
     low, high = decoded(found["series"]["low"]), decoded(found["series"]["high"])
     assert len(low) == len(high) < 10_000
     assert (low.min(), high.max()) == (-77.5, 91.25)
-    centres = np.frombuffer(base64.b64decode(grid.axis()["time"]), "<f8")
+    centres = np.frombuffer(base64.b64decode(grid.time_axis()["time"]), "<f8")
     span = time[-1] / len(centres)
     assert centres[high.argmax()] == pytest.approx(time[123_456], abs=span)
     np.testing.assert_allclose(decoded(found["series"]["frames"]), tau[frames, 1], rtol=1e-7)
 
 
 def test_columns_are_grouped_and_read_in_handy_units(machine, recording):
-    grid = Grid.of(recording, np.arange(401))
-    found = groups(machine, recording, grid)
+    grid = ThinningGrid.from_recording(recording, np.arange(401))
+    found = plot_groups(machine, recording, grid)
     expected = {
         "q1": ("Angles", "deg", 180 / np.pi),
         "X1": ("Strokes", "mm", 1e3),
@@ -122,7 +122,7 @@ def test_columns_are_grouped_and_read_in_handy_units(machine, recording):
 
 
 def test_every_column_is_on_the_page_once(machine, recording):
-    names = [column.name for column in columns(machine, recording)]
+    names = [column.name for column in page_columns(machine, recording)]
     references, derived = {"reference_X1"}, {"error_X1"}
     assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references | derived)
 
@@ -134,7 +134,7 @@ def test_errors_and_the_sum_of_energies_are_plotted(machine, recording):
         channels=recording.channels | energies,
         channel_units=recording.channel_units | dict.fromkeys(energies, "J"),
     )
-    found = groups(machine, energetic, Grid.of(energetic, np.arange(401)))
+    found = plot_groups(machine, energetic, ThinningGrid.from_recording(energetic, np.arange(401)))
     group, there = line(found, "error_X1")
     assert (group["title"], group["unit"], there["label"]) == ("Errors", "mm", "X1")
     np.testing.assert_allclose(decoded(there["series"]["low"]), 1.0, rtol=1e-6)
@@ -155,10 +155,10 @@ def test_work_and_limits(machine, recording):
     power = (recording.tau * recording.v).sum(axis=1)
     assert given - taken == pytest.approx(np.trapezoid(power, recording.time), rel=1e-12)
     assert min(given, taken) >= 0
-    told = limits_hit(machine, recording)
+    told = reached_limit_sentences(machine, recording)
     assert len(told) == 4  # X1 and X2 go from one end to the other
     assert told[0].startswith("X1 reaches its lower limit of 0 mm at 4.25 s")
-    assert not run_summary(machine, None)["forces"]
+    assert not summarize_run(machine, None)["forces"]
 
 
 def test_a_second_recording_has_to_be_of_the_machine(machine, recording, tmp_path):

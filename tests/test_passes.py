@@ -8,9 +8,9 @@ from work import passes
 import crane
 from crane.cli.runs import read_run
 from crane.dynamics import Dynamics
-from crane.identification.mechanics import delays
+from crane.identification.mechanics import force_delays
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.payload import identify_payload
+from crane.identification.mechanics.identify_payload import identify_payload
 from crane.recordings import Recording
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -51,7 +51,7 @@ def test_delays_are_looked_for_in_few_samples(mini, recording, monkeypatch):
     N = len(recording.time)
     with passes(monkeypatch) as count:
         identify(mini, recording)
-    assert count["closed"] <= N + min(delays._MOST, N) + ASIDE
+    assert count["closed"] <= N + min(force_delays._MAX_SAMPLES, N) + ASIDE
 
 
 def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monkeypatch):
@@ -97,11 +97,13 @@ def test_a_file_is_read_once(mini, recording, tmp_path, monkeypatch):
 def test_quantities_at_closed_postures_are_those_of_their_strokes(mini, backend):
     given, dynamics = motion(mini, duration=0.2), Dynamics(mini, backend=backend)
     q = mini.closure.solve(given.q)
-    found = dynamics.at("inverse with friction", q, given.v, given.a)
+    found = dynamics.evaluate_closed("inverse with friction", q, given.v, given.a)
     wanted = dynamics.inverse(given.q, given.v, given.a, friction=True)
     assert np.abs(found - wanted).max() < 1e-12 * np.abs(wanted).max()
-    one = dynamics.at("inverse with friction", q[3], given.v[3], given.a[3])
+    one = dynamics.evaluate_closed("inverse with friction", q[3], given.v[3], given.a[3])
     assert np.abs(one - found[3]).max() <= 1e-14 * np.abs(wanted).max()
     # columns of a table that was solved or transposed stand the other way round
-    turned = dynamics.at("inverse with friction", *map(np.asfortranarray, (q, given.v, given.a)))
+    turned = dynamics.evaluate_closed(
+        "inverse with friction", *map(np.asfortranarray, (q, given.v, given.a))
+    )
     np.testing.assert_array_equal(turned, found)

@@ -114,7 +114,7 @@ def test_fast_tip_paths_are_followed_too(mini):
     kinematics = crane.Kinematics(mini)
     start, end = kinematics.position([[0.0, 0.006, 0.005], [0.8, 0.024, 0.02]])
     path = crane.tip_trajectory(
-        mini, crane.point_to_point(start, end, 0.5), guess=[0.0, 0.006, 0.005]
+        mini, crane.point_to_point(start, end, 0.5), initial_guess=[0.0, 0.006, 0.005]
     )
     time = np.linspace(0, 0.5, 333)
     q_a, v_a, _ = path(time)
@@ -215,7 +215,7 @@ def test_redundant_arms_move_smoothly():
     q_a = np.array([0.3, -1.2, 1.4, -0.5, 0.4, 0.2])
     start = kinematics.position(q_a)
     line = crane.point_to_point(start, start + [0.05, 0.1, -0.08], 1.0)
-    path = crane.tip_trajectory(arm, line, guess=q_a)
+    path = crane.tip_trajectory(arm, line, initial_guess=q_a)
     time = np.linspace(0, 1, 997)
     position, velocity, acceleration = path(time)
     np.testing.assert_allclose(kinematics.position(position), line(time)[0], atol=1e-7)

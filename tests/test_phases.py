@@ -36,7 +36,7 @@ def machine(tmp_path_factory):
 
 
 def run(machine, name="both", **options):
-    under = machine.under(*machine.tasks[name].loads)
+    under = machine.with_external_forces(*machine.tasks[name].loads)
     return crane.simulate(under, crane.joystick(under, name), **options)
 
 
@@ -129,7 +129,7 @@ def test_recorded_signals_do_the_same_again(machine, found):
     force = np.stack([seen[f"load_earth_force_{axis}"] for axis in "xyz"], axis=1)
     earth = crane.Wrench("load_x", force, times=found.time, name="earth")
     again = crane.simulate(
-        machine.under(earth), crane.Signals(machine, found.time, signals), step=2e-3
+        machine.under(earth), crane.ValveSignals(machine, found.time, signals), step=2e-3
     )
     np.testing.assert_allclose(again.q, found.q, atol=1e-6)
 
@@ -147,7 +147,7 @@ def test_loads_by_phases(found):
 
 
 def test_loads_by_phases_need_phases(machine):
-    under = machine.under(*machine.tasks["both"].loads)
+    under = machine.with_external_forces(*machine.tasks["both"].loads)
     for controller in (None, crane.joystick(under, {"x": [(0, 0), (1, 0.1)]})):
         with pytest.raises(crane.CraneError, match="load 'earth' counts phases, simulate it with"):
             crane.simulate(under, controller, duration=0.1)
@@ -155,7 +155,7 @@ def test_loads_by_phases_need_phases(machine):
 
 def test_a_batch_has_phases_of_its_own(machine):
     """Variants end at other times; with one duration they are stacked."""
-    under = machine.under(*machine.tasks["both"].loads)
+    under = machine.with_external_forces(*machine.tasks["both"].loads)
     with_more = under.with_payload(crane.Payload("load_x", 300.0))
     both = [under, with_more]
 
@@ -195,8 +195,8 @@ def test_the_command_simulates_and_accounts_for_it(tmp_path):
     machine, recording = crane.load(path), crane.Recording.read(tmp_path / "run/recording.csv")
     assert recording.controller == "joystick"
     assert recording.time[-1] == pytest.approx(run(machine, step=1e-2).time[-1])
-    account = crane.power_account(machine, recording)
-    assert np.abs(account.residual).max() <= 1e-9 * np.abs(account.shaft).max()
+    account = crane.power_balance(machine, recording)
+    assert np.abs(account.residual).max() <= 1e-9 * np.abs(account.shaft_power).max()
     done = typed("simulate", path, "--task", "both", "--step", "0.003", "--out", tmp_path / "odd")
     assert done.returncode == 2 and "no whole number of steps" in done.stderr
 
@@ -278,18 +278,18 @@ def test_phases_belong_to_tasks_that_have_some(tmp_path):
 def test_phases_in_python(machine):
     """As in files; bad ones are refused as there."""
     phases = [crane.Phase("out", {"x": 0.6}, {"x": 0.3}, 5.0)]
-    recording = crane.simulate(machine, crane.Phases(machine, phases, ramp=0.0), step=1e-2)
+    recording = crane.simulate(machine, crane.LeverPhases(machine, phases, ramp=0.0), step=1e-2)
     assert 0.3 <= recording.q[-1, 0] < 0.33
     jump = recording.channels["voltage_x"]
     assert jump[1] == pytest.approx(0.1 + 0.9 * 0.6) and set(np.round(jump, 9)) <= {0.0, 0.64}
     with pytest.raises(crane.CraneError, match="no valve for 'z', known: x, y"):
-        crane.Phases(machine, [crane.Phase("out", {"z": 0.6}, {"z": 0.3}, 5.0)])
-    command, rest = crane.Phases(machine, phases), np.zeros((2, 2))
+        crane.LeverPhases(machine, [crane.Phase("out", {"z": 0.6}, {"z": 0.3}, 5.0)])
+    command, rest = crane.LeverPhases(machine, phases), np.zeros((2, 2))
     for time in (0.0, 0.01, 0.01):
         command.update(time, np.array([0.2, 0.2]), np.zeros(2), rest)
     with pytest.raises(crane.CraneError, match="levers by positions do not go back"):
         command.update(0.005, np.array([0.2, 0.2]), np.zeros(2), rest)
     with pytest.raises(crane.CraneError, match="there are no phases of levers"):
-        crane.Phases(machine, [])
+        crane.LeverPhases(machine, [])
     with pytest.raises(crane.CraneError, match="the ramp of the levers is -1 s, give at least 0"):
-        crane.Phases(machine, phases, ramp=-1.0)
+        crane.LeverPhases(machine, phases, ramp=-1.0)

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from crane.common.errors import OutputError
 from crane.recordings.recording import Recording
-from crane.view.plots.recording import plot_recording, recording_figure
+from crane.view.plots.recording_figure import plot_recording, recording_figure
 
 SIGNATURES = {".png": b"\x89PNG\r\n", ".svg": b"<?xml", ".pdf": b"%PDF"}
 
@@ -222,7 +222,9 @@ def test_unknown_format_writes_nothing(tmp_path, recording, name):
 
 
 def test_no_global_state_of_pyplot():
-    code = "import sys, crane.view.plots.recording; print('matplotlib.pyplot' in sys.modules)"
+    code = (
+        "import sys, crane.view.plots.recording_figure; print('matplotlib.pyplot' in sys.modules)"
+    )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
 

@@ -13,9 +13,9 @@ from work import at_most
 import crane
 from crane.recordings import Recording
 from crane.studies.power_comparison import PowerComparison
-from crane.view.plots.power import power_figure
-from crane.view.plots.power_comparison import power_comparison_figure
-from crane.view.plots.sankey import sankey_figure
+from crane.view.plots.power_comparison_figure import power_comparison_figure
+from crane.view.plots.power_figure import power_figure
+from crane.view.plots.sankey_diagram import sankey_figure
 
 G, SUPPLY, TANK, SPEED = 9.81, 9.25e6, 1e5, 0.05
 
@@ -48,7 +48,7 @@ def test_a_mass_that_rises_at_constant_speed(tmp_path, kind):
         given = {"spool_x": 0.1143 + (1 - 0.1143) * y}
         valve = COMPENSATED
     machine, recording, weight = lifted(tmp_path, valve, back, **given)
-    account = crane.power_account(machine, recording)
+    account = crane.power_balance(machine, recording)
     expected = {
         "supply.shaft": into * (SUPPLY - TANK),
         "x.inlet": into * edge,
@@ -62,10 +62,12 @@ def test_a_mass_that_rises_at_constant_speed(tmp_path, kind):
     for name, power in expected.items():
         found = account.powers.get(name, zero)
         np.testing.assert_allclose(found, power, rtol=1e-6, atol=1e-9, err_msg=name)
-        assert account.energy(found) == pytest.approx(0.5 * power, rel=1e-6, abs=1e-9)
+        assert account.integrate_energy(found) == pytest.approx(0.5 * power, rel=1e-6, abs=1e-9)
     others = [x for name, x in account.powers.items() if name not in expected]
-    assert all(np.abs(x).max() < 1e-9 * account.shaft[0] for x in others)
-    assert account.mean(account.shaft) == pytest.approx(expected["supply.shaft"], rel=1e-6)
+    assert all(np.abs(x).max() < 1e-9 * account.shaft_power[0] for x in others)
+    assert account.mean_power(account.shaft_power) == pytest.approx(
+        expected["supply.shaft"], rel=1e-6
+    )
     totals = account.totals
     assert totals["load"] == pytest.approx(0.5 * weight * SPEED, rel=1e-6)
     lost = 0.5 * sum(expected[f"x.{what}"] for what in ("inlet", "compensator", "outlet"))
@@ -122,7 +124,7 @@ def mixed(tmp_path_factory):
     machine = network(tmp_path_factory.mktemp("network"))
     time = [0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.5]
     levers = {"x": [0, 0, 0.5, 0.5, -0.6, -0.6, 0, 0], "y": [0, 0, 0.7, 0.7, 0, -1, -1, 0.4]}
-    signals = crane.Signals(machine, time, levers)
+    signals = crane.ValveSignals(machine, time, levers)
     return machine, crane.simulate(machine, signals, duration=1.5, step=2e-4)
 
 
@@ -143,7 +145,7 @@ def digging():
 @pytest.mark.parametrize("which", ["mixed", "patu", "digging"])
 def test_shafts_are_the_sum_of_all_others(request, which):
     machine, recording = request.getfixturevalue(which)
-    account = crane.power_account(machine, recording)
+    account = crane.power_balance(machine, recording)
     largest = max(np.abs(power).max() for power in account.powers.values())
     assert np.abs(account.residual).max() <= 1e-9 * largest
     totals = account.totals
@@ -155,7 +157,7 @@ def test_shafts_are_the_sum_of_all_others(request, which):
 
 def test_everything_is_told(mixed):
     """A circuit with one of everything has power in all of it, and losses are losses."""
-    account = crane.power_account(*mixed)
+    account = crane.power_balance(*mixed)
     busy = {name for name, power in account.powers.items() if np.abs(power).max() > 0.1}
     assert busy >= {
         "supply.shaft", "second.shaft", "supply.friction", "supply.slip", "second.bypass",
@@ -167,7 +169,7 @@ def test_everything_is_told(mixed):
     signed = ("shaft", "load", "stored", "spring", "cooling")
     for name, power in account.powers.items():
         if name.rpartition(".")[2] not in signed:
-            assert power.min() >= -1e-9 * np.abs(account.shaft).max(), name
+            assert power.min() >= -1e-9 * np.abs(account.shaft_power).max(), name
 
 
 @pytest.mark.parametrize("which", ["mixed", "patu"])
@@ -178,7 +180,7 @@ def test_energies_are_the_integrals_of_the_simulation(request, which):
     """
     machine, recording = request.getfixturevalue(which)
     recording = recording.between(0.1, recording.time[-1])
-    account = crane.power_account(machine, recording)
+    account = crane.power_balance(machine, recording)
     energy, pumps = account.energies, account.pumps
     gained = {name: x[-1] - x[0] for name, x in recording.channels.items()}
 
@@ -202,21 +204,21 @@ def test_energies_are_the_integrals_of_the_simulation(request, which):
 def test_an_engine_turns_its_pumps_and_itself(mixed):
     """What it gives: the shafts, and J/2 w^2 of its own inertia; fuel by that and by time."""
     machine, recording = mixed
-    account = crane.power_account(machine, recording)
+    account = crane.power_balance(machine, recording)
     speed = recording.channels["engine_speed"]
     kinetic = 0.5 * 1.2 * (speed[-1] ** 2 - speed[0] ** 2)
-    given = account.energy(account.engine)
+    given = account.integrate_energy(account.engine_power)
     assert given == pytest.approx(account.totals["shaft"] + kinetic, rel=1e-4)
     assert abs(kinetic) > 1e-2 * given
-    assert account.fuel == pytest.approx(4e-4 * 1.5 + 6e-8 * given, rel=1e-9)
-    assert account.fuel_volume == pytest.approx(account.fuel / 840.0)
-    assert f"{1e6 * account.fuel / 840:.4g} ml" in account.to_markdown()
+    assert account.fuel_mass == pytest.approx(4e-4 * 1.5 + 6e-8 * given, rel=1e-9)
+    assert account.fuel_volume == pytest.approx(account.fuel_mass / 840.0)
+    assert f"{1e6 * account.fuel_mass / 840:.4g} ml" in account.to_markdown()
 
 
 def test_no_engine_no_fuel(patu):
-    account = crane.power_account(*patu)
-    assert account.engine is None
-    assert account.fuel is None
+    account = crane.power_balance(*patu)
+    assert account.engine_power is None
+    assert account.fuel_mass is None
     assert "fuel" not in account.to_markdown()
 
 
@@ -234,8 +236,8 @@ def test_a_recording_that_was_read_tells_the_same(patu, tmp_path, suffix):
             units |= {f"{joint}_force": "N m" if unit == "rad" else "N"}
         columns = recording.columns()
         np.savez(path, **{f"{x} [{unit}]" if unit else x: columns[x] for x, unit in units.items()})
-    first = crane.power_account(machine, recording)
-    again = crane.power_account(machine, Recording.read(path))
+    first = crane.power_balance(machine, recording)
+    again = crane.power_balance(machine, Recording.read(path))
     assert [*again.powers] == [*first.powers]
     for name, power in first.powers.items():
         np.testing.assert_allclose(again.powers[name], power, rtol=1e-12, atol=1e-9)
@@ -244,26 +246,26 @@ def test_a_recording_that_was_read_tells_the_same(patu, tmp_path, suffix):
 def test_a_measured_supply_is_taken_as_it_is(patu):
     """Without a record of its pump: the line gives what the valves draw, and stores nothing."""
     machine, recording = patu
-    first = crane.power_account(machine, recording)
+    first = crane.power_balance(machine, recording)
     there = {x: y for x, y in recording.channels.items() if x not in ("share_supply",)}
     there.pop("shaft_supply")
     measured = replace(recording, channels=there, channel_units={})
-    account = crane.power_account(machine, measured)
-    drawn = first.shaft - first.powers["supply.stored"]
+    account = crane.power_balance(machine, measured)
+    drawn = first.shaft_power - first.powers["supply.stored"]
     net = first.powers["supply.stored"] / recording.channels["pressure_supply"]
     drawn += net * recording.channels["pressure_tank"]  # oil that the line kept leaves no tank
-    np.testing.assert_allclose(account.shaft, drawn, atol=1e-9 * first.shaft.max())
-    assert np.abs(account.residual).max() <= 1e-9 * first.shaft.max()
-    assert np.abs(drawn - first.shaft).max() > 1e-6 * first.shaft.max()
+    np.testing.assert_allclose(account.shaft_power, drawn, atol=1e-9 * first.shaft_power.max())
+    assert np.abs(account.residual).max() <= 1e-9 * first.shaft_power.max()
+    assert np.abs(drawn - first.shaft_power).max() > 1e-6 * first.shaft_power.max()
 
 
 @pytest.mark.parametrize(("which", "joint"), [("patu", "X_lift"), ("mixed", "x")])
 def test_friction_is_the_machine_s_where_none_is_recorded(request, which, joint):
     """That of seals under pressure, too."""
     machine, recording = request.getfixturevalue(which)
-    first = crane.power_account(machine, recording)
+    first = crane.power_balance(machine, recording)
     kept = {x: y for x, y in recording.channels.items() if not x.startswith("friction_")}
-    account = crane.power_account(machine, replace(recording, channels=kept, channel_units={}))
+    account = crane.power_balance(machine, replace(recording, channels=kept, channel_units={}))
     moving = np.abs(recording.v[:, machine.active.index(joint)]) > 1e-2
     assert moving.any()
     for name in (f"{joint}.friction", f"{joint}.load"):
@@ -276,40 +278,40 @@ def test_missing_channels_are_refused_in_one_line(patu):
     gone = ("pressure_X_lift_a", "spring_X_lift", "spool_X_ext")
     kept = {name: x for name, x in recording.channels.items() if name not in gone}
     with pytest.raises(crane.CraneError) as error:
-        crane.power_account(machine, replace(recording, channels=kept, channel_units={}))
+        crane.power_balance(machine, replace(recording, channels=kept, channel_units={}))
     text = str(error.value)
     assert text == (
         "columns are missing: 'pressure_X_lift_a', 'spring_X_lift', 'spool_X_ext' "
-        "(power_account needs what a simulation on valves records)"
+        "(power_balance needs what a simulation on valves records)"
     )
 
 
 def test_the_wrong_machine_is_refused(patu, digging, tmp_path):
     with pytest.raises(crane.CraneError, match=r"'X_boom'.* of 'excavator' not recorded"):
-        crane.power_account(digging[0], patu[1])
+        crane.power_balance(digging[0], patu[1])
     with pytest.raises(crane.CraneError, match="has no valves"):
-        crane.power_account(crane.load("mini_forwarder"), patu[1])
+        crane.power_balance(crane.load("mini_forwarder"), patu[1])
     machine = rig(tmp_path)
     time = np.linspace(0, 1, 5)
     column = np.ones((5, 1))
     turned = Recording(time, ("x",), column, column, column, {"x": "rad"})
     with pytest.raises(crane.CraneError, match=r"'x' is in \[rad\]"):
-        crane.power_account(machine, turned)
+        crane.power_balance(machine, turned)
     moved = {"pressure_x_a": time + 1e6, "pressure_x_b": time + 1e6, "spool_x": time}
     bars = Recording(time, ("x",), column, column, column, {"x": "m"}, moved,
                      {"pressure_x_a": "bar"})  # fmt: skip
     with pytest.raises(crane.CraneError, match=r"'pressure_x_a' is in \[bar\]"):
-        crane.power_account(machine, bars)
+        crane.power_balance(machine, bars)
 
 
 def test_samples_cost_no_python(patu):
     """Lines that are run do not depend on how many samples there are."""
     machine, recording = patu
-    crane.power_account(machine, recording)
+    crane.power_balance(machine, recording)
     lines = []
     for part in (recording.between(0.0, 1.0), recording):
         with at_most(10_000_000) as work:
-            crane.power_account(machine, part)
+            crane.power_balance(machine, part)
         lines.append(work.lines)
     assert lines[1] <= 1.05 * lines[0]
 
@@ -347,10 +349,10 @@ def test_the_command_refuses_in_one_line(patu, tmp_path):
 def test_one_sample_and_a_machine_at_rest_have_tables_and_pictures(patu, tmp_path):
     """Nothing is divided by a duration or an energy of zero."""
     machine, recording = patu
-    account = crane.power_account(machine, recording.between(0.0, 0.0))
-    assert account.mean(account.shaft) == account.shaft[0]
+    account = crane.power_balance(machine, recording.between(0.0, 0.0))
+    assert account.mean_power(account.shaft_power) == account.shaft_power[0]
     assert set(account.totals.values()) == {0.0}
-    for shown in (account, crane.power_account(machine, recording.between(0.0, 0.5))):
+    for shown in (account, crane.power_balance(machine, recording.between(0.0, 0.5))):
         assert "nan" not in shown.to_markdown()
         sankey_figure(shown)
         power_figure(shown)
@@ -360,7 +362,7 @@ def test_one_sample_and_a_machine_at_rest_have_tables_and_pictures(patu, tmp_pat
 def test_pictures_have_words_that_do_not_overlap(request, which):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    account = crane.power_account(*request.getfixturevalue(which))
+    account = crane.power_balance(*request.getfixturevalue(which))
     for draw in (sankey_figure, power_figure):
         figure = draw(account)
         canvas = FigureCanvasAgg(figure)
@@ -380,27 +382,31 @@ def test_pictures_have_words_that_do_not_overlap(request, which):
 
 
 def compared(patu, **more):
-    account = crane.power_account(*patu)
-    half = crane.power_account(patu[0], patu[1].between(0.0, 3.0))
+    account = crane.power_balance(*patu)
+    half = crane.power_balance(patu[0], patu[1].between(0.0, 3.0))
     return PowerComparison({"whole run": account, "half": half}, **more)
 
 
 def test_runs_beside_each_other(patu):
     """Each one's classes sum to its shafts; time, peak, work per mass as by hand."""
     found = compared(patu, moved=500.0)
-    for run, account in found.accounts.items():
-        assert sum(found.classes(run).values()) == pytest.approx(account.totals["shaft"], rel=1e-9)
-    whole = found.accounts["whole run"]
-    assert found.classes("whole run")["load"] == pytest.approx(whole.totals["load"], rel=1e-12)
+    for run, account in found.balances.items():
+        assert sum(found.energy_by_class(run).values()) == pytest.approx(
+            account.totals["shaft"], rel=1e-9
+        )
+    whole = found.balances["whole run"]
+    assert found.energy_by_class("whole run")["load"] == pytest.approx(
+        whole.totals["load"], rel=1e-12
+    )
     rows = {
         cells[0]: cells[1:]
         for line in found.to_markdown().splitlines()
         if len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 3
     }
     assert rows["time [s]"] == ["6.00", "3.00"]
-    peaks = [f"{x.shaft.max() / 1e3:.1f}" for x in found.accounts.values()]
+    peaks = [f"{x.shaft_power.max() / 1e3:.1f}" for x in found.balances.values()]
     assert rows["peak of them [kW]"] == peaks
-    work = np.trapezoid(whole.shaft, whole.time)
+    work = np.trapezoid(whole.shaft_power, whole.time)
     assert rows["work per kg of 500 [J/kg]"][0] == f"{work / 500:.0f}"
     assert "fuel [g]" not in rows
 
@@ -409,7 +415,7 @@ def test_a_picture_of_runs_beside_each_other(patu, mixed):
     """Its words do not overlap, and stay within."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    four = {name: crane.power_account(*mixed) for name in "abcd"}
+    four = {name: crane.power_balance(*mixed) for name in "abcd"}
     for comparison in (compared(patu), PowerComparison(four)):
         figure = power_comparison_figure(comparison)
         canvas = FigureCanvasAgg(figure)
@@ -422,7 +428,7 @@ def test_a_picture_of_runs_beside_each_other(patu, mixed):
         for box in boxes:
             assert box.x0 >= 0 and box.y0 >= 0
             assert box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
-    assert f"| fuel [g] | {1e3 * four['a'].fuel:.1f} |" in PowerComparison(four).to_markdown()
+    assert f"| fuel [g] | {1e3 * four['a'].fuel_mass:.1f} |" in PowerComparison(four).to_markdown()
 
 
 def test_the_command_compares(patu, tmp_path):

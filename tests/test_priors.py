@@ -7,10 +7,10 @@ from broken import DATA
 import crane
 from crane.common.errors import InputError
 from crane.description import Friction
-from crane.description.estimation import Known
+from crane.description.estimation_settings import ParameterPrior
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import Motion, identify
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.priors import stated
+from crane.identification.mechanics.priors import prior_from_names
 
 TIME = np.arange(0, 8, 0.01)
 W = np.pi
@@ -40,10 +40,10 @@ def one_way(four_bar):
 
 def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
     assert identify(four_bar, one_way).parameters is None  # base parameters come out
-    names = Model(four_bar).names
+    names = IdentificationModel(four_bar).names
     bodies = np.array([0.1 if "_arm" in name or "coupler" in name else np.inf for name in names])
     with pytest.raises(InputError) as caught:
-        identify(four_bar, one_way, prior=(Model(four_bar).nominal, bodies))
+        identify(four_bar, one_way, prior=(IdentificationModel(four_bar).nominal, bodies))
     assert str(caught.value) == (
         "the prior says nothing of crank.coulomb, crank.coulomb_offset, crank.viscous, "
         "crank.viscous_offset, and this motion does not tell them apart: move the joints both "
@@ -84,8 +84,10 @@ def test_a_share_of_the_description_is_about_friction_too(four_bar, one_way):
     rough = four_bar.replace(
         friction={"crank": Friction(coulomb=4.0, viscous=0.5, smoothing=1e-3)}
     )
-    model = Model(rough)
-    _, std = stated(model, {"*": Known(0.3, relative=True)}, np.ones(len(model.names)))
+    model = IdentificationModel(rough)
+    _, std = prior_from_names(
+        model, {"*": ParameterPrior(0.3, relative=True)}, np.ones(len(model.names))
+    )
     by = dict(zip(model.names, std, strict=True))
     assert by["crank.coulomb"] == by["crank.coulomb_offset"] == pytest.approx(1.2)
     assert by["crank.viscous"] == by["crank.viscous_offset"] == pytest.approx(0.15)

@@ -116,7 +116,7 @@ def driven(path):
         DRAWN["condition above 20"] += 1
         return None
     assert set(machine.active) == set(joints.split(", "))
-    assert float(machine.closure.condition(machine.home)) == pytest.approx(
+    assert float(machine.closure.condition_number(machine.home)) == pytest.approx(
         float(condition), rel=6e-3
     )
     return machine
@@ -133,8 +133,10 @@ def test_random_linkages_move_as_constraint_dynamics_says(plan):
     n, model = len(machine.active), machine.model
     structure = closure.structure
     assert closure.residual(machine.home) < 1e-13 and np.abs(machine.home).max() < 1e-12
-    assert len(structure.rows) == model.nv - n == len(closure.passive)
-    assert len(structure.rows) + len(structure.redundant) == 5 * len(closure.equations.loops)
+    assert len(structure.independent_rows) == model.nv - n == len(closure.passive)
+    assert len(structure.independent_rows) + len(structure.redundant_rows) == 5 * len(
+        closure.equations.loops
+    )
     random = np.random.default_rng(plan[-1])
     dynamics = crane.Dynamics(machine, backend="pinocchio")
     tested = 0
@@ -145,7 +147,7 @@ def test_random_linkages_move_as_constraint_dynamics_says(plan):
         except crane.CraneError:
             POSTURES["out of reach"] += 1
             continue
-        if closure.condition(q) > 100:
+        if closure.condition_number(q) > 100:
             POSTURES["condition above 100"] += 1
             continue
         gamma = closure.gamma(q)

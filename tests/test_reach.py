@@ -7,7 +7,7 @@ import pytest
 
 import crane
 from crane.common.errors import ClosureError, CraneWarning
-from crane.studies.measures import of_strokes
+from crane.studies.measures import measure_strokes
 
 pytestmark = pytest.mark.slow
 
@@ -80,7 +80,7 @@ def test_reach_of_three_cylinders_is_that_in_line(arm):
     """Where the barrels sit, and how long the strokes are, does not change it."""
     wanted = BASE[0] + sum(ARMS)
     for change in ({}, {"barrel1.x": 0.08}, {"barrel2.z": 0.47}, {"X1.lower": -0.21}):
-        found = of_strokes(crane.load(arm, change))
+        found = measure_strokes(crane.load(arm, change))
         assert found["reach"] == pytest.approx(wanted, abs=1e-9), change
 
 
@@ -113,7 +113,7 @@ def test_a_study_orders_by_the_true_reach(arm):
     assert np.ptp(wanted) < 0.05
     assert found.columns["reach"] == pytest.approx(wanted[order], abs=1e-9)
     best = np.argsort(order)[np.argsort(wanted)[::-1]]
-    assert found.order("reach") == best.tolist()
+    assert found.rank("reach") == best.tolist()
 
 
 @pytest.mark.slow
@@ -134,7 +134,7 @@ def test_ends_of_strokes_are_where_the_branch_ends():
             closes = middle
         except ClosureError:
             opens = middle
-    found = of_strokes(machine)
+    found = measure_strokes(machine)
     assert found["lower_X2"] == pytest.approx(closes, abs=1e-9)
     assert found["upper_X2"] == 0.03 and found["lower_X1"] == 0.0
 
@@ -143,7 +143,7 @@ def test_ends_of_strokes_are_where_the_branch_ends():
 def test_reach_of_the_big_crane_is_that_of_its_workspace():
     machine = crane.load("patu655")
     space = crane.workspace(machine, 1000)
-    assert of_strokes(machine)["reach"] == pytest.approx(
+    assert measure_strokes(machine)["reach"] == pytest.approx(
         space.extreme("largest radius").value, abs=1e-9
     )
 
@@ -190,7 +190,7 @@ def test_reach_ends_with_the_branch(tmp_path):
     machine = crane.load(tmp_path / "slider.urdf")
     # the horizontal distance is the same for all: it is seen along x, gravity taken as along y
     machine.model.gravity.linear = np.array([0.0, -9.81, 0.0])
-    found = of_strokes(machine)
+    found = measure_strokes(machine)
     assert found["reach"] == pytest.approx(0.4 * np.cos(0.5), abs=1e-9)
     assert found["upper_s"] == pytest.approx(crank + rod, abs=1e-9)
     assert found["lower_s"] == slide(1.0)

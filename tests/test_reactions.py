@@ -11,7 +11,7 @@ from test_digits import four_bar, loaded, written
 
 import crane
 from crane import Dynamics, ForceElement, Reactions, Rope
-from crane.common.errors import BranchEdgeError, InputError
+from crane.common.errors import InputError, SingularConfigurationError
 
 G = 9.81
 
@@ -68,15 +68,17 @@ def test_beam_on_a_cylinder_by_moments(tmp_path):
         weight = np.array([0, 0, -100 * G])
         turning = np.cross(along, weight) + np.cross(2 * along, push[:3])
         force = -turning[1] / np.cross(along, way)[1]
-        found = dict(zip(reactions.names, reactions.at(q, wrenches={"end": push}), strict=True))
-        assert np.allclose(reactions.drives(q, wrenches={"end": push}), force, rtol=1e-12)
+        found = dict(
+            zip(reactions.names, reactions.joint_wrenches(q, wrenches={"end": push}), strict=True)
+        )
+        assert np.allclose(reactions.drive_forces(q, wrenches={"end": push}), force, rtol=1e-12)
         # the beam, predecessor of the eye, is pushed by the rod
         assert np.allclose(found["eye"][:3], -force * way, atol=1e-9)
         assert np.allclose(found["foot"][:3], force * way, atol=1e-9)
         assert np.allclose(found["pivot"][:3], -weight - push[:3] - force * way, atol=1e-9)
         # massless barrel and rod are pulled and pushed along their line alone
         assert np.allclose([found[x][3:] for x in ("eye", "foot", "stroke")], 0, atol=1e-9)
-    known = dict(zip(reactions.names, reactions.determined(q), strict=True))
+    known = dict(zip(reactions.names, reactions.statically_determined(q), strict=True))
     for pinned in ("pivot", "foot", "eye"):
         assert known[pinned].tolist() == [True, True, False, False, False, True]
 
@@ -149,7 +151,7 @@ def test_four_bar_by_newton_and_euler_of_each_link(tmp_path):
     right[8] -= torque
     wanted = np.linalg.solve(matrix, right)
     loads = {"P": [push.real, push.imag, 0, 0, 0, 0], "rocker": [0, 0, 0, 0, 0, torque]}
-    found = dict(zip(reactions.names, reactions.at(q, v, a, loads), strict=True))
+    found = dict(zip(reactions.names, reactions.joint_wrenches(q, v, a, loads), strict=True))
     pins = np.concatenate([found[name][:2] for name in ("O2", "A", "B", "O4")])
     assert np.allclose(pins, wanted[:8], rtol=1e-9, atol=1e-9)
     assert np.isclose(found["O2"][5], wanted[8], rtol=1e-9)
@@ -176,8 +178,8 @@ def _machine(name, folder):
         return hanging.afloat(folder), ["load", "hull"]
     machine = crane.load(name)
     links = [machine.tip, machine.closure.equations.loops[0].successor]
-    root = machine.tree.root
-    far = 5 * machine.closure.size
+    root = machine.tree.root_link
+    far = 5 * machine.closure.characteristic_length
     return machine.replace(
         forces=(ForceElement(between=(root, links[0]), stiffness=3e3, damping=200, force=500),
                 ForceElement(joint=machine.closure.equations.coordinates.names[-1], force=77)),
@@ -192,11 +194,11 @@ def test_every_body_is_in_balance(name, tmp_path):
     (q_a, v_a, a_a), (q, v, a) = moving(machine, 12)
     reactions, dynamics = Reactions(machine), Dynamics(machine)
     rng = np.random.default_rng(1)
-    scale = G * machine.tree.mass
+    scale = G * machine.tree.total_mass
     loads = {held: 0.2 * scale * rng.normal(size=(12, 6)) for held in links}
-    found = reactions.at(q, v, a, loads, friction=True)
-    drives = reactions.drives(q, v, a, loads, friction=True)
-    wanted = dynamics.inverse(q_a, v_a, a_a, friction=True) - dynamics.applied(q_a, loads)
+    found = reactions.joint_wrenches(q, v, a, loads, friction=True)
+    drives = reactions.drive_forces(q, v, a, loads, friction=True)
+    wanted = dynamics.inverse(q_a, v_a, a_a, friction=True) - dynamics.project_wrenches(q_a, loads)
     assert np.allclose(drives, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
     model, data = machine.model, machine.model.createData()
     joints, nj = dict(zip(reactions.names, range(100), strict=False)), model.njoints - 1
@@ -221,7 +223,7 @@ def test_every_body_is_in_balance(name, tmp_path):
             frame = machine.frame(held)
             about = _about(data.oMf[frame].translation, wrench[i])
             rest[model.frames[frame].parentJoint] += about
-        for item in machine.elements:
+        for item in machine.force_elements:
             if item.between is None:
                 continue
             one, two = (machine.frame(x) for x in item.between)
@@ -243,15 +245,15 @@ def test_every_body_is_in_balance(name, tmp_path):
                 rest[body] += _about(data.oMf[frame].translation, push)
         assert np.abs(rest[1:]).max() < 1e-9 * largest
         # across a joint goes what acts along it
-        axes = reactions.axes(q[i])
+        axes = reactions.joint_axes(q[i])
         driven = np.zeros(model.nv)
         driven[machine.closure.active] = drives[i]
-        along, _ = forces.along(q[i], v[i])
-        along = driven + along[: model.nv] - forces.friction(v[i]) - model.armature * a[i]
+        along, _ = forces.passive_forces_by_element(q[i], v[i])
+        along = driven + along[: model.nv] - forces.friction_forces(v[i]) - model.armature * a[i]
         for column, body in enumerate(machine.coordinates.joints.tolist()):
             if model.joints[body].nv > 1:
                 continue
-            part = slice(0, 3) if machine.coordinates.slides[column] else slice(3, 6)
+            part = slice(0, 3) if machine.coordinates.is_translation[column] else slice(3, 6)
             across = found[i, body - 1, part] @ axes[body - 1, :, 2]
             assert abs(across - along[column]) < 1e-9 * largest
         for k, loop in enumerate(machine.closure.equations.loops):
@@ -266,7 +268,7 @@ def test_what_floats_is_held_by_nothing(tmp_path):
     q_a = q[0, machine.closure.active]
     gained = Dynamics(machine).forward(q_a, v[0, machine.closure.active], tau)
     a = machine.closure.gamma(q[0]) @ gained + machine.closure.drift(q[0], v[0])
-    found = Reactions(machine).at(q[0], v[0], a)
+    found = Reactions(machine).joint_wrenches(q[0], v[0], a)
     assert np.abs(found[0]).max() < 1e-9 * np.abs(found).max()
 
 
@@ -294,15 +296,15 @@ def test_multipliers_are_those_of_pinocchio(stewart):
         tau = np.zeros(model.nv)
         tau[stewart.closure.active] = 300 * rng.normal(size=len(stewart.active))
         a = pin.constraintDynamics(model, data, q[i], v[i], tau, contacts, datas, settings)
-        drives = reactions.drives(q[i], v[i], a)
+        drives = reactions.drive_forces(q[i], v[i], a)
         assert np.allclose(drives, tau[stewart.closure.active], atol=1e-6)
-        found = reactions.at(q[i], v[i], a)[model.njoints - 1 :, :3]
+        found = reactions.joint_wrenches(q[i], v[i], a)[model.njoints - 1 :, :3]
         lambdas = np.reshape(data.lambda_c, (-1, 3))
         pin.updateFramePlacements(model, data)
         for force, wanted, loop in zip(found, lambdas, equations.loops, strict=True):
             turn = data.oMf[stewart.frame(loop.predecessor)].rotation
             assert np.allclose(turn @ wanted, -force, atol=1e-6 * np.abs(found).max())
-    assert reactions.determined(q).all()
+    assert reactions.statically_determined(q).all()
 
 
 def test_determined_is_what_no_stress_changes(mini):
@@ -310,7 +312,7 @@ def test_determined_is_what_no_stress_changes(mini):
     reactions = Reactions(mini)
     _, (q, v, a) = moving(mini, 3)
     equations, model = mini.closure.equations, mini.model
-    known = reactions.determined(q)
+    known = reactions.statically_determined(q)
     rng = np.random.default_rng(2)
     for i in range(len(q)):
         jacobian = equations.evaluate(q[i])[1]
@@ -333,7 +335,7 @@ def test_determined_is_what_no_stress_changes(mini):
                     held[carrier] += sign * wrench
             loops.append(_about(-frames[2 * k + 1].translation, wrench))
         joints = [_about(-data.oMi[j].translation, held[j]) for j in range(1, model.njoints)]
-        changed = np.array([*joints, *loops]).reshape(-1, 2, 3) @ reactions.axes(q[i])
+        changed = np.array([*joints, *loops]).reshape(-1, 2, 3) @ reactions.joint_axes(q[i])
         loud = np.abs(changed.reshape(-1, 6)) > 1e-9 * np.abs(changed).max()
         assert (loud == ~known[i]).all()
 
@@ -342,11 +344,11 @@ def test_a_unit_force_is_what_it_adds(mini):
     reactions = Reactions(mini)
     _, (q, v, a) = moving(mini, 4)
     for held in (mini.tip, mini.tree.root):
-        unit = reactions.unit(q, held)
-        assert np.allclose(unit[2], reactions.unit(q[2], held), atol=1e-12)
+        unit = reactions.unit_load_wrenches(q, held)
+        assert np.allclose(unit[2], reactions.unit_load_wrenches(q[2], held), atol=1e-12)
         force = np.array([3.0, -2.0, 5.0])
-        loaded = reactions.at(q, v, a, {held: [*force, 0, 0, 0]}, friction=True)
-        added = loaded - reactions.at(q, v, a, friction=True)
+        loaded = reactions.joint_wrenches(q, v, a, {held: [*force, 0, 0, 0]}, friction=True)
+        added = loaded - reactions.joint_wrenches(q, v, a, friction=True)
         assert np.allclose(unit @ force, added, atol=1e-10)
 
 
@@ -356,8 +358,8 @@ def test_rotors_take_their_torque_before_the_pin(tmp_path):
     geared = crane.load(plain.path, active=["O2"], changes={"O2.rotor_inertia": 3.0})
     _, (q, v, a) = moving(plain, 2)
     one, two = Reactions(plain), Reactions(geared)
-    assert np.allclose(one.at(q, v, a), two.at(q, v, a), atol=1e-12)
-    more = two.drives(q, v, a) - one.drives(q, v, a)
+    assert np.allclose(one.joint_wrenches(q, v, a), two.joint_wrenches(q, v, a), atol=1e-12)
+    more = two.drive_forces(q, v, a) - one.drive_forces(q, v, a)
     assert np.allclose(more, 3.0 * a[:, plain.closure.active])
 
 
@@ -365,8 +367,8 @@ def test_without_loops_it_is_rnea():
     machine = crane.load("tx40")
     q = postures(machine, 0.5, 3) if machine.closure.equations.loops else machine.home[None]
     reactions, data = Reactions(machine), machine.model.createData()
-    found = reactions.at(q)
-    assert reactions.determined(q).all()
+    found = reactions.joint_wrenches(q)
+    assert reactions.statically_determined(q).all()
     pin.rnea(machine.model, data, q[0], 0 * q[0], 0 * q[0])
     pin.forwardKinematics(machine.model, data, q[0])
     for body in range(1, machine.model.njoints):
@@ -381,12 +383,12 @@ def test_digits_determine_no_more_than_what_was_meant(tmp_path):
     meant, _ = loaded(written(tmp_path / "meant", four_bar(repr(-np.pi / 2), repr(np.pi / 2))))
     machine, _ = loaded(written(tmp_path, four_bar("-1.5708", "1.57079")))
     one, two = Reactions(meant), Reactions(machine)
-    known = one.determined(meant.home)
-    assert not known.all() and (known == two.determined(machine.home)).all()
-    wanted, found = one.at(meant.home), two.at(machine.home)
+    known = one.statically_determined(meant.home)
+    assert not known.all() and (known == two.statically_determined(machine.home)).all()
+    wanted, found = one.joint_wrenches(meant.home), two.joint_wrenches(machine.home)
     assert np.allclose(found, wanted, atol=1e-4 * np.abs(wanted).max())
     q_a = machine.home[machine.closure.active]
-    assert np.allclose(two.drives(machine.home), Dynamics(machine).gravity(q_a), rtol=1e-4)
+    assert np.allclose(two.drive_forces(machine.home), Dynamics(machine).gravity(q_a), rtol=1e-4)
 
 
 def test_a_dead_centre_determines_nothing(tmp_path):
@@ -397,20 +399,26 @@ def test_a_dead_centre_determines_nothing(tmp_path):
     dead["stroke"] = np.hypot(0.6, 1) + 1
     q = np.array([dead[name] for name in beam.joints])
     assert beam.closure.residual(q) < 1e-12
-    with pytest.raises(BranchEdgeError, match="stroke"):
-        Reactions(beam).at(q)
+    with pytest.raises(SingularConfigurationError, match="stroke"):
+        Reactions(beam).joint_wrenches(q)
 
 
 def test_what_cannot_be_is_told_in_one_line(mini):
     reactions = Reactions(mini)
     q = mini.home
     for call, words in (
-        (lambda: reactions.at(q[:3]), "q has the shape"),
-        (lambda: reactions.at(q, np.zeros((2, len(q)))), "v has 2 samples and q 1"),
-        (lambda: reactions.at(q, wrenches={"hook": np.zeros(6)}), "frame 'hook' is unknown"),
-        (lambda: reactions.at(q, wrenches={mini.tip: np.zeros((3, 6))}), "has 3 samples and q"),
-        (lambda: reactions.unit(q, "hook"), "frame 'hook' is unknown"),
-        (lambda: reactions.at(np.zeros((0, len(q)))), "empty stack"),
+        (lambda: reactions.joint_wrenches(q[:3]), "q has the shape"),
+        (lambda: reactions.joint_wrenches(q, np.zeros((2, len(q)))), "v has 2 samples and q 1"),
+        (
+            lambda: reactions.joint_wrenches(q, wrenches={"hook": np.zeros(6)}),
+            "frame 'hook' is unknown",
+        ),
+        (
+            lambda: reactions.joint_wrenches(q, wrenches={mini.tip: np.zeros((3, 6))}),
+            "has 3 samples and q",
+        ),
+        (lambda: reactions.unit_load_wrenches(q, "hook"), "frame 'hook' is unknown"),
+        (lambda: reactions.joint_wrenches(np.zeros((0, len(q)))), "empty stack"),
         (lambda: Reactions("mini_forwarder"), "load it with crane.load"),
     ):
         with pytest.raises(InputError, match=words):

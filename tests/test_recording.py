@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from crane.common.errors import InputError, OutputError, RecordingError
 from crane.recordings.recording import Recording
-from crane.recordings.summary import subject
+from crane.recordings.recording_summary import recorded_machine_name
 
 
 def make(**changes):
@@ -200,8 +200,8 @@ def test_a_machine_s_own_name_is_kept_where_its_file_has_another(tmp_path):
         for file in (tmp_path / "a.csv", tmp_path / "a.npz"):
             (recording.to_csv if file.suffix == ".csv" else recording.to_npz)(file)
             assert Recording.read(file).machine_name == (name if noted else "")
-            assert subject(Recording.read(file)) == name
-    assert subject(make(machine="/there/my.yaml")) == "my"
+            assert recorded_machine_name(Recording.read(file)) == name
+    assert recorded_machine_name(make(machine="/there/my.yaml")) == "my"
 
 
 def test_failed_writing_leaves_nothing(tmp_path):

@@ -6,10 +6,10 @@ from hydraulic_rig import COMPENSATED, rig
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, RecordingError
-from crane.control import Signals
+from crane.control import ValveSignals
 from crane.recordings import timeseries
 from crane.recordings.timeseries import Table
-from crane.simulation.replays import Channel, replay
+from crane.simulation.recording_replay import ChannelComparison, replay
 
 
 @pytest.fixture
@@ -17,13 +17,13 @@ def measured(tmp_path):
     """A rig's file, from a simulation that begins before the file does."""
     machine = rig(tmp_path, COMPENSATED, supply={"pressure": 1.2e7})
     times = np.linspace(0, 4, 41)
-    signals = Signals(machine, times, {"x": 5.8 - 0.9 * np.sin(2 * np.pi * times / 2)})
+    signals = ValveSignals(machine, times, {"x": 5.8 - 0.9 * np.sin(2 * np.pi * times / 2)})
     recording = crane.simulate(machine, signals, duration=4.0)
     return machine, recording
 
 
 def write(path, columns, units):
-    timeseries.write(path, Table(units, np.column_stack(list(columns.values())), {}))
+    timeseries.write_table(path, Table(units, np.column_stack(list(columns.values())), {}))
     return path
 
 
@@ -51,7 +51,7 @@ def test_the_model_s_own_recording_comes_back(tmp_path, measured):
     assert set(rows) == {"x", "x_velocity", "pressure_x_a", "pressure_x_b"}
     assert rows["x"].rms < 1e-7
     assert rows["pressure_x_a"].rms < 2e3
-    assert rows["x"].relative < 1e-5
+    assert rows["x"].relative_rms < 1e-5
     assert again.time[-1] == pytest.approx(3.7)
     assert again.task == "file"
     assert np.ptp(recording.q[300:, 0]) > 0.005
@@ -79,8 +79,8 @@ def test_a_wrong_model_shows(tmp_path, measured):
     x = next(channel for channel in comparison.channels if channel.name == "x")
     gap = np.interp(recording.time[::10], again.time, again.q[:, 0]) - recording.q[::10, 0]
     assert x.rms == pytest.approx(np.sqrt(np.mean(gap**2)), rel=1e-9)
-    assert x.relative == pytest.approx(x.rms / np.std(recording.q[::10, 0]), rel=1e-9)
-    assert x.relative > 0.05
+    assert x.relative_rms == pytest.approx(x.rms / np.std(recording.q[::10, 0]), rel=1e-9)
+    assert x.relative_rms > 0.05
     assert f"| x | m | {x.rms:.4g} |" in comparison.to_markdown()
 
 
@@ -208,7 +208,7 @@ def test_steps_that_cannot_be_are_refused(tmp_path, measured, step):
 def test_rounding_of_a_channel_at_rest_is_no_variation():
     """-45 deg in rad vary by 1e-16: the error is not 1e14 times that."""
     resting = np.full(101, np.radians(-45.0))
-    assert Channel("q3", "rad", resting, resting + 1e-3).relative == np.inf
+    assert ChannelComparison("q3", "rad", resting, resting + 1e-3).relative_rms == np.inf
 
 
 def test_one_sample_and_other_machines_are_refused(tmp_path, measured):

@@ -9,8 +9,8 @@ from rig import Converter, Rig, Sensors, Tolerances, converter, rig
 
 import crane
 from crane.common.errors import InputError, LimitError
-from crane.description import Friction, changed, parameters
-from crane.formats import read
+from crane.description import Friction, apply_parameter_changes, parameters
+from crane.formats import read_machine_spec
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 
@@ -276,8 +276,8 @@ def test_a_force_keeps_its_sign_when_the_load_drives():
 @pytest.mark.parametrize("seed", range(4))
 def test_parameters_are_within_the_tolerances(mini, seed):
     drawn = Rig(mini, seed)
-    spec = read("mini_forwarder")
-    printed, numbers = parameters(spec), parameters(changed(spec, drawn.changes))
+    spec = read_machine_spec("mini_forwarder")
+    printed, numbers = parameters(spec), parameters(apply_parameter_changes(spec, drawn.changes))
     most = Tolerances()
     bodies = [name.removesuffix(".mass") for name in printed if name.endswith(".mass")]
     bodies.remove("payload")
@@ -321,7 +321,7 @@ def test_parameters_are_within_the_tolerances(mini, seed):
 def test_draws_fill_the_tolerances(mini):
     """Of a uniform distribution: the mean is zero, the spread 1/sqrt(3) of the half-width."""
     shares, errors = [], []
-    printed = parameters(read("mini_forwarder"))
+    printed = parameters(read_machine_spec("mini_forwarder"))
     for seed in range(12):
         drawn = Rig(mini, seed)
         found, errors = drawn.changes, [*errors, *drawn.errors]

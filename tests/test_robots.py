@@ -9,8 +9,8 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning
-from crane.control import controller
-from crane.motion.curves import point_to_point
+from crane.control import make_controller
+from crane.motion.trajectory import point_to_point
 
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
 FREEDOMS = {
@@ -42,7 +42,7 @@ def test_they_close(name):
     closure = machine.closure
     assert len(machine.active) == FREEDOMS[name]
     assert closure.residual(machine.home) <= 1e-12
-    assert closure.structure.surplus.gap <= 1e-12
+    assert closure.structure.redundancy.largest_gap <= 1e-12
     coordinates = closure.equations.coordinates
     assert (machine.home >= coordinates.lower - 1e-9).all()
     assert (machine.home <= coordinates.upper + 1e-9).all()
@@ -62,7 +62,7 @@ def test_computed_torque_holds_home(name):
     machine = robot(name)
     home = machine.home[machine.closure.active]
     driven = [i for i, joint in enumerate(machine.active) if joint not in machine.free]
-    hold = controller("computed-torque", machine, point_to_point(home, home, 1.0))
+    hold = make_controller("computed-torque", machine, point_to_point(home, home, 1.0))
     run = crane.simulate(machine, hold)
     assert run.time[-1] == pytest.approx(1.0)
     assert np.abs(run.q - run.q[0])[:, driven].max() < 1e-6

@@ -10,8 +10,8 @@ from broken import DATA
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.dynamics.dynamics import BACKENDS
-from crane.identification.mechanics.inertias import Inertial, RotorInertia
-from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
 
 BARE = {"friction": {}, "forces": (), "end_stops": ()}
 RATIO, DISC = 2.0, 5e-3  # rotor's speed over the joint's, [kg m2]
@@ -123,13 +123,14 @@ def test_rotors_are_known_to_identification_unless_a_term_has_them(rotors):
     q_a, v_a, a_a, _ = states(rotors, 20, seed=2)
     q_a[:, 1:] *= 0.03
     wanted = crane.Dynamics(rotors).inverse(q_a, v_a, a_a)
-    given = Model(rotors, [Inertial(rotors)])
-    asked = Model(
-        rotors, [Inertial(rotors), RotorInertia(rotors, "X1"), RotorInertia(rotors, "q3")]
+    given = IdentificationModel(rotors, [InertialTerm(rotors)])
+    asked = IdentificationModel(
+        rotors,
+        [InertialTerm(rotors), RotorInertiaTerm(rotors, "X1"), RotorInertiaTerm(rotors, "q3")],
     )
     for model, count in ((given, 110), (asked, 112)):
         at = model.samples(q_a, v_a, a_a)
-        found = model.regressor(at) @ model.nominal + model.known(at)
+        found = model.regressor(at) @ model.nominal + model.known_forces(at)
         assert len(model.nominal) == count
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
 
@@ -159,7 +160,7 @@ def test_armature_is_mujoco_s_in_closed_loops(rotors, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         crane.write_mjcf(rotors, tmp_path / "rotors.xml")
-        again = crane.load(tmp_path / "rotors.xml").driven_by(rotors.active)
+        again = crane.load(tmp_path / "rotors.xml").with_active_joints(rotors.active)
     assert {x: again.tree.joints[x].rotor_inertia for x in ROTORS} == ROTORS
     oracle, dynamics = Oracle(tmp_path / "rotors.xml", rotors), crane.Dynamics(rotors)
     for q_a, v_a, _, tau in zip(*states(rotors, 5, seed=5), strict=True):

@@ -6,10 +6,10 @@ import pytest
 
 import crane.cli.demo
 from crane.cli.runs import check_folder, check_free, read_run, write_run
+from crane.common.atomic_output import portable_file_name, replace_folder
 from crane.common.errors import OutputError
-from crane.common.output import file_name, staging
 from crane.recordings.recording import Recording
-from crane.recordings.summary import subject, title
+from crane.recordings.recording_summary import recorded_machine_name, result_title
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def tree(folder):
 class TestStaging:
     def test_folder_appears_whole_at_the_end(self, tmp_path):
         target = tmp_path / "a" / "b"
-        with staging(target) as part:
+        with replace_folder(target) as part:
             (part / "inner").mkdir()
             (part / "inner" / "file").write_text("new")
             assert not (tmp_path / "a").exists()
@@ -42,7 +42,7 @@ class TestStaging:
         (target / "inner").mkdir(parents=True)
         for name in ("one", "inner/two", "inner/three"):
             (target / name).write_text("old")
-        with staging(target) as part:
+        with replace_folder(target) as part:
             (part / "inner").mkdir()
             (part / "inner" / "two").write_text("new")
             (part / "one").write_text("new")
@@ -59,7 +59,7 @@ class TestStaging:
             target.mkdir(parents=True)
             (target / "file").write_text("old")
         before = tree(tmp_path)
-        with pytest.raises(error), staging(target) as part:
+        with pytest.raises(error), replace_folder(target) as part:
             (part / "file").write_text("new")
             raise error
         assert tree(tmp_path) == before
@@ -70,7 +70,7 @@ class TestStaging:
         (tmp_path / "one").mkdir()
         (tmp_path / "two").write_text("old")
         before = tree(tmp_path)
-        with pytest.raises(OutputError, match="is a f"), staging(tmp_path) as part:
+        with pytest.raises(OutputError, match="is a f"), replace_folder(tmp_path) as part:
             (part / "zero").write_text("new")
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_text("new")
@@ -80,19 +80,19 @@ class TestStaging:
         target = tmp_path / "run"
         with (
             pytest.raises(OutputError, match=rf"^{target}/file: is full$"),
-            staging(target) as part,
+            replace_folder(target) as part,
         ):
             raise OutputError(f"{part / 'file'}: is full")
         with (
             pytest.raises(OutputError, match=rf"^{target}: cannot be written \(No space"),
-            staging(target),
+            replace_folder(target),
         ):
             raise OSError(28, "No space left on device")
 
     def test_a_link_stays_a_link(self, tmp_path):
         (tmp_path / "link").symlink_to(tmp_path / "run")
         for text in ("one", "two"):
-            with staging(tmp_path / "link") as part:
+            with replace_folder(tmp_path / "link") as part:
                 (part / "file").write_text(text)
             assert (tmp_path / "link").is_symlink()
             assert (tmp_path / "run" / "file").read_text() == text
@@ -155,7 +155,7 @@ def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recordin
     text = write_run(tmp_path, recording)
     assert set(tree(tmp_path)) == {"recording.csv", "summary.md", "notes.txt"}
     assert (tmp_path / "summary.md").read_text() == text
-    assert text.startswith(f"# {title(subject(recording), recording.task)}\n")
+    assert text.startswith(f"# {result_title(recorded_machine_name(recording), recording.task)}\n")
     np.testing.assert_array_equal(read_run(tmp_path).time, recording.time)
 
 
@@ -184,4 +184,4 @@ def test_demo_that_stops_leaves_nothing(tmp_path, monkeypatch, error, recording)
     ],
 )
 def test_names_of_files(text, name):
-    assert file_name(text) == name
+    assert portable_file_name(text) == name

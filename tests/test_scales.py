@@ -51,9 +51,9 @@ def moved(name, scale, folder, backend):
     path = written(name, scale, folder)
     report = quiet(crane.check, path)
     found = {
-        (finding.error, re.sub(r"[-+]?\d[\d.e+-]*", "#", finding.what))
+        (finding.is_error, re.sub(r"[-+]?\d[\d.e+-]*", "#", finding.message))
         for finding in report.findings
-        if not FAR.search(finding.what)
+        if not FAR.search(finding.message)
     }
     machine = quiet(crane.load, path)
     closure, n, random = machine.closure, len(machine.active), np.random.default_rng(0)
@@ -69,7 +69,10 @@ def moved(name, scale, folder, backend):
     q_a, v_a, a_a = q_a * coordinate, *random.normal(size=(2, 12, n))
     every = scale.of(machine, "coordinate", machine.joints)
     q = closure.solve(q_a)
-    gaps = [np.abs(closure.equations.scaled(one)[0][closure.structure.rows]).max() for one in q]
+    gaps = [
+        np.abs(closure.equations.evaluate_scaled(one)[0][closure.structure.independent_rows]).max()
+        for one in q
+    ]
     dynamics = crane.Dynamics(machine, backend=backend)
     tau = dynamics.inverse(q_a, v_a * rate, a_a * acceleration)
     recording = quiet(
@@ -87,7 +90,7 @@ def moved(name, scale, folder, backend):
         "mass": dynamics.mass_matrix(q_a) * coordinate * coordinate[:, None] / scale.by((2, 1, 0)),
         "inverse": tau / force,
         "forward": dynamics.forward(q_a, v_a * rate, 0.5 * tau) / acceleration,
-        "condition": closure.condition(q),
+        "condition": closure.condition_number(q),
         "motion": recording.q / coordinate,
         "kinetic": recording.channels["kinetic"] / energy,
     }
@@ -138,7 +141,7 @@ def test_workspaces_of_any_size(name, s, folder):
         crane.workspace(quiet(crane.load, written(name, scale, folder)), **frame)
         for scale in (ONE, Scale(s))
     )
-    assert other.share == pytest.approx(one.share, rel=1e-9)
+    assert other.closed_share == pytest.approx(one.closed_share, rel=1e-9)
     assert other.area == pytest.approx(one.area * s**2, rel=1e-9)
     for found, wanted in zip(other.extremes, one.extremes, strict=True):
         assert found.value == pytest.approx(wanted.value * s, rel=1e-6)
@@ -176,11 +179,13 @@ def test_a_loop_that_stays_open_is_told_at_any_size(s, folder):
 @pytest.mark.parametrize("s", [1e-3, 1e4])
 def test_base_parameters_are_those_of_the_machine(s, folder):
     """Groups of masses, first moments and inertias, whose factors have powers of a length."""
-    from crane.identification.mechanics.base import base_parameters
-    from crane.identification.mechanics.model import Model
+    from crane.identification.mechanics.base_parameters import base_parameters
+    from crane.identification.mechanics.identification_model import IdentificationModel
 
     one, other = (
-        base_parameters(Model(quiet(crane.load, written("mini_forwarder.yaml", scale, folder))))
+        base_parameters(
+            IdentificationModel(quiet(crane.load, written("mini_forwarder.yaml", scale, folder)))
+        )
         for scale in (ONE, Scale(s))
     )
     assert one.names == other.names and one.unobservable == other.unobservable

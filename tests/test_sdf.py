@@ -12,7 +12,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.opening import robots
+from crane.formats.robot_files import open_robots
 
 
 def load(path, **options):
@@ -230,7 +230,7 @@ def test_parts_apart(tmp_path):
 def test_a_link_without_mass_weighs_what_sdf_says(tmp_path):
     text = arm(TWO).replace(MASS, "", 1).replace('name="b"><pose>', 'name="b" ><pose>')
     machine, told = warnings_of(written(tmp_path, text))
-    assert machine.tree.mass == 2.5
+    assert machine.tree.total_mass == 2.5
     assert told == [
         "arm.sdf:2: link 'a' has no <inertial>, which SDF takes as 1 kg and 1 kg m2: write what "
         "it has"
@@ -432,7 +432,7 @@ def test_models_within_models(tmp_path):
     rng = np.random.default_rng(0)
     assert_same(load(path, packages=[tmp_path / "models"]), load(flat), rng)
     machine = load(path, packages=[tmp_path / "models"])
-    assert crane.formats.recalled(machine.call).model == machine.model
+    assert crane.formats.load_from_expression(machine.load_expression).model == machine.model
 
 
 def test_a_world_with_one_machine(tmp_path):
@@ -460,7 +460,7 @@ def test_what_is_drawn(tmp_path):
     )
     text = arm(TWO).replace(MASS, MASS + visual, 1)
     machine = load(written(tmp_path, text))
-    with robots(machine) as (xml,):
+    with open_robots(machine) as (xml,):
         (drawn,) = xml.root.iter("visual")
     assert drawn.find("origin").get("xyz").split() == ["0.0", "0.0", "2.0"]
     crane.write_urdf_plus(machine, tmp_path / "out.urdf")

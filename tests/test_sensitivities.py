@@ -8,7 +8,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError
-from crane.formats.loading import Variants
+from crane.formats.machine_loading import MachineVariants
 from crane.recordings import timeseries
 
 MASS, STIFFNESS, DAMPING = 2.0, 50.0, 0.6
@@ -42,7 +42,7 @@ def test_a_damped_spring_as_its_closed_form(tmp_path):
     spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}, damping: {DAMPING}}}]"
     machine = block(tmp_path, spring=spring)
     by = ("start.x", "start.x_velocity", "block.mass", "spring.x.stiffness", "spring.x.damping")
-    found = crane.sensitivities(machine, None, ([0.3], [0.1]), 5.0, 2e-3, by=by,
+    found = crane.sensitivities(machine, None, ([0.3], [0.1]), 5.0, 2e-3, parameters=by,
                                 outputs=("x", "x_velocity"))  # fmt: skip
     time = found.recording.time
     at = np.array([0.3, 0.1, MASS, STIFFNESS, DAMPING])
@@ -53,7 +53,9 @@ def test_a_damped_spring_as_its_closed_form(tmp_path):
             w * (swung(time, *(at + j * h)) - swung(time, *(at - j * h))) for j, w in weights
         )
         true /= 1e-3 * at[i]
-        assert found.slopes[:, :, i] == pytest.approx(true, abs=1e-9 * np.abs(true).max()), name
+        assert found.derivatives[:, :, i] == pytest.approx(true, abs=1e-9 * np.abs(true).max()), (
+            name
+        )
     assert found.values == pytest.approx(at)
 
 
@@ -64,28 +66,30 @@ def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
     machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}", spring)
     by = ("start.x", "friction.x.coulomb", "spring.x.stiffness", "block.mass")
     outputs = ("x", "x_velocity")
-    found = crane.sensitivities(machine, None, [x0], 4.0, 2e-3, by=by, outputs=outputs)
+    found = crane.sensitivities(machine, None, [x0], 4.0, 2e-3, parameters=by, outputs=outputs)
     n = round((x0 * STIFFNESS / coulomb - 1.0) / 2.0 + 0.4999)
     assert found.recording.q[-1, 0] == pytest.approx(
         (-1) ** n * (x0 - 2 * n * coulomb / STIFFNESS)
     )
     true = (-1) ** n * np.array([1.0, -2 * n / STIFFNESS, 2 * n * coulomb / STIFFNESS**2, 0.0])
-    assert found.slopes[-1, 0] == pytest.approx(true, abs=1e-8)
-    assert found.slopes[-1, 1] == pytest.approx(0.0, abs=1e-8)
+    assert found.derivatives[-1, 0] == pytest.approx(true, abs=1e-8)
+    assert found.derivatives[-1, 1] == pytest.approx(0.0, abs=1e-8)
     # and during the first half swing
     w, time = np.sqrt(STIFFNESS / MASS), found.recording.time
     first = time < np.pi / w
-    assert found.of("x", "start.x")[first] == pytest.approx(np.cos(w * time[first]), abs=1e-8)
+    assert found.derivative("x", "start.x")[first] == pytest.approx(
+        np.cos(w * time[first]), abs=1e-8
+    )
 
 
-class Ramp(crane.Law):
+class Ramp(crane.ControlLaw):
     """A force that grows."""
 
     def references(self, times):
         return 3.0 * times[:, None]
 
-    def law(self, at):
-        return at.reference, ()
+    def law(self, inputs):
+        return inputs.reference, ()
 
 
 def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
@@ -93,15 +97,17 @@ def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
     coulomb = 2.0
     machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}")
     by = ("friction.x.coulomb", "block.mass")
-    found = crane.sensitivities(machine, Ramp(machine), [0.0], 2.0, 2e-3, by=by, outputs=("x",))
+    found = crane.sensitivities(
+        machine, Ramp(machine), [0.0], 2.0, 2e-3, parameters=by, outputs=("x",)
+    )
     since = np.maximum(found.recording.time - coulomb / 3.0, 0.0)
-    assert found.slopes[:, 0, 0] == pytest.approx(-(since**2) / (2 * MASS), abs=1e-9)
-    assert found.slopes[:, 0, 1] == pytest.approx(-3.0 * since**3 / (6 * MASS**2), abs=1e-9)
+    assert found.derivatives[:, 0, 0] == pytest.approx(-(since**2) / (2 * MASS), abs=1e-9)
+    assert found.derivatives[:, 0, 1] == pytest.approx(-3.0 * since**3 / (6 * MASS**2), abs=1e-9)
 
 
 def differences(machine, made, by, duration, step, outputs, share):
     """Derivatives (N, k, p) of order 4, and how far those over half as much differ."""
-    variants, out, doubt = Variants(machine), [], []
+    variants, out, doubt = MachineVariants(machine), [], []
 
     def run(name, value):
         with warnings.catch_warnings():
@@ -129,10 +135,17 @@ def compare(machine, made, by, duration, step, outputs, share):
     """To 1e-6, or as well as differences of simulations know. Returns the relative gaps."""
     controller, initial = made(machine)
     found = crane.sensitivities(
-        machine, controller, initial, duration, step, by=by, outputs=outputs, tolerance=1e-10
+        machine,
+        controller,
+        initial,
+        duration,
+        step,
+        parameters=by,
+        outputs=outputs,
+        tolerance=1e-10,
     )
     true, doubt = differences(machine, made, by, duration, step, outputs, share)
-    gap, doubt = np.abs(found.slopes - true).max(axis=0), doubt.max(axis=0)
+    gap, doubt = np.abs(found.derivatives - true).max(axis=0), doubt.max(axis=0)
     columns = found.recording.columns()
     sizes = np.array([np.ptp(columns[output]) for output in outputs])[:, None]
     numbers = np.where(found.values, np.abs(found.values), 0.1)
@@ -176,7 +189,7 @@ def test_ten_seconds_on_valves(sticks, share):
     def made(other):
         valve = other.hydraulics.valves["X_lift"]
         levers = valve.neutral + 0.4 * np.array([0, 0, 1, 1, 0, 0]) * (valve.full - valve.neutral)
-        signals = crane.Signals(other, [0, 0.5, 1, 4, 4.5, 10.0], {"X_lift": levers})
+        signals = crane.ValveSignals(other, [0, 0.5, 1, 4, 4.5, 10.0], {"X_lift": levers})
         return signals, [0.2, 0.3]
 
     outputs = ("X_lift", "X_tilt", "pressure_X_lift_a", "tip_z")
@@ -188,18 +201,18 @@ def test_what_has_no_sensitivity_is_refused(tmp_path):
     machine = block(tmp_path)
     start = ([0.0], [1.0])
     for options, text in (
-        ({"by": ["start.y"]}, "'start.y' is no start of an active joint"),
-        ({"by": ["mass"]}, "'mass'"),
-        ({"by": ["block.mass"], "outputs": ["y"]}, "'y' is no output of 'block'"),
-        ({"by": []}, "no number is named"),
+        ({"parameters": ["start.y"]}, "'start.y' is no start of an active joint"),
+        ({"parameters": ["mass"]}, "'mass'"),
+        ({"parameters": ["block.mass"], "outputs": ["y"]}, "'y' is no output of 'block'"),
+        ({"parameters": []}, "no number is named"),
     ):
         with pytest.raises(CraneError, match=text):
             crane.sensitivities(machine, None, start, 0.1, **options)
-    with pytest.raises(CraneError, match="write it as a crane.control.Law"):
-        crane.sensitivities(machine, lambda t, q, v: q, start, 0.1, by=["block.mass"])
+    with pytest.raises(CraneError, match="write it as a crane.control.ControlLaw"):
+        crane.sensitivities(machine, lambda t, q, v: q, start, 0.1, parameters=["block.mass"])
     with pytest.raises(CraneError, match="dead centre"):
         crank = crane.load("tests/data/slider_crank.yaml")
-        crane.sensitivities(crank, None, ([1.0], [0.0]), 2.0, by=["start.theta"])
+        crane.sensitivities(crank, None, ([1.0], [0.0]), 2.0, parameters=["start.theta"])
 
 
 def test_the_command_tells_what_a_motion_depends_on(tmp_path):
@@ -211,7 +224,7 @@ def test_the_command_tells_what_a_motion_depends_on(tmp_path):
     assert "| link3.mass | 0.218 | 0.00218 |" in done.stdout and "X1_force [N]" in done.stdout
     names = {"sensitivities.md", "sensitivities.csv", "sensitivities.png"}
     assert {path.name for path in out.iterdir()} == names
-    table = timeseries.read(out / "sensitivities.csv")
+    table = timeseries.read_table(out / "sensitivities.csv")
     first = dict(zip(table.units, table.values[0], strict=True))
     assert first["X1 by start.X1"] == pytest.approx(1.0) and first["X1 by link3.mass"] == 0.0
     for options, said in (

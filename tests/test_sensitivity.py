@@ -10,10 +10,10 @@ from test_floating import ARM, states, walker
 
 import crane
 from crane.common.errors import CraneError
-from crane.description.changes import parameters
-from crane.dynamics.compiled import SLOPES
-from crane.dynamics.named import Named
-from crane.formats.loading import Variants
+from crane.description.parameter_changes import parameters
+from crane.dynamics.compiled_dynamics import DERIVATIVES_OF
+from crane.dynamics.constant_derivatives import ConstantDerivatives
+from crane.formats.machine_loading import MachineVariants
 
 ORDER_8 = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
 BUNDLED = ("mini_forwarder", "patu655", "tx40", "kr300")
@@ -127,7 +127,7 @@ def test_floating_bases_move_along_their_twist(name, tmp_path):
     n = len(machine.active)
     ((q_a, v_a, x),) = states(machine, 1)
     found = dynamics.derivatives("forward", q_a, v_a, x)
-    column = machine.coordinates.floating[0]
+    column = machine.coordinates.floating_base_columns[0]
     base = [machine.active.index(joint) for joint in machine.joints[column : column + 6]]
     place, vector = base[:3], base[3:]
     motions = pin.exp3(q_a[vector]), q_a[place].copy()
@@ -243,11 +243,11 @@ def test_every_operation_and_the_formulas_of_their_own_agree(monkeypatch):
     machine = machine_of("mini_forwarder")
     dynamics, _, q_a, v_a, a_a = state(machine, 7)
     q, inputs = machine.closure.solve(q_a), np.concatenate([v_a, a_a])
-    found = dynamics._compiled(SLOPES + "forward").at(q, inputs)
-    monkeypatch.setattr("crane.dynamics.compiled._ANALYTIC", {})
+    found = dynamics._required_formula(DERIVATIVES_OF + "forward").evaluate_closed(q, inputs)
+    monkeypatch.setattr("crane.dynamics.compiled_dynamics._ANALYTIC_DERIVATIVES", {})
     plain = crane.Dynamics(crane.load("mini_forwarder"))
-    plain.pattern[0] = np.nan  # another program
-    other = plain._compiled(SLOPES + "forward").at(q, inputs)
+    plain.constant_pattern[0] = np.nan  # another program
+    other = plain._required_formula(DERIVATIVES_OF + "forward").evaluate_closed(q, inputs)
     np.testing.assert_allclose(found, other, rtol=0, atol=1e-12 * np.abs(other).max())
 
 
@@ -261,14 +261,14 @@ def test_numbers_of_the_machine(name):
     machine = machine_of(name)
     dynamics, _, q_a, v_a, a_a = state(machine, 8)
     v_a = np.abs(v_a) + 0.05
-    variants = Variants(machine)
+    variants = MachineVariants(machine)
     values = parameters(variants.spec)
     heads = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
     names = [x for x in values if x.split(".")[0] not in heads]
-    random, named, possible, tried = np.random.default_rng(9), Named(machine), [], 0
+    random, named, possible, tried = np.random.default_rng(9), ConstantDerivatives(machine), [], 0
     for number in random.permutation(names)[:18].tolist():
         try:
-            named.slopes([number], dynamics.constants)
+            named.jacobian([number], dynamics.constants_of)
         except CraneError as error:
             assert "cannot be varied" in str(error)
             continue
@@ -355,6 +355,6 @@ def test_all_derivatives_of_forward_dynamics_take_few_operations(name, most):
     """Beside forward dynamics; a row of a product of matrices counts as its entries."""
     counts = {}
     dynamics = crane.Dynamics(machine_of(name))
-    for quantity in ("forward", SLOPES + "forward"):
-        counts[quantity] = dynamics._formula(quantity)._program.longest
-    assert counts[SLOPES + "forward"] <= most * counts["forward"]
+    for quantity in ("forward", DERIVATIVES_OF + "forward"):
+        counts[quantity] = dynamics._compiled_quantity(quantity)._program.max_formula_length
+    assert counts[DERIVATIVES_OF + "forward"] <= most * counts["forward"]

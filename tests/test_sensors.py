@@ -12,13 +12,13 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description.sensors import Sensor
-from crane.formats.loading import Variants
+from crane.formats.machine_loading import MachineVariants
 from crane.recordings import timeseries
-from crane.recordings.pins import pin_slopes
-from crane.recordings.reading import corrected, read, within
+from crane.recordings.ideal_sensors import ideal_readings
+from crane.recordings.pin_derivatives import pin_derivatives
 from crane.recordings.recording import Recording
-from crane.recordings.sensed import sensed
-from crane.recordings.strokes import dead_length
+from crane.recordings.recording_reader import correct_readings, read_quantities, select_time_span
+from crane.recordings.stroke_check import dead_length
 from crane.recordings.timeseries import Table
 
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -60,7 +60,7 @@ def motion(machine):
     v = np.einsum("nij,nj->ni", machine.closure.gamma(q), v_a)
     names = ["q2", "q3", "inclination_lift_boom", "inclination_tilt_boom"]
     names += [f"{name}_velocity" for name in names]
-    said = sensed(machine, q, v, names)
+    said = ideal_readings(machine, q, v, names)
     columns = {"time": time, "X_lift": q_a[:, 0], "X_tilt": q_a[:, 1], **said}
     columns |= {"X_lift_force": 1e4 + 0 * time, "X_tilt_force": 1e4 + 0 * time}
     units = {"time": "s", "X_lift": "m", "X_tilt": "m", "X_lift_force": "N", "X_tilt_force": "N"}
@@ -75,7 +75,7 @@ def written(folder, motion, names=None, notes=None, **off):
     values = [off[x](columns[x]) if x in off else columns[x] for x in names]
     path = folder / "run.csv"
     table = Table({x: units[x] for x in names}, np.column_stack(values), notes or {})
-    timeseries.write(path, table)
+    timeseries.write_table(path, table)
     return path
 
 
@@ -100,14 +100,14 @@ def test_a_sensor_reads_late_scaled_and_off_and_is_corrected():
     time = np.linspace(0.0, 4.0, 401)
     reading = -2.0 * (time - 0.1) ** 2 + 0.3
     table = Table({"time": "s", "q": "rad"}, np.column_stack([time, reading]), {})
-    found = corrected(table, {"q": sensor})
+    found = correct_readings(table, {"q": sensor})
     assert found.values[-1, 0] == pytest.approx(3.9)  # what comes later it has not told
     np.testing.assert_allclose(found.values[:, 1], found.values[:, 0] ** 2, atol=1e-12)
     signal = Table({"time": "s", "voltage_q": "V"}, np.column_stack([time, time**2]), {})
-    at_valve = corrected(signal, {"voltage_q": Sensor(zero=0.3, scale=2.0)}).values[:, 1]
+    at_valve = correct_readings(signal, {"voltage_q": Sensor(zero=0.3, scale=2.0)}).values[:, 1]
     np.testing.assert_allclose(at_valve, 2.0 * time**2 + 0.3, atol=1e-12)
     for late in (
-        lambda: corrected(signal, {"voltage_q": Sensor(delay=0.1)}),
+        lambda: correct_readings(signal, {"voltage_q": Sensor(delay=0.1)}),
         lambda: crane.load("patu655", changes={"sensor.voltage_q.delay": 0.1}),
     ):
         with pytest.raises(InputError, match=r"its valve is: give 'valve.q.delay'$"):
@@ -234,7 +234,7 @@ def test_sensors_that_agree_say_nothing(machine, motion, tmp_path):
         assert told(machine, written(tmp_path, motion, **off)) == []
 
 
-@pytest.mark.parametrize("name", crane.description.bundled())
+@pytest.mark.parametrize("name", crane.description.bundled_machines())
 def test_simulations_of_bundled_machines_agree_with_themselves(name, tmp_path):
     machine = crane.load(name)
     active = [x for x in machine.active if x not in machine.free]
@@ -315,7 +315,7 @@ def test_a_pin_elsewhere_is_named(machine, motion, tmp_path, name, at):
     assert told(other, tmp_path / "run.csv") == []
     assert "'q2'" in line and "a constant offset leaves" in line
     assert "a pin elsewhere alone" in line
-    drawn = Variants(machine).values[name]  # found to first order of how far it is off
+    drawn = MachineVariants(machine).values[name]  # found to first order of how far it is off
     assert number(line, name) == pytest.approx(at, abs=0.06 * abs(at - drawn))
 
 
@@ -323,8 +323,8 @@ def test_postures_change_with_pins_as_other_machines_have_them(machine):
     """Central differences over machines that are loaded with pins elsewhere."""
     random = np.random.default_rng(3)
     q_a = random.uniform(0.2, 0.8, (4, 2)) * (machine.upper - machine.lower)
-    slopes = pin_slopes(machine, machine.closure.solve(q_a))
-    variants = Variants(machine)
+    slopes = pin_derivatives(machine, machine.closure.solve(q_a))
+    variants = MachineVariants(machine)
     assert {name.rpartition(".")[0] for name in slopes} == {
         "lift_boom_rod", "lift_eye", "tilt_eye", "tilt_boom_bracket", "bracket2_eye"
     }  # fmt: skip
@@ -348,7 +348,7 @@ def test_an_absolute_angle_in_the_place_of_a_joint_s_is_suspected(machine, motio
     names = ["time", "q2", "q3", "inclination_tilt_boom", "X_lift_force", "X_tilt_force"]
     values = [absolute + 0.01 if x == "q3" else columns[x] for x in names]
     table = Table({x: units[x] for x in names}, np.column_stack(values), {})
-    timeseries.write(tmp_path / "run.csv", table)
+    timeseries.write_table(tmp_path / "run.csv", table)
     (line,) = told(machine, tmp_path / "run.csv")
     assert "'inclination_tilt_boom' is" in line and suspected in line
 
@@ -380,7 +380,7 @@ def test_inclinometers_tell_the_posture(machine, motion, tmp_path, given):
     columns, units = motion
     names = ["time", *given, "X_lift_force", "X_tilt_force"]
     table = Table({x: units[x] for x in names}, np.column_stack([columns[x] for x in names]), {})
-    timeseries.write(tmp_path / "run.csv", table)
+    timeseries.write_table(tmp_path / "run.csv", table)
     found = crane.read_measured(machine, tmp_path / "run.csv")
     for i, joint in enumerate(("X_lift", "X_tilt")):
         np.testing.assert_allclose(found.q[:, i], columns[joint], atol=1e-9)
@@ -407,7 +407,7 @@ def test_one_sample_is_compared_and_its_rates_are_not(machine, motion, tmp_path)
     columns, units = motion
     names = ["q2", "q2_velocity", "X_lift", "X_tilt", "time", "X_lift_force", "X_tilt_force"]
     values = np.array([[columns[x][0] + 0.1 * x.startswith("q2") for x in names]])
-    timeseries.write(tmp_path / "run.csv", Table({x: units[x] for x in names}, values, {}))
+    timeseries.write_table(tmp_path / "run.csv", Table({x: units[x] for x in names}, values, {}))
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         (line,) = told(machine, tmp_path / "run.csv")
@@ -424,7 +424,7 @@ def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
         names = ["time", name, "X_lift_force", "X_tilt_force"] + ["X_lift"] * bool(off)
         values = [columns[x] + off * (x == name) for x in names]
         table = Table({x: units[x] for x in names}, np.column_stack(values), {})
-        timeseries.write(tmp_path / "run.csv", table)
+        timeseries.write_table(tmp_path / "run.csv", table)
         with pytest.raises(RecordingError) as error:
             crane.read_measured(machine, tmp_path / "run.csv")
         assert said in str(error.value)
@@ -455,9 +455,9 @@ def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
 def test_a_delay_reads_beyond_the_window(machine, motion, tmp_path):
     """The end of a window holds what a late sensor says after it."""
     path = written(tmp_path, motion, [])
-    table = timeseries.read(path)
+    table = timeseries.read_table(path)
     late = {"X_lift": Sensor(delay=0.1)}
-    cut = within(corrected(table, late), (3.0, 5.0), path)
+    cut = select_time_span(correct_readings(table, late), (3.0, 5.0), path)
     assert cut.values[-1, 1] == pytest.approx(
         np.interp(5.1, table.values[:, 0], table.values[:, 1])
     )
@@ -517,15 +517,15 @@ def test_a_raw_log_is_read_by_the_sensors_of_its_machine(machine, tmp_path):
     known["spool_X_lift"] = Sensor("spool")
     path = crane.write_machine(machine.replace(sensors=known), tmp_path / "machine")
     with pytest.warns(CraneWarning, match="'spool_X_lift' \\(no 'spool'\\)"):
-        one = read(LIFTING, crane.load(path))
+        one = read_quantities(LIFTING, crane.load(path))
     del known["time"], known["spool_X_lift"]
     with pytest.raises(
         RecordingError, match="yaml: does not say which column of .* is 'time', kn"
     ):
-        read(LIFTING, machine.replace(sensors=known))
-    two = read(LIFTING, machine, columns)
+        read_quantities(LIFTING, machine.replace(sensors=known))
+    two = read_quantities(LIFTING, machine, columns)
     assert one.units == two.units and np.array_equal(one.values, two.values)
-    raw = timeseries.arrays(LIFTING)
+    raw = timeseries.read_log_arrays(LIFTING)
     at = list(one.units).index("inclination_tilt_boom")
     np.testing.assert_allclose(one.values[:, at], np.deg2rad(raw["z2_deg"]) + 0.085, atol=1e-12)
     # what crane wrote is no log
@@ -534,7 +534,7 @@ def test_a_raw_log_is_read_by_the_sensors_of_its_machine(machine, tmp_path):
               {"sensors": "ideal"}), "x",
     ).to_csv(tmp_path / "run.csv")  # fmt: skip
     assert np.array_equal(
-        read(tmp_path / "run.csv", crane.load(path)).values[:, 0], one.values[:, 0]
+        read_quantities(tmp_path / "run.csv", crane.load(path)).values[:, 0], one.values[:, 0]
     )
 
 

@@ -7,12 +7,12 @@ import pytest
 from scipy.linalg import block_diag
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
-from crane.identification.mechanics import checks
-from crane.identification.mechanics.against import check_forces
-from crane.identification.mechanics.checks import check, check_samples
-from crane.identification.signals import motion as signals
-from crane.identification.signals import smoother
-from crane.identification.signals.motion import Motion, differentiate
+from crane.identification.mechanics import recording_checks
+from crane.identification.mechanics.force_checks import check_forces
+from crane.identification.mechanics.recording_checks import check_recording, check_samples
+from crane.identification.signals import kalman_smoother
+from crane.identification.signals import signal_processing as signals
+from crane.identification.signals.signal_processing import Motion, differentiate
 
 JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
 
@@ -85,7 +85,7 @@ def fixed(monkeypatch):
             x = math.log(h)
 
         monkeypatch.setattr(scipy.optimize, "minimize_scalar", lambda *_, **__: Found)
-        return smoother.smooth(y, step)
+        return kalman_smoother.kalman_smooth(y, step)
 
     return smooth
 
@@ -118,7 +118,7 @@ def test_likelihood_is_the_density_of_what_polynomials_leave():
     rng = np.random.default_rng(3)
     y, costs, exact = rng.standard_normal(40).cumsum(), [], []
     for h in (0.3, 0.7, 1.4):
-        costs.append(smoother.likelihood(y, h)[0])
+        costs.append(kalman_smoother.likelihood(y, h)[0])
         F, Q = model(h)
         V, cross = np.zeros((40, 40)), np.zeros((4, 4))
         for k in range(40):
@@ -178,7 +178,7 @@ def test_without_noise_and_without_motion():
     found = differentiate(time, np.column_stack([q, np.full(4000, 0.3)]))
     np.testing.assert_allclose(found.v[:, :2], v, atol=1e-8)
     np.testing.assert_allclose(found.a[50:-50, :2], a[50:-50], atol=1e-4)
-    assert not found.v[:, 2].any() and found.passed[2] == math.inf
+    assert not found.v[:, 2].any() and found.passband[2] == math.inf
 
 
 def test_the_frequency_of_which_a_smoother_leaves_half():
@@ -186,8 +186,8 @@ def test_the_frequency_of_which_a_smoother_leaves_half():
     step, rng = 1e-3, np.random.default_rng(6)
     time = step * np.arange(20_000)
     found = differentiate(time, movement(time)[0] + 1e-4 * rng.standard_normal((20_000, 2)))
-    for passed in found.passed:
-        F, _, K = smoother._stationary(2 * np.pi * passed * step)
+    for passed in found.passband:
+        F, _, K = kalman_smoother._stationary_filter(2 * np.pi * passed * step)
         z = np.exp(2j * np.pi * passed * step)
         gain = np.linalg.solve(z * np.eye(4) - F @ (np.eye(4) - np.outer(K, np.eye(4)[0])), F @ K)
         innovation = 1 - gain[0]  # of the predictions; |1 - innovation spectrum| is what is left
@@ -291,8 +291,8 @@ def test_a_filtered_row_sees_its_neighbourhood_and_nothing_else(cutoff, decimati
 
 def test_moving():
     v = np.array([[0.1, -0.3], [-0.2, 0.0]])
-    np.testing.assert_array_equal(signals.moving(v, 0.15), [[False, True], [True, False]])
-    np.testing.assert_array_equal(signals.moving(v, [0.05, 1]), [[True, False], [True, False]])
+    np.testing.assert_array_equal(signals.is_moving(v, 0.15), [[False, True], [True, False]])
+    np.testing.assert_array_equal(signals.is_moving(v, [0.05, 1]), [[True, False], [True, False]])
 
 
 def recorded():
@@ -375,7 +375,7 @@ SPOILT = {
 def test_bad_recordings_are_explained(spoil, message):
     def judge():
         check_samples(recording["time"])
-        check(**recording)
+        check_recording(**recording)
 
     recording = recorded()
     judge()
@@ -461,5 +461,7 @@ def test_forces_come_late():
 
 def test_delay_between_samples():
     time = np.arange(5000) * 4e-3
-    found = checks.delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
+    found = recording_checks.signal_delay(
+        time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0]
+    )
     assert abs(found - 0.0615) < 1e-3

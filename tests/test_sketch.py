@@ -13,10 +13,10 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
-from crane.description import bundled
-from crane.view.sketch.draw import sketch_figure
-from crane.view.sketch.plane import find_plane
-from crane.view.sketch.sheet import symbol
+from crane.description import bundled_machines
+from crane.view.sketch.drawing_plane import find_plane
+from crane.view.sketch.sketch_figure import sketch_figure
+from crane.view.sketch.sketch_layout import format_joint_symbol
 
 PLANAR = ["four_bar.yaml", "slider_crank.yaml", "five_bar.urdf"]
 
@@ -26,7 +26,7 @@ def machines():
     """The bundled machines and those of tests/data that move in a plane."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        loaded = [crane.load(name) for name in bundled()]
+        loaded = [crane.load(name) for name in bundled_machines()]
     return loaded + [crane.load(DATA / name) for name in PLANAR]
 
 
@@ -115,7 +115,7 @@ def test_every_joint_and_loop_is_named_once(machines):
     for machine in machines:
         figure = sketch_figure(machine)
         expected = [*machine.joints, *(loop.name for loop in machine.closure.equations.loops)]
-        assert sorted(names(figure)) == sorted(map(symbol, expected)), machine.name
+        assert sorted(names(figure)) == sorted(map(format_joint_symbol, expected)), machine.name
 
 
 def test_no_words_overlap_at_home(machines):
@@ -131,7 +131,10 @@ def test_no_words_lie_on_lines_at_home(machines):
 def test_no_words_overlap_anywhere_on_the_cranes(machines):
     for machine in machines[:3]:
         for q_a in random_postures(machine, 5, seed=1):
-            assert overlaps(sketch_figure(machine, q_a, com=True)) == [], (machine.name, q_a)
+            assert overlaps(sketch_figure(machine, q_a, show_centres_of_mass=True)) == [], (
+                machine.name,
+                q_a,
+            )
 
 
 def test_axes_are_equal_and_named_in_metres(machines):
@@ -147,25 +150,25 @@ def test_axes_are_equal_and_named_in_metres(machines):
 
 def test_cylinders_reach_from_pin_to_pin(mini):
     """Barrels begin at their pins, rods end at theirs, whatever the strokes."""
-    from crane.view.sketch.mechanism import project
+    from crane.view.sketch.mechanism_projection import project_mechanism
 
     for q_a in random_postures(mini, 10):
         q = mini.closure.solve(q_a)
-        mechanism = project(mini, q, find_plane(mini, q))
-        pins = {shown.name: shown.at for shown in mechanism.pins}
+        mechanism = project_mechanism(mini, q, find_plane(mini, q))
+        pins = {shown.name: shown.position for shown in mechanism.pins}
         for slide, pin_name, eye in zip(
             mechanism.slides, ("q4", "q10"), ("A1_eye", "A2_eye"), strict=True
         ):
             np.testing.assert_allclose(slide.start, pins[pin_name], rtol=0, atol=1e-9)
-            np.testing.assert_allclose(slide.end, pins[eye], rtol=0, atol=1e-9)
-            way, along = slide.end - slide.start, slide.inner - slide.start
+            np.testing.assert_allclose(slide.rod_outer_end, pins[eye], rtol=0, atol=1e-9)
+            way, along = slide.rod_outer_end - slide.start, slide.rod_inner_end - slide.start
             barrel = np.linalg.norm(slide.mouth - slide.start)
             assert 0 < np.linalg.norm(along) < barrel < np.linalg.norm(way)
 
 
 def test_centres_of_mass_only_where_asked(mini):
     assert "centre of mass" not in drawn(sketch_figure(mini))
-    figure = sketch_figure(mini, com=True)
+    figure = sketch_figure(mini, show_centres_of_mass=True)
     lines = [x for x in figure.axes[0].get_lines() if x.get_gid() == "centre of mass"]
     places = {tuple(np.round(line.get_xydata()[0], 9)) for line in lines}
     data = mini.model.createData()

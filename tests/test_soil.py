@@ -8,7 +8,7 @@ import pytest
 
 import crane
 from crane.common.errors import CraneError
-from crane.description.external import Here
+from crane.description.external_forces import FrameMotion
 
 SANDY, CLAY = crane.SOILS["sandy loam"], crane.SOILS["lean clay"]
 STICKY = crane.Soil(18e3, 9e3, np.radians(25), np.radians(14), 4e3, 2e3)
@@ -54,8 +54,8 @@ def flattest(soil, rake):
 
 @pytest.mark.parametrize("soil", [SANDY, CLAY, STICKY, UNDRAINED, *crane.SOILS.values()])
 def test_factors_are_those_of_a_wedge_in_balance_that_resists_least(soil):
-    for rake in np.linspace(0.2, min(1.5, soil.steepest), 5):
-        factors, cot_beta = soil.factors(np.cos(rake), np.sin(rake))
+    for rake in np.linspace(0.2, min(1.5, soil.max_rake), 5):
+        factors, cot_beta = soil.cutting_factors(np.cos(rake), np.sin(rake))
         beta = np.arctan2(1.0, cot_beta)
         assert beta == pytest.approx(flattest(soil, rake), abs=1e-6)
         depth = 0.3
@@ -72,7 +72,7 @@ def test_factors_are_those_of_a_wedge_in_balance_that_resists_least(soil):
 def test_an_upright_blade_is_a_wall_under_passive_pressure(friction, tool, coefficient):
     """2 N_gamma is Coulomb's coefficient (tables of B. M. Das, Principles of Foundation Eng.)."""
     soil = crane.Soil(1.0, 0.0, np.radians(friction), np.radians(tool))
-    (of_weight, *_), _ = soil.factors(0.0, 1.0)
+    (of_weight, *_), _ = soil.cutting_factors(0.0, 1.0)
     assert 2 * of_weight == pytest.approx(coefficient, rel=5e-4)
 
 
@@ -81,10 +81,10 @@ def test_a_strip_bears_what_tables_say():
     for degrees, of_cohesion, of_pressure in (
         (0, 5.14, 1.0), (10, 8.35, 2.47), (20, 14.83, 6.40), (30, 30.14, 18.40), (40, 75.31, 64.20)
     ):  # fmt: skip
-        found = crane.Soil(0.0, 0.0, np.radians(degrees)).bearing
+        found = crane.Soil(0.0, 0.0, np.radians(degrees)).bearing_factors
         assert found == pytest.approx((of_cohesion, of_pressure), abs=6e-3)
-    near = crane.Soil(0.0, 0.0, 1e-9).bearing
-    assert near == pytest.approx(crane.Soil(0.0, 0.0, 0.0).bearing, rel=1e-8)
+    near = crane.Soil(0.0, 0.0, 1e-9).bearing_factors
+    assert near == pytest.approx(crane.Soil(0.0, 0.0, 0.0).bearing_factors, rel=1e-8)
 
 
 def seen(depth, rake, velocity, lean=0.0):
@@ -94,18 +94,18 @@ def seen(depth, rake, velocity, lean=0.0):
         np.cos(lean) * up + np.sin(lean) * lateral, [np.sin(rake), 0.0, np.cos(rake)]
     )  # fmt: skip
     turn = np.stack([np.cross(lateral, up), lateral, up], axis=1)
-    return Here([0.0, 0.0, -depth], turn.tolist(), list(velocity), [0.0] * 3, [])
+    return FrameMotion([0.0, 0.0, -depth], turn.tolist(), list(velocity), [0.0] * 3, [])
 
 
 def cutter(soil=STICKY, frame="blade", **options):
     options = {"width": 1.2, "length": 0.8, "smoothing": 1e-4} | options
-    return crane.Cutting(frame, soil, blade=(0, 0, 1), cutting=(1, 0, 0), **options)
+    return crane.SoilCutting(frame, soil, blade=(0, 0, 1), cutting=(1, 0, 0), **options)
 
 
 @pytest.mark.parametrize("soil", [STICKY, UNDRAINED, SANDY])
 def test_ahead_it_resists_with_the_wedge_and_withdrawn_it_only_rubs(soil):
     rake, depth = 1.0, 0.3
-    _, cot_beta = soil.factors(np.cos(rake), np.sin(rake))
+    _, cot_beta = soil.cutting_factors(np.cos(rake), np.sin(rake))
     ahead, _ = wedge(soil, rake, np.arctan2(1.0, cot_beta), depth)
     force = cutter(soil).wrench(seen(depth, rake, (1.0, 0.0, 0.0)))[0]
     assert np.array(force)[[0, 2]] == pytest.approx(1.2 * ahead, rel=1e-6)
@@ -114,7 +114,7 @@ def test_ahead_it_resists_with_the_wedge_and_withdrawn_it_only_rubs(soil):
     pressure = (1 - np.sin(soil.friction)) * (soil.surcharge + soil.unit_weight * depth / 2)
     shear = soil.adhesion + np.tan(soil.tool_friction) * pressure
     rubs = 2 * 1.2 * depth / np.sin(rake) * shear
-    of_cohesion, of_pressure = soil.bearing
+    of_cohesion, of_pressure = soil.bearing_factors
     strip = soil.cohesion * of_cohesion
     strip += (soil.surcharge + soil.unit_weight * depth) * of_pressure
     bears = 1.2 * 0.02 * strip / np.hypot(1.0, 0.02 / depth)
@@ -142,9 +142,9 @@ def test_beyond_the_bounds_of_the_rake_it_cuts_with_their_wedges():
     steep = crane.Soil(15e3, 0.0, 1.0, 1.0)
     heap, within = (
         np.array(cutter(steep).wrench(seen(depth, rake, ahead))[0])
-        for rake in (1.5, steep.steepest)
+        for rake in (1.5, steep.max_rake)
     )
-    assert steep.steepest == pytest.approx(np.pi - 2.35)
+    assert steep.max_rake == pytest.approx(np.pi - 2.35)
     assert heap == pytest.approx(within, rel=1e-6)
     flat, almost = (cutter().wrench(seen(depth, rake, ahead))[0] for rake in (0.0, 1e-6))
     sides = cutter().wrench(seen(depth, 0.0, (-1.0, 0.0, 0.0)))[0]
@@ -174,9 +174,9 @@ def test_it_never_drives_the_edge_and_is_always_a_number():
             np.linalg.norm(force) * np.linalg.norm(where.velocity),
         )
         assert power <= 1e-9 * most
-        assert acting.look(where)[1] == pytest.approx(np.linalg.norm(force))
+        assert acting.outputs(where)[1] == pytest.approx(np.linalg.norm(force))
         some += power < -1e-3 * most
-        if where.place[2] >= 0:
+        if where.position[2] >= 0:
             assert not force.any()
     assert some > 1000
 
@@ -222,7 +222,7 @@ def run(machine, loads, initial, duration, **options):
 
 def test_pulled_as_the_equation_says_it_goes_on_at_its_speed(sled, tmp_path):
     rake, depth, speed = 1.1, 0.25, 0.8
-    _, cot_beta = STICKY.factors(np.cos(rake), np.sin(rake))
+    _, cot_beta = STICKY.cutting_factors(np.cos(rake), np.sin(rake))
     ahead, _ = wedge(STICKY, rake, np.arctan2(1.0, cot_beta), depth)
     pull = crane.Wrench("blade", (-1.2 * ahead[0], 0, 0), name="pull")
     pitch = rake - np.pi / 2  # about y, that turns z to x
@@ -243,13 +243,13 @@ def test_a_dig_keeps_the_balance_and_is_in_machine_code_what_it_is_in_python(sle
 
     def in_python(time, *where):
         parts = [part.tolist() for part in where]
-        return np.concatenate(digging.wrench(Here(*parts, [])))
+        return np.concatenate(digging.wrench(FrameMotion(*parts, [])))
 
     push = crane.Wrench("blade", (500.0, 0, 0), (0, 900.0, 0), name="push")
     start = [0.0, -0.25, -0.4], [2.0, -1.0, 0.3]
     runs = [
         run(sled, [load, push], start, 0.3, step=1e-3, method="rk4")
-        for load in (digging, crane.Pushing("blade", in_python))
+        for load in (digging, crane.WrenchFunction("blade", in_python))
     ]
     assert runs[0].q == pytest.approx(runs[1].q, abs=1e-11)
     assert runs[0].channels["depth_blade"].max() > 0.05
@@ -277,14 +277,14 @@ def test_machine_files_dig(sled, tmp_path):
     path = tmp_path / "digging.yaml"
     path.write_text(DIGGING)
     machine = crane.load(path)
-    (found,) = machine.external
+    (found,) = machine.external_forces
     assert (found.cutting, found.blade) == ([1, 0, 0], [0, 0, 1])
     assert (found.soil.cohesion, found.soil.surcharge) == (68950.0, 500.0)
     dug = run(machine, [], None, 0.5)
     assert dug.channels["resistance_blade"].max() > 100
     again = crane.load(crane.write_machine(machine, tmp_path / "written"))
     assert run(again, [], None, 0.5).q == pytest.approx(dug.q, abs=1e-12)
-    (written,) = again.external
+    (written,) = again.external_forces
     assert written.soil == found.soil and written.thickness == found.thickness
     for old, new, text in (
         ("ground:", "#", "yaml:8: cutters without ground, add 'ground: {height: 0}'"),
@@ -307,7 +307,7 @@ def test_machine_files_dig(sled, tmp_path):
         (cutter(found.soil, name="b"), "several grounds"),
     ):
         with pytest.raises(CraneError, match=text):
-            crane.write_machine(machine.under(other), tmp_path / "other")
+            crane.write_machine(machine.with_external_forces(other), tmp_path / "other")
 
 
 def test_the_documented_soils_are_those_of_the_table():

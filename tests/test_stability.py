@@ -9,8 +9,8 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError
-from crane.dynamics.stability import Stability
-from crane.studies.tipping import tipping_load
+from crane.dynamics.tipping_stability import TippingStability
+from crane.studies.task_tipping_load import tipping_load
 
 G, BASE, FEET = 9.81, 900.0, ((0.9, 1.1), (1.0, -1.0), (-1.2, -1.1), (-1.1, 1.2))
 MODELS = crane.load("patu655").path.parent
@@ -52,9 +52,9 @@ def standing(folder):
 
 
 def test_static_moments_are_those_of_the_centre_of_mass(standing):
-    stability = Stability(standing)
+    stability = TippingStability(standing)
     q_a = standing.home[standing.closure.active] + [[0.0, 0, 0, 0], [1.3, 0.05, -0.02, 0.4]]
-    margins = stability.static(q_a)
+    margins = stability.static_margins(q_a)
     for i, q in enumerate(standing.closure.solve(q_a)):
         # Pinocchio leaves out what is fixed to the world
         model, data = standing.model, standing.model.createData()
@@ -62,30 +62,30 @@ def test_static_moments_are_those_of_the_centre_of_mass(standing):
         moved = sum(x.mass for x in model.inertias[1:])
         centre = (moved * data.com[0] + BASE * np.array([-0.3, 0.05, -0.2])) / (moved + BASE)
         assert stability.mass == pytest.approx(moved + BASE, rel=1e-12)
-        for k, (one, other) in enumerate(stability.lines):
+        for k, (one, other) in enumerate(stability.line_names):
             a, b = (np.array(FEET[int(name[-1])]) for name in (one, other))
             way = (b - a) / np.linalg.norm(b - a)
             lever = way[0] * (centre - [*a, 0])[1] - way[1] * (centre - [*a, 0])[0]
             true = stability.mass * G * lever
             assert margins.moments[i, k] == pytest.approx(true, rel=1e-9)
     q = standing.closure.solve(q_a)
-    carried = stability.carried(q, stability.ground(q))
+    carried = stability.support_forces(q, stability.ground_wrench(q))
     assert (carried[0] > 0).all()
     assert carried[0].sum() == pytest.approx(stability.mass * G, rel=1e-9)
 
 
 def test_the_load_that_tips_by_hand_moments(standing):
-    stability = Stability(standing)
+    stability = TippingStability(standing)
     q_a = standing.home[standing.closure.active] + [0.4, 0.1, -0.05, 1.0]
-    (load,), (line,) = stability.tip_over_load(q_a)
+    (load,), (line,) = stability.tipping_load(q_a)
     loaded = standing.with_payload(crane.Payload(standing.tip, load))
-    (moments,) = Stability(loaded).static(q_a).moments
+    (moments,) = TippingStability(loaded).static_margins(q_a).moments
     weight = (stability.mass + load) * G
-    lines = [" to ".join(x) for x in stability.lines]
+    lines = [" to ".join(x) for x in stability.line_names]
     assert abs(moments[lines.index(line)]) < 1e-9 * weight
     assert moments.min() > -1e-9 * weight and 0 < load < 1e4
     # a load between the supports does not tip it
-    assert stability.tip_over_load(q_a, "pillar")[0][0] == np.inf
+    assert stability.tipping_load(q_a, "pillar")[0][0] == np.inf
 
 
 def test_moving_it_takes_what_a_free_flyer_needs(standing):
@@ -93,7 +93,7 @@ def test_moving_it_takes_what_a_free_flyer_needs(standing):
     motion = crane.ComputedTorque(standing, crane.task_trajectory(standing, "swing"))
     pull = crane.Wrench(standing.tip, (300.0, -200.0, -800.0), (0.0, 50.0, 20.0))
     run = crane.simulate(standing, motion, None, 6.0, 0.05, loads=[pull])
-    stability = Stability(standing.under(pull))
+    stability = TippingStability(standing.under(pull))
     dynamics, closure = crane.Dynamics(standing), standing.closure
     model = pin.Model()
     root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
@@ -105,7 +105,7 @@ def test_moving_it_takes_what_a_free_flyer_needs(standing):
     whole, tip = model, standing.model.frames[standing.frame(standing.tip)]
     assert pin.computeTotalMass(whole) == pytest.approx(stability.mass, rel=1e-12)
     data = whole.createData()
-    applied = dynamics.applied(run.q, {standing.tip: [300.0, -200, -800, 0, 50, 20]})
+    applied = dynamics.project_wrenches(run.q, {standing.tip: [300.0, -200, -800, 0, 50, 20]})
     friction = np.stack([run.channels[f"friction_{x}"] for x in standing.active], axis=1)
     checked = 0
     for i in range(5, len(run.time), 7):
@@ -126,7 +126,7 @@ def test_moving_it_takes_what_a_free_flyer_needs(standing):
         moment = held[3:] - [0.0, 50.0, 20.0] - np.cross(place, [300.0, -200.0, -800.0])
         carried = sum(run.channels[f"support_foot{k}"][i] for k in range(4))
         assert carried == pytest.approx(force[2], rel=1e-7)
-        for one, other in stability.lines:
+        for one, other in stability.line_names:
             start, end = (np.array([*FEET[int(x[-1])], -0.6]) for x in (one, other))
             way = (end - start) / np.linalg.norm(end - start)
             true = way @ (moment - np.cross(start, force))
@@ -150,7 +150,7 @@ def test_wrong_supports_are_told(folder):
         with pytest.raises(CraneError, match=rf"wrong.yaml:\d+: .*{match}"):
             crane.load(path)
     with pytest.raises(CraneError, match="0 supports and no area between them"):
-        Stability(crane.load("patu655"))
+        TippingStability(crane.load("patu655"))
 
 
 def test_supports_are_written(standing, tmp_path):
@@ -162,17 +162,17 @@ def test_supports_are_written(standing, tmp_path):
 def test_a_payload_tips_it_by_its_inertia_earlier(folder, standing):
     """At rest as hand moments say, and less while it slews."""
     found = tipping_load(standing, "swing")
-    loaded = crane.load(folder / "patu655.yaml", {"payload.mass": found.static})
+    loaded = crane.load(folder / "patu655.yaml", {"payload.mass": found.static_mass})
     run = crane.simulate(
         loaded, crane.ComputedTorque(loaded, crane.task_trajectory(loaded, "swing")), step=5e-3
     )
     assert run.channels["static_stability"].min() == pytest.approx(0.0, abs=1e-4)
-    assert found.mass < found.static
+    assert found.mass < found.static_mass
     assert run.channels["stability"].min() < 0
     worst = int(run.channels["static_stability"].argmin())
-    alone, _ = Stability(standing).tip_over_load(run.q[worst])
+    alone, _ = TippingStability(standing).tipping_load(run.q[worst])
     # the payload's centre hangs below the tip, so only nearly
-    assert found.static == pytest.approx(alone[0], rel=0.2)
+    assert found.static_mass == pytest.approx(alone[0], rel=0.2)
 
 
 def test_what_is_fixed_is_what_stands_on_stiff_contacts(folder):
@@ -188,17 +188,17 @@ def test_what_is_fixed_is_what_stands_on_stiff_contacts(folder):
     floats = crane.load(path)
     hold = crane.simulate(floats, None, None, 6.0, 0.01)
     fixed = crane.load(folder / "patu655.yaml")
-    stability = Stability(fixed)
+    stability = TippingStability(fixed)
     q_a = hold.q[-1][[floats.active.index(x) for x in fixed.active]]
     q = fixed.closure.solve(q_a)[None]
-    carried = stability.carried(q, stability.ground(q))[0]
+    carried = stability.support_forces(q, stability.ground_wrench(q))[0]
     found = [hold.channels[f"support_foot{i}"][-1] for i in range(4)]
     assert found == pytest.approx(carried, rel=0.02)
-    shares = Stability(floats)
+    shares = TippingStability(floats)
     assert hold.channels["stability"][-1] == pytest.approx(
-        stability.static(q_a).least[0], rel=0.02
+        stability.static_margins(q_a).smallest_ratio[0], rel=0.02
     )
-    assert shares.stands is False and stability.stands
+    assert shares.is_stationary is False and stability.is_stationary
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_the_excavator_tips_as_by_hand(slew):
     machine = crane.load("excavator")
     q_a = machine.home[machine.closure.active].copy()
     q_a[machine.active.index("slew")] = slew
-    (load,), (line,) = Stability(machine).tip_over_load(q_a)
+    (load,), (line,) = TippingStability(machine).tipping_load(q_a)
     model, data = machine.model, machine.model.createData()
     pin.framesForwardKinematics(model, data, machine.closure.solve(q_a))
     bodies = [(x.mass, data.oMi[i].act(x.lever)) for i, x in enumerate(model.inertias)]

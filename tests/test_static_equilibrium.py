@@ -61,7 +61,7 @@ def test_it_stands_where_hand_statics_has_it_and_stays(load):
     assert run["base_ry"][0] == pytest.approx((sunk[1] - sunk[0]) / 2, rel=1e-4)
     assert np.abs(run.v).max() < 1e-8  # dropped from home, it is 0.3 m/s fast
     assert run.start == "in static equilibrium on its contacts, base_z -0.01779 m from home"
-    assert f"starts {run.start}" in crane.recordings.summary.summarize(run).to_markdown()
+    assert f"starts {run.start}" in crane.recordings.recording_summary.summarize(run).to_markdown()
 
 
 def test_a_run_that_is_told_its_start_starts_there(load):

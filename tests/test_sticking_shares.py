@@ -5,7 +5,11 @@ import pytest
 from scipy.linalg import qr
 from scipy.optimize import lsq_linear
 
-from crane.simulation.integration.sticking import _INDEPENDENT, _bounded, _independent
+from crane.simulation.integration.stick_slip_modes import (
+    _RANK_TOLERANCE,
+    _bounded_least_squares,
+    _independent_columns,
+)
 
 
 @pytest.mark.parametrize("over", [1e-10, 0.3, 3.0])
@@ -21,7 +25,7 @@ def test_shares_are_the_least_within_their_limits(over):
         shares[0] = np.sign(shares[0]) * (1.0 + over)
         size = np.linalg.norm(reach, axis=0).max()
         net = reach @ shares + draw.normal(size=len(reach)) * 1e-2 * size
-        found = _bounded(reach, net)
+        found = _bounded_least_squares(reach, net)
         wanted = lsq_linear(reach, net, (-1.0, 1.0), method="bvls", tol=1e-15).x
         assert np.abs(found).max() <= 1.0 + 1e-15  # as scipy has it
         off = np.linalg.norm(reach * (found - wanted), axis=0).max()
@@ -42,13 +46,13 @@ def test_independent_columns_are_those_of_a_pivoted_qr(near):
             columns[:, -1] += size * columns[:, 0] / np.linalg.norm(columns[:, 0])
         if k and draw.random() < 0.2:
             columns[:, draw.integers(k)] = 0.0
-        kept, rank = _independent(columns)
+        kept, rank = _independent_columns(columns)
         if not k:
             assert (len(kept), rank) == (0, 0)
             continue
         upper, order = qr(columns, mode="r", pivoting=True)
         sizes = np.abs(np.diag(upper))
         own = np.linalg.norm(columns, axis=0)[order[: len(sizes)]]
-        independent = sizes > _INDEPENDENT * own
+        independent = sizes > _RANK_TOLERANCE * own
         assert rank == independent.sum()
         assert set(kept) == set(order[:rank])

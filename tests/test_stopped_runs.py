@@ -124,7 +124,7 @@ def test_a_run_that_stops_is_written_and_says_so(stopped):
 
 
 def test_page_and_figure_of_a_stopped_run_say_so(stopped):
-    from crane.view.plots.recording import recording_figure
+    from crane.view.plots.recording_figure import recording_figure
 
     folder, _, _ = stopped
     result = typed("view", folder, "--no-open")

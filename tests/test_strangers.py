@@ -6,11 +6,11 @@ import pytest
 from broken import DATA, LOOPED, copy_machine, swap
 
 import crane
-import crane.view.page.visuals
+import crane.view.page.machine_visuals
 from crane.common.errors import CraneWarning
 from crane.formats import write_urdf_plus
 from crane.formats.check import check
-from crane.formats.visuals.meshes import mesh_file
+from crane.formats.visuals.mesh_files import find_mesh_file
 
 COUPLER = '    <parent link="crank_arm"/>\n'
 LIMIT = '<limit lower="-1" upper="1" effort="10" velocity="5"/>'
@@ -99,7 +99,7 @@ def test_a_mesh_is_found_by_names_of_any_kind(name, tmp_path):
     for file in ("arm/meshes/a.stl", "other/b.stl", "arm/urdf/c.stl"):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("solid")
-    found = mesh_file(name.format(folder=tmp_path), tmp_path / "arm" / "urdf")
+    found = find_mesh_file(name.format(folder=tmp_path), tmp_path / "arm" / "urdf")
     assert found is not None and found.is_file()
     assert found.name == name.rpartition("/")[2]
 
@@ -108,7 +108,7 @@ def test_a_mesh_is_found_by_names_of_any_kind(name, tmp_path):
     "name", ["", "package://", "package:///", "package://x.stl", "a\0b", "x" * 5000, "://", "."]
 )
 def test_a_mesh_that_is_not_there_is_a_finding(name, tmp_path):
-    assert mesh_file(name, DATA) is None
+    assert find_mesh_file(name, DATA) is None
     if name.isprintable() and name:
         path = copy_machine(LOOPED, tmp_path)
         drawn = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
@@ -116,6 +116,6 @@ def test_a_mesh_that_is_not_there_is_a_finding(name, tmp_path):
             tmp_path
         )
         (finding,) = check(path).findings
-        assert "is not there, correct its path or install the package" in finding.what
+        assert "is not there, correct its path or install the package" in finding.message
         with pytest.warns(CraneWarning, match="mesh files? "):
-            crane.view.page.visuals.read_visuals(crane.load(path))
+            crane.view.page.machine_visuals.read_visuals(crane.load(path))

@@ -14,8 +14,8 @@ import crane
 from crane.cli.ranges import ranges
 from crane.common.errors import ClosureError, InputError
 from crane.studies import measures
-from crane.studies.measures import of_strokes
-from crane.view.plots.study import plot_study
+from crane.studies.measures import measure_strokes
+from crane.view.plots.study_figure import plot_study
 
 pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
 PIN = {"link3_G.x": np.linspace(0.08, 0.11, 4), "link3_G.y": [-0.01, 0.0]}
@@ -75,14 +75,17 @@ def test_a_variant_that_cannot_is_a_row_with_its_reason(pins):
     assert unable and all(np.isnan(row["peak_X2"]) for row in unable)
     assert all("cannot reach" in row["reason"] for row in unable)
     study = crane.study("mini_forwarder", {"link7.mass": [-1.0, 0.1]}, ["lift"], ["peak_X1"])
-    assert study.reasons == ("parameter 'link7.mass' is -1 kg, it must not be negative", "")
+    assert study.failure_reasons == (
+        "parameter 'link7.mass' is -1 kg, it must not be negative",
+        "",
+    )
 
 
 def test_strokes_where_the_loops_close(monkeypatch):
     """Every cell as closing it alone says."""
-    monkeypatch.setattr(measures, "_CELLS", 125)
+    monkeypatch.setattr(measures, "_COUPLED_GRID_SIZE", 125)
     machine = crane.load("mini_forwarder", {"link3_G.x": 0.11, "link3_G.y": -0.01})
-    found = of_strokes(machine)
+    found = measure_strokes(machine)
     cells, closed = np.linspace(0, 0.03, 11), []
     for x1 in cells:
         for x2 in cells:
@@ -101,7 +104,7 @@ def test_strokes_where_the_loops_close(monkeypatch):
 
 
 def test_an_open_arm_has_strokes_too():
-    found = of_strokes(crane.load("ur5_robot"))
+    found = measure_strokes(crane.load("ur5_robot"))
     assert found["range"] == 1.0 and found["upper_elbow_joint"] > 3
 
 
@@ -270,10 +273,16 @@ def test_expressions_and_measures_of_ones_own_are_columns():
     measures = ["load(6, 1) / mass", "mass", "double"]
     own = {"double": lambda machine: 2 * machine.tree.links["arm"].inertial.mass}
     found = crane.study(
-        "excavator", vary, [], measures, own=own, frame="bucket_lip", require=["reach >= 9.9"]
+        "excavator",
+        vary,
+        [],
+        measures,
+        user_measures=own,
+        frame="bucket_lip",
+        require=["reach >= 9.9"],
     )
     assert found.measures == tuple(measures)
-    assert "lacks" in found.reasons[0] and found.reasons[1] == ""
+    assert "lacks" in found.failure_reasons[0] and found.failure_reasons[1] == ""
     assert found.columns["double"][1] == 1200.0 and np.isnan(found.columns["double"][0])
     variant = crane.load("excavator", changes={"arm.mass": 600.0, "bucket_lip.x": 1.47})
     chart = crane.capacity(variant, "bucket_lip", radii=[6.0], heights=[1.0])
@@ -289,10 +298,10 @@ def test_tasks_of_levers_are_done_with_their_circuit():
     """A pump of less pressure does less work in the same levers' time, and may vary."""
     vary = {"supply.pressure": [3.0e7, 3.5e7]}
     found = crane.study("excavator", vary, ["dig"], ["pump_work", "duration", "peak_X_boom"])
-    assert found.reasons == ("", "") and (found.columns["duration"] == 16.0).all()
+    assert found.failure_reasons == ("", "") and (found.columns["duration"] == 16.0).all()
     less, more = found.columns["pump_work"]
     run = crane.simulate(
-        (machine := crane.load("excavator")).under(*machine.tasks["dig"].loads),
+        (machine := crane.load("excavator")).with_external_forces(*machine.tasks["dig"].loads),
         crane.joystick(machine, "dig"), duration=16.0, step=5e-3,
     )  # fmt: skip
     assert less < more == pytest.approx(run.channels["pump_work"][-1], rel=1e-9)

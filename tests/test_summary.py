@@ -6,7 +6,7 @@ import pytest
 
 from crane import load, simulate
 from crane.recordings.recording import Recording
-from crane.recordings.summary import energy_balance, points, rms, summarize
+from crane.recordings.recording_summary import energy_imbalance, point_channel, rms, summarize
 
 DATA = Path(__file__).parent / "data"
 
@@ -63,10 +63,10 @@ def test_tracking_errors():
 
 def test_points_need_all_three_axes():
     recording = make([0.0, 1.0], tip_x=[1.0, 2.0], tip_y=[3.0, 4.0])
-    assert points(recording, "tip") is None
+    assert point_channel(recording, "tip") is None
     assert summarize(recording).tip_rms_error is None
     recording = make([0.0, 1.0], tip_x=[1.0, 2.0], tip_y=[3.0, 4.0], tip_z=[5.0, 6.0])
-    np.testing.assert_array_equal(points(recording, "tip"), [[1, 3, 5], [2, 4, 6]])
+    np.testing.assert_array_equal(point_channel(recording, "tip"), [[1, 3, 5], [2, 4, 6]])
 
 
 def test_markdown():
@@ -121,14 +121,14 @@ def test_the_balance_of_energy(off, expected):
         "",
         f"energy balance: {expected}",
     ]
-    assert summarize(make(time, **channels)).balance == ""  # of no energies
+    assert summarize(make(time, **channels)).balance_text == ""  # of no energies
 
 
 def test_a_balance_that_is_simulated(slider_crank):
     recording = simulate(slider_crank, lambda t, q, v: [2.0 - v[0]], duration=0.2)
-    gap = energy_balance(recording)
+    gap = energy_imbalance(recording)
     assert 0 < np.abs(gap).max() < 1e-6 < np.ptp(recording.channels["work"])
-    assert summarize(recording).balance == f"off by at most {np.abs(gap).max():.2g} J"
+    assert summarize(recording).balance_text == f"off by at most {np.abs(gap).max():.2g} J"
 
 
 def test_potential_energy_counts_weight_from_the_world_s_origin_and_springs_from_their_rest(

@@ -25,9 +25,9 @@ class Sines(crane.Trajectory):
         pass
 
     def position(self, time):
-        return self.middle + self._rate(0, time)
+        return self.middle + self._derivative(0, time)
 
-    def _rate(self, order, time):
+    def _derivative(self, order, time):
         angle = self.rate * np.asarray(time)[..., None, None] + self.phase + order * np.pi / 2
         return (self.size * self.rate**order * np.sin(angle)).sum(axis=-1)
 
@@ -35,7 +35,7 @@ class Sines(crane.Trajectory):
         reach = self.size.sum(axis=1)
         return self.middle - reach, self.middle + reach
 
-    def turns(self):
+    def extremum_times(self):
         return np.linspace(0, self.duration, 100)
 
     def breaks(self):

@@ -12,23 +12,28 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description import Friction
-from crane.description.estimation import Estimation, Known
+from crane.description.estimation_settings import EstimationSettings, ParameterPrior
 from crane.formats import write_machine
-from crane.identification.mechanics.against import tell_shared
 from crane.identification.mechanics.cross_validation import (
-    FOLDS,
+    FOLD_COUNT,
     cross_validate,
-    settings_of,
-    trials_text,
+    format_trials,
+    identify_options,
 )
-from crane.identification.mechanics.friction import Presliding, RestMemory, friction, root
+from crane.identification.mechanics.force_checks import check_shared_samples
+from crane.identification.mechanics.friction_laws import friction_laws
+from crane.identification.mechanics.friction_terms import (
+    FrictionalMemory,
+    PreslidingFriction,
+    friction_term,
+    root_friction_term,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertias import Inertial, RotorInertia
-from crane.identification.mechanics.laws import laws
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.priors import stated
-from crane.identification.mechanics.term import Direction
-from crane.identification.signals.motion import Motion
+from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
+from crane.identification.mechanics.model_term import ForceDirection
+from crane.identification.mechanics.priors import prior_from_names
+from crane.identification.signals.signal_processing import Motion
 
 STEP = 5e-3
 TIME = STEP * np.arange(1600)
@@ -36,7 +41,7 @@ TIME = STEP * np.arange(1600)
 
 @pytest.fixture(scope="module")
 def arm():
-    return crane.load("tx40").replace(estimation=Estimation())
+    return crane.load("tx40").replace(estimation=EstimationSettings())
 
 
 def moved(machine, seed=0, terms=None, parameters=None):
@@ -47,10 +52,10 @@ def moved(machine, seed=0, terms=None, parameters=None):
     angle = TIME[:, None] * w + phase
     q = machine.home[machine.closure.active] + size * np.sin(angle)
     v, a = size * w * np.cos(angle), -size * w**2 * np.sin(angle)
-    model = Model(machine, terms)
+    model = IdentificationModel(machine, terms)
     at = model.samples(q, v, a, STEP)
     tau = model.regressor(at) @ (model.nominal if parameters is None else parameters)
-    return Motion(TIME, q, v, a, tau + model.known(at))
+    return Motion(TIME, q, v, a, tau + model.known_forces(at))
 
 
 def test_names_are_the_terms_that_they_say(arm):
@@ -59,17 +64,23 @@ def test_names_are_the_terms_that_they_say(arm):
         "q1.presliding": (1e-3,), "q1.root": (), "q2.memory": (0.2, 0.1), "q3.stiction": (0.1, 1),
         "q6+0.5*q5.coulomb": (), "q6+0.5*q5.rotor_inertia": (), "q4.viscous": None,
     }  # fmt: skip
-    both = Direction("q6+0.5*q5", {"q6": 1.0, "q5": 0.5})
+    both = ForceDirection("q6+0.5*q5", {"q6": 1.0, "q5": 0.5})
     kinds = ("coulomb", "viscous")
     wanted = [
-        Inertial(arm),
-        *(RotorInertia(arm, joint) for joint in ("q1", "q2", "q3", "q4", both)),
-        friction(arm, "q1", ("viscous",)), root(arm, "q1"), Presliding(arm, "q1", 1e-3),
-        friction(arm, "q2", kinds), RestMemory(arm, "q2", 0.2, 0.1),
-        friction(arm, "q3", kinds, stribeck=(0.1, 1.0)), friction(arm, "q4", ("coulomb",)),
-        friction(arm, "q5", kinds), friction(arm, "q6", kinds), friction(arm, both, ("coulomb",)),
-    ]  # fmt: skip
-    one, other = Model(arm, changes), Model(arm, wanted)
+        InertialTerm(arm),
+        *(RotorInertiaTerm(arm, joint) for joint in ("q1", "q2", "q3", "q4", both)),
+        friction_term(arm, "q1", ("viscous",)),
+        root_friction_term(arm, "q1"),
+        PreslidingFriction(arm, "q1", 1e-3),
+        friction_term(arm, "q2", kinds),
+        FrictionalMemory(arm, "q2", 0.2, 0.1),
+        friction_term(arm, "q3", kinds, stribeck=(0.1, 1.0)),
+        friction_term(arm, "q4", ("coulomb",)),
+        friction_term(arm, "q5", kinds),
+        friction_term(arm, "q6", kinds),
+        friction_term(arm, both, ("coulomb",)),
+    ]
+    one, other = IdentificationModel(arm, changes), IdentificationModel(arm, wanted)
     assert set(one.names) == set(other.names) and len(one.names) == len(other.names)
     motion = moved(arm)
     columns = [
@@ -86,8 +97,8 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
     v[:, 0] = -0.3
     q = np.zeros_like(v)
     q[:, 0] = -0.3 * TIME
-    term = RestMemory(arm, "q1", 0.2, 0.1)
-    model = Model(arm, [term])
+    term = FrictionalMemory(arm, "q1", 0.2, 0.1)
+    model = IdentificationModel(arm, [term])
     found = term.columns(model.samples(q, v, 0 * v, STEP))[:, 0, 0]
     w = 0.3 * (1 - np.exp(-(TIME + STEP) / 0.2))
     np.testing.assert_allclose(found, -np.exp(-w / 0.1), rtol=1e-12)
@@ -141,7 +152,7 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
 )
 def test_terms_that_are_none(arm, terms, message):
     with pytest.raises(InputError) as caught:
-        model = Model(arm, terms)
+        model = IdentificationModel(arm, terms)
         model.regressor(model.samples(*np.zeros((3, 2, 6))))
     assert str(caught.value).startswith(message) and str(caught.value).isprintable()
 
@@ -149,11 +160,13 @@ def test_terms_that_are_none(arm, terms, message):
 def test_what_is_known_by_name(arm):
     """The last that speaks of a parameter counts; shares are of what is described."""
     rough = arm.replace(friction={"q1": Friction(coulomb=8.0)})
-    model = Model(rough)
+    model = IdentificationModel(rough)
     sizes = np.linspace(1.0, 2.0, len(model.names))
     known = {"*": "30 %", "link[12]": "10 %", "link2.m": "5 +- 0.1", "*.viscous": 7,
              "q1.viscous": "2 +- 50 %"}  # fmt: skip
-    mean, std = stated(model, {k: Known.read(x) for k, x in known.items()}, sizes)
+    mean, std = prior_from_names(
+        model, {k: ParameterPrior.parse(x) for k, x in known.items()}, sizes
+    )
     by = {name: (mean[i], std[i], sizes[i]) for i, name in enumerate(model.names)}
     assert by["link1.Izz"][1] == pytest.approx(0.1 * by["link1.Izz"][2])
     assert by["link3.m"][1] == pytest.approx(0.3 * by["link3.m"][2])
@@ -179,12 +192,15 @@ def test_a_parameter_that_is_known_stays_where_it_is(arm, feasible):
 
 def test_the_machine_file_says_it_and_keeps_it(arm, tmp_path):
     kr300 = crane.load("kr300")
-    assert "q1.memory" in Model(kr300).names and "q1.coulomb" not in Model(kr300).names
+    assert (
+        "q1.memory" in IdentificationModel(kr300).names
+        and "q1.coulomb" not in IdentificationModel(kr300).names
+    )
     again = crane.load(write_machine(kr300, tmp_path / "out"))
     assert again.estimation == kr300.estimation
-    assert Model(again).names == Model(kr300).names
+    assert IdentificationModel(again).names == IdentificationModel(kr300).names
     held = crane.load("kr300", lock={"q6": 0.0})  # what is said of a locked joint is of nobody
-    assert not [name for name in Model(held).names if name.startswith("q6")]
+    assert not [name for name in IdentificationModel(held).names if name.startswith("q6")]
 
 
 @pytest.mark.parametrize("word", ["{}", "'{}'", '"{}"'])
@@ -231,7 +247,7 @@ def test_a_motor_of_two_joints_is_written_as_a_rotor_that_a_coupling_turns(arm, 
     """The machine that is read back has its forces, by Pinocchio and by the formulas."""
     terms = {"q5+q6.rotor_inertia": (), "q5+q6.viscous": (), "q5+q6.coulomb": (),
              "q*.rotor_inertia": (), "q*.viscous_offset": None}  # fmt: skip
-    model = Model(arm, terms)
+    model = IdentificationModel(arm, terms)
     truth = model.nominal.copy()
     for i, name in enumerate(model.names):
         kind = name.rpartition(".")[2]
@@ -254,18 +270,20 @@ def test_a_motor_of_two_joints_is_written_as_a_rotor_that_a_coupling_turns(arm, 
 def test_friction_without_a_place_is_written_as_the_nearest_law(arm):
     """Presliding at steady speeds is Coulomb's; of the root, least squares over the speeds."""
     terms = {"q1.presliding": (1e-3,), "q2.root": (), "q3.stiction": (0.1,), "q3.viscous": None}
-    model = Model(arm, terms)
+    model = IdentificationModel(arm, terms)
     values = np.zeros(len(model.names))
     for name, value in {"q1.presliding": 4.0, "q1.viscous": 2.0, "q2.root": 3.0, "q3.coulomb": 1.0,
                         "q3.stiction": 0.5}.items():  # fmt: skip
         values[model.names.index(name)] = value
-    found = laws(model, values, dict.fromkeys(arm.active, (0.01, 1.0)))
+    found = friction_laws(model, values, dict.fromkeys(arm.active, (0.01, 1.0)))
     law = found["q1"].law
-    assert found["q1"].off < 1e-9 and law.coulomb + law.stiction == pytest.approx(4.0)
+    assert found["q1"].max_deviation < 1e-9 and law.coulomb + law.stiction == pytest.approx(4.0)
     assert law.viscous == pytest.approx(2.0)
-    assert found["q3"].off == 0 and found["q3"].law == Friction(1.0, stiction=0.5, stribeck=0.1)
+    assert found["q3"].max_deviation == 0 and found["q3"].law == Friction(
+        1.0, stiction=0.5, stribeck=0.1
+    )
     v = np.linspace(0.01, 1.0, 500)
-    law, off = found["q2"].law, found["q2"].off
+    law, off = found["q2"].law, found["q2"].max_deviation
     written = law.coulomb + law.viscous * v + law.stiction * np.exp(-((v / law.stribeck) ** 2))
     assert np.abs(written - 3 * np.sqrt(v)).max() == pytest.approx(off, rel=0.02)
     assert 0 < off < 0.6  # that of the best straight line, about 0.8 + 2.4 v, at the lowest speed
@@ -381,8 +399,8 @@ def test_the_prior_that_predicts_is_chosen(arm):
     given = dataclasses.replace(motion, tau=tau)
     trials = cross_validate(arm, given, {"bodies": ["1 %", "10000 %"]}, bandwidth=5.0)
     assert [trial.settings["bodies"] for trial in trials] == ["1 %", "10000 %"]
-    assert trials[0].mean < trials[1].mean and trials[0].errors.shape == (FOLDS,)
-    assert "bodies=1 %" in trials_text(trials).splitlines()[2]
+    assert trials[0].mean_error < trials[1].mean_error and trials[0].errors.shape == (FOLD_COUNT,)
+    assert "bodies=1 %" in format_trials(trials).splitlines()[2]
     with pytest.raises(InputError, match="nothing is tried, give values such as bandwidth=2,5,10"):
         cross_validate(arm, given, {})
     few = {name: getattr(given, name)[:200] for name in ("time", "q", "v", "a", "tau")}
@@ -428,21 +446,24 @@ def test_a_part_at_rest_judges_nothing(arm):
         arm, Motion(**held), {"bodies": ["1 %"]}, bandwidth=5.0, slow={"q*": 0.01}
     )
     assert np.isnan(trial.errors).tolist() == [False, False, True, False, False]
-    assert trial.mean < 0.1 and " - " in trials_text([trial])
+    assert trial.mean_error < 0.1 and " - " in format_trials([trial])
 
 
 def test_a_share_of_everything_stands_beside_what_is_tried(arm):
     (trial,) = cross_validate(arm, moved(arm), {"bodies": ["1 %"]}, prior=0.3, bandwidth=5.0)
-    assert trial.mean < 0.1
-    assert settings_of(trial, {"prior": 0.3})["prior"] == {
-        "*": Known(0.3, relative=True), "bodies": Known(0.01, relative=True)
+    assert trial.mean_error < 0.1
+    assert identify_options(trial, {"prior": 0.3})["prior"] == {
+        "*": ParameterPrior(0.3, relative=True), "bodies": ParameterPrior(0.01, relative=True)
     }  # fmt: skip
 
 
 def test_what_is_given_counts_after_what_the_machine_file_says(arm):
     """Also where both say something of the same name: the last that speaks counts."""
-    known = {"*": Known(0.3, relative=True), "bodies": Known(0.01, relative=True)}
-    told = arm.replace(estimation=Estimation(prior=known))
+    known = {
+        "*": ParameterPrior(0.3, relative=True),
+        "bodies": ParameterPrior(0.01, relative=True),
+    }
+    told = arm.replace(estimation=EstimationSettings(prior=known))
     ours, plain = (
         identify(machine, moved(arm), prior=prior, bandwidth=5.0).parameters
         for machine, prior in ((told, 0.5), (arm, {"*": "50 %"}))
@@ -470,7 +491,7 @@ def test_two_recordings_teach_as_one(arm):
     assert len(both.training.time) == 2 * len(alone.training.time)
     assert (np.diff(both.training.time) > 0).all()
     np.testing.assert_allclose(both.training.modelled, both.validation.modelled, rtol=1e-12)
-    assert both.validation.stacked < 1e-3
+    assert both.validation.overall_relative_error < 1e-3
 
 
 def test_what_is_learned_does_not_judge_and_is_learned_once(arm):
@@ -510,9 +531,9 @@ def test_rests_that_are_alike_are_no_shared_samples(arm):
     one, other = moved(arm, seed=0), moved(arm, seed=1)
     for motion in (one, other):
         motion.tau[:640] = 1.0
-    tell_shared([one, other], [], False)
+    check_shared_samples([one, other], [], False)
     with pytest.raises(RecordingError, match="100% of recording 2's samples are in recording 1"):
-        tell_shared([one, one], [], False)
+        check_shared_samples([one, one], [], False)
 
 
 def test_which_of_several_cannot_serve_is_said(arm):

@@ -17,7 +17,7 @@ import pytest
 import crane
 from crane.common.errors import CraneWarning
 from crane.control import ValveDrive
-from crane.dynamics.stability import Stability
+from crane.dynamics.tipping_stability import TippingStability
 
 THREADS, SAMPLES = 3, 6
 
@@ -130,7 +130,7 @@ def stacked(dynamics, q_a, v_a, x):
 
 def held(machine):
     """The machine with a spring between frames, and friction that is smooth."""
-    tip, root = machine.tip, machine.tree.root
+    tip, root = machine.tip, machine.tree.root_link
     spring = crane.ForceElement(between=(root, tip), stiffness=50.0, damping=1.0, rest=0.2)
     return machine.replace(forces=(*machine.forces, spring))
 
@@ -189,7 +189,7 @@ def balanced(stability, q_a, v_a, x):
 
 def test_stability():
     digger = crane.load("excavator")
-    assert wrong(lambda: Stability(digger), balanced, digger) == 0
+    assert wrong(lambda: TippingStability(digger), balanced, digger) == 0
 
 
 def swayed(sway, q_a, v_a, x):
@@ -233,7 +233,7 @@ def circled(drive, q_a, v_a, x):
 
 
 def test_circuit(patu):
-    assert wrong(lambda: ValveDrive(patu, crane.Signals(patu, [0.0], {})), circled, patu) == 0
+    assert wrong(lambda: ValveDrive(patu, crane.ValveSignals(patu, [0.0], {})), circled, patu) == 0
 
 
 def program(time, q_a, v_a, pressures):
@@ -249,4 +249,4 @@ def simulated(shared, q_a, v_a, x):
 
 @pytest.mark.slow
 def test_simulations(patu):
-    assert wrong(lambda: (patu, crane.Sampled(program, patu)), simulated, patu) == 0
+    assert wrong(lambda: (patu, crane.SampledCommand(program, patu)), simulated, patu) == 0

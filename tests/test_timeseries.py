@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 
 from crane.common.errors import RecordingError
 from crane.recordings import timeseries
-from crane.recordings.timeseries import Table, arrays, read, read_csv, read_npz, spellings, write
+from crane.recordings.timeseries import (
+    Table,
+    accepted_units,
+    read_csv,
+    read_log_arrays,
+    read_npz,
+    read_table,
+    write_table,
+)
 
 GOOD = "time [s],a [m],b\n0,1,2\n0.5,3,4\n"
 
@@ -16,7 +24,7 @@ GOOD = "time [s],a [m],b\n0,1,2\n0.5,3,4\n"
 def read_text(tmp_path, text, **kwargs):
     path = tmp_path / "table.csv"
     path.write_text(text, **kwargs)
-    return read(path)
+    return read_table(path)
 
 
 def test_reads_names_units_and_numbers(tmp_path):
@@ -50,11 +58,11 @@ def test_notes_keep_what_follows_the_first_colon(tmp_path):
     assert notes == {"machine": "C:\\cranes\\big.yaml", "task": "lift"}
 
 
-@pytest.mark.parametrize("read", [read, arrays], ids=["as recording", "as log"])
+@pytest.mark.parametrize("read", [read_table, read_log_arrays], ids=["as recording", "as log"])
 def test_a_file_that_is_cut_short_anywhere_is_told(tmp_path, read):
     path, whole = tmp_path / "cut.csv", tmp_path / "whole.csv"
     values = np.array([[0.0, 1.25, -3e-5], [0.5, 1.5, 22.75]])
-    write(whole, Table({"time": "s", "a": "m", "b": ""}, values, {"machine": "x"}))
+    write_table(whole, Table({"time": "s", "a": "m", "b": ""}, values, {"machine": "x"}))
     data = whole.read_bytes()
     for length in range(len(data)):
         path.write_bytes(data[:length])
@@ -114,9 +122,9 @@ def test_broken_files(tmp_path, text, message):
 
 def test_missing_file(tmp_path):
     with pytest.raises(RecordingError, match="no such file or directory, give the path of a CSV"):
-        read(tmp_path / "none.csv")
+        read_table(tmp_path / "none.csv")
     with pytest.raises(RecordingError, match="no such file, a recording is a .csv or .npz file"):
-        read(tmp_path / "none.txt")
+        read_table(tmp_path / "none.txt")
 
 
 def test_folder(tmp_path):
@@ -129,7 +137,7 @@ def test_binary_file(tmp_path, rows):
     path = tmp_path / "table.csv"
     path.write_bytes(rows + b"\x1f\x8b\xff\xfe\x00\n")
     with pytest.raises(RecordingError, match="is not text, give a CSV in UTF-8"):
-        read(path)
+        read_table(path)
 
 
 @settings(deadline=None)
@@ -143,16 +151,16 @@ def test_binary_file(tmp_path, rows):
 def test_numbers_survive_bit_by_bit(tmp_path_factory, numbers):
     path = tmp_path_factory.mktemp("table") / "table.csv"
     values = np.column_stack([np.arange(len(numbers), dtype=float), numbers])
-    write(path, Table({"time": "s", "a": ""}, values, {}))
-    back = read(path).values
+    write_table(path, Table({"time": "s", "a": ""}, values, {}))
+    back = read_table(path).values
     assert [math.copysign(1.0, x) for x in back[:, 1]] == [math.copysign(1.0, x) for x in numbers]
     np.testing.assert_array_equal(back, values)
 
 
 def test_long_tables_are_written_whole(tmp_path):
     values = np.column_stack([np.arange(10_001.0), np.sqrt(np.arange(10_001.0))])
-    write(tmp_path / "table.csv", Table({"time": "s", "a": "m"}, values, {"task": "count"}))
-    table = read(tmp_path / "table.csv")
+    write_table(tmp_path / "table.csv", Table({"time": "s", "a": "m"}, values, {"task": "count"}))
+    table = read_table(tmp_path / "table.csv")
     np.testing.assert_array_equal(table.values, values)
     assert table.notes == {"task": "count"}
 
@@ -175,7 +183,7 @@ def test_declared_units_become_si(tmp_path, unit, si, number, converted):
         assert table.units == {"time": "s", "a": si, "b": ""}
         assert table.values[0, 1] == pytest.approx(converted, rel=3e-16, abs=0)
         assert table.values[0, 2] == number
-    assert unit in spellings(si)
+    assert unit in accepted_units(si)
 
 
 def test_other_units_stay(tmp_path):
@@ -210,7 +218,7 @@ def test_long_lines(tmp_path, data, message):
     path = tmp_path / "table.csv"
     path.write_bytes(data)
     with pytest.raises(RecordingError) as caught:
-        read(path)
+        read_table(path)
     assert message in str(caught.value)
     assert len(str(caught.value)) < 400
 
@@ -220,9 +228,9 @@ def test_lines_across_blocks_are_counted(tmp_path, monkeypatch, end):
     """Whatever the size of the blocks that are looked at, and however lines end."""
     (tmp_path / "table.csv").write_text(GOOD.replace("\n", end), newline="")
     for size in range(16, 40):  # the header row has 16 characters
-        monkeypatch.setattr("crane.recordings.timeseries._BLOCK", size)
+        monkeypatch.setattr("crane.recordings.timeseries._BLOCK_BYTES", size)
         assert timeseries._count_lines(tmp_path / "table.csv") in (3, 4)
-    monkeypatch.setattr("crane.recordings.timeseries._BLOCK", 15)
+    monkeypatch.setattr("crane.recordings.timeseries._BLOCK_BYTES", 15)
     with pytest.raises(RecordingError, match="line 1 has more than 15 bytes"):
         timeseries._count_lines(tmp_path / "table.csv")
 
@@ -240,7 +248,7 @@ def test_numbers_beyond_all_that_is_measured(tmp_path):
         read_text(tmp_path, GOOD + "1,2,1e308\n")
     np.savez(tmp_path / "table.npz", **{"time [s]": [0.0, 1.0], "a [bar]": [1e30, 1e20]})
     with pytest.raises(RecordingError, match="table.npz: 'a' is 1e\\+35 at sample 0, beyond all"):
-        read(tmp_path / "table.npz")
+        read_table(tmp_path / "table.npz")
 
 
 def test_a_pipe_is_no_file(tmp_path):
@@ -248,7 +256,7 @@ def test_a_pipe_is_no_file(tmp_path):
     for name in ("table.csv", "table.npz"):
         os.mkfifo(tmp_path / name)
         with pytest.raises(RecordingError, match="is no plain file, copy it into one"):
-            read(tmp_path / name)
+            read_table(tmp_path / name)
 
 
 @pytest.mark.parametrize("count", [1, 3, 5000])
@@ -258,7 +266,7 @@ def test_columns_that_stay_the_same_are_written_like_others(tmp_path, count):
     rows = np.tile(same, (count, 1))
     rows[count // 2 :, -1] = -0.0
     names = [f"c{i}" for i in range(len(same))]
-    write(tmp_path / "a.csv", Table(dict.fromkeys(names, ""), rows, {}))
+    write_table(tmp_path / "a.csv", Table(dict.fromkeys(names, ""), rows, {}))
     lines = (tmp_path / "a.csv").read_text().splitlines()
     body = lines[lines.index(",".join(names)) + 1 :]
     assert body == [",".join("" if x != x else repr(x) for x in row) for row in rows.tolist()]

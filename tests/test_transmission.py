@@ -70,7 +70,7 @@ def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(nam
         model, data, _ = by_pinocchio(path.read_text(), state)
         assert set(model.names[1:]) - {"base"} == names == set(state.name)
         tree.update_cfg(dict(zip(state.name, state.position.tolist(), strict=True)))
-        tolerance = 100 * EPS * machine.closure.size
+        tolerance = 100 * EPS * machine.closure.characteristic_length
         ends = [(loop.predecessor, loop.successor) for loop in machine.closure.equations.loops]
         for one, two in ends:  # pins and balls: the two frames' origins meet
             places = [data.oMf[model.getFrameId(end)].translation for end in (one, two)]
@@ -128,7 +128,7 @@ def test_velocities_are_derivatives_and_power_is_the_same_on_both_sides():
     moved = (place.position(q_a + h * v_a) - place.position(q_a - h * v_a)) / (2 * h)
     push = transmission.wrench_to_actuator([*wrench[:3], 0, 0, 0])
     assert np.isclose(np.dot(list(push.values()), v_a), wrench[:3] @ moved, atol=1e-8)
-    applied = crane.Dynamics(machine).applied(q_a, {machine.tip: wrench})
+    applied = crane.Dynamics(machine).project_wrenches(q_a, {machine.tip: wrench})
     assert np.allclose(list(f_a.values()), applied, rtol=1e-12)
 
 
@@ -149,7 +149,7 @@ def test_forces_of_actuators_are_forces_at_other_joints_and_back(name, joints):
     back = transmission.joint_to_actuator(there)
     assert tuple(there) == joints
     assert np.allclose([back[x] for x in forces], list(forces.values()), rtol=1e-10, atol=1e-10)
-    seen = machine.driven_by(joints)  # whose own gravity is the same machine's
+    seen = machine.with_active_joints(joints)  # whose own gravity is the same machine's
     held = crane.Dynamics(machine).gravity(q_a)
     there = transmission.actuator_to_joint(dict(zip(machine.active, held, strict=True)), joints)
     expected = crane.Dynamics(seen).gravity(state.position[seen.closure.active])
@@ -162,13 +162,13 @@ def test_messages_name_some_joints_in_any_order_and_others_too():
     transmission = crane.Transmission(machine)
     home = dict(zip(machine.joints, machine.home.tolist(), strict=True))
     assert transmission.update(["X_tilt", "engine"], [home["X_tilt"], 180.0], [0.1, 0.0]) is None
-    assert transmission.unheard == ("slew", "X_lift", "X_ext")
+    assert transmission.unknown_actuators == ("slew", "X_lift", "X_ext")
     assert transmission.state is None
     assert transmission.update(["pump"], [1.0]) is None
     rest = ["X_ext", "q2", "slew", "X_lift"]  # q2 is passive, and what is said of it is not read
     given = [home["X_ext"], 9.9, home["slew"], home["X_lift"]]
     state = transmission.update(rest, given, [0.0] * 4, [1.0, 2.0, 3.0, 4.0])
-    assert transmission.unheard == () and state is transmission.state
+    assert transmission.unknown_actuators == () and state is transmission.state
     assert np.abs(state.position - machine.home).max() < 1e-14
     assert state.name == machine.joints
     v_a = np.array([0.0, 0.0, 0.1, 0.0])
@@ -186,7 +186,7 @@ def test_messages_name_some_joints_in_any_order_and_others_too():
 def test_a_vehicle_that_floats_is_placed_by_others_and_its_crane_is_as_on_the_ground():
     machine, same = loaded(FLOATING), loaded("excavator")
     transmission, other = crane.Transmission(machine), crane.Transmission(same)
-    assert transmission.actuators == transmission.unheard == same.active
+    assert transmission.actuators == transmission.unknown_actuators == same.active
     assert transmission.update(["base_x", "slew"], [3.0, 0.4], [1.0, 0.1]) is None
     strokes = near_home(same, np.random.default_rng(6), 0.02)
     states = [x.update(same.active, strokes, strokes, strokes) for x in (transmission, other)]

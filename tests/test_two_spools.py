@@ -13,8 +13,8 @@ from test_circuit_transients import VALVE, C, G, clip, compare, cylinder, root
 
 import crane
 from crane.common.errors import CraneError
-from crane.control import Signals
-from crane.view.plots.recording import plot_recording
+from crane.control import ValveSignals
+from crane.view.plots.recording_figure import plot_recording
 
 TANK, SUPPLY = 1e5, 9.25e6
 C1, C2, C3, C4 = (ORIFICE[name] for name in ("c1", "c2", "c3", "c4"))
@@ -43,7 +43,7 @@ def test_each_chamber_has_its_own_edges(tmp_path):
 def test_steady_motion_metered_in_and_out_apart(tmp_path, u, w):
     """A v = Q_A = .., B v = Q_B through the two spools, A p_A - B p_B = d v; also regenerating."""
     machine = rig(tmp_path, APART, axis="1 0 0", friction={"viscous": 8e4})
-    control = Signals(machine, [0.0], {"x": [u], "x_b": [w]})
+    control = ValveSignals(machine, [0.0], {"x": [u], "x_b": [w]})
     run = crane.simulate(machine, control, [0.05], 3.0, tolerance=1e-10)
 
     def left(v):
@@ -118,12 +118,12 @@ AT = [0.0, 0.2, 0.5, 0.9, 1.2, 1.5]
 
 def test_balances_and_powers_close(tmp_path):
     machine = everything_apart(tmp_path)
-    run = crane.simulate(machine, Signals(machine, AT, LEVERS), duration=1.5, tolerance=1e-10)
+    run = crane.simulate(machine, ValveSignals(machine, AT, LEVERS), duration=1.5, tolerance=1e-10)
     oil, energy = gaps(run, machine)
     assert oil < 1e-12
     assert energy < 1e-6
     assert np.ptp(run.q, axis=0).min() > 0.01
-    account = crane.power_account(machine, run)
+    account = crane.power_balance(machine, run)
     shafts = sum(x for name, x in account.powers.items() if name.endswith(".shaft"))
     others = sum(x for name, x in account.powers.items() if not name.endswith(".shaft"))
     np.testing.assert_allclose(others, shafts, atol=1e-9 * np.abs(shafts).max())
@@ -137,7 +137,7 @@ def test_commanded_alike_they_are_one(tmp_path, own):
     one = rig(tmp_path / "one", ORIFICE | own, control=gains)
     two = rig(tmp_path / "two", APART | own, control=gains)
     for command in (
-        lambda machine: Signals(machine, [0.0, 0.3, 0.5], {"x": [0.0, 0.6, -0.4]}),
+        lambda machine: ValveSignals(machine, [0.0, 0.3, 0.5], {"x": [0.0, 0.6, -0.4]}),
         lambda machine: crane.joystick(machine, {"x": [(0.0, 0.0), (0.2, 0.5), (0.5, -0.5)]}),
         lambda machine: crane.ValvePD(machine, crane.via_points([0.0, 0.6], [[0.2], [0.3]])),
     ):
@@ -156,10 +156,10 @@ def test_levers_and_programs_move_the_second_spool_alone(tmp_path):
     assert run.channels["voltage_x_b"][-1] == pytest.approx(1.0 - 4.0 * (0.1 + 0.9 * 0.25))
     alike = crane.simulate(machine, crane.joystick(machine, {"x": lever["x"]}), duration=0.3)
     assert alike.channels["voltage_x_b"][-1] == pytest.approx(1.0 + 4.0 * (0.1 + 0.9 * 0.5))
-    program = crane.Sampled(lambda t, q, v, p: [0.3, 2.0], machine, period=0.01)
+    program = crane.SampledCommand(lambda t, q, v, p: [0.3, 2.0], machine, period=0.01)
     run = crane.simulate(machine, program, duration=0.1)
     assert (run.channels["voltage_x"][-1], run.channels["voltage_x_b"][-1]) == (0.3, 2.0)
-    short = crane.Sampled(lambda t, q, v, p: [0.3], machine, period=0.01)
+    short = crane.SampledCommand(lambda t, q, v, p: [0.3], machine, period=0.01)
     with pytest.raises(CraneError, match=r"the signals at t = 0 s .*x_b"):
         crane.simulate(machine, short, duration=0.1)
 
@@ -186,7 +186,7 @@ def test_a_task_of_levers_goes_with_its_joints(tmp_path):
 
 def test_a_recording_of_two_signals_is_replayed(tmp_path):
     machine = everything_apart(tmp_path)
-    run = crane.simulate(machine, Signals(machine, AT, LEVERS), duration=1.5)
+    run = crane.simulate(machine, ValveSignals(machine, AT, LEVERS), duration=1.5)
     run.to_csv(tmp_path / "run.csv")
     again, _ = crane.replay(machine, tmp_path / "run.csv")
     np.testing.assert_allclose(again.q, run.q, atol=2e-4 * np.ptp(run.q))
@@ -196,7 +196,7 @@ def test_the_brake_lets_go_by_the_spool_that_goes_farther(tmp_path):
     machine = rig(tmp_path, APART, cylinder={"brake": 1e4, "brake_release": 0.2})
     for u, w, held in ((0.0, 0.0, 1e4), (0.1, 0.0, 5e3), (0.0, -0.15, 2.5e3), (0.1, 0.3, 0.0)):
         at, _ = now(machine, [u, w])
-        assert at.grips[0] == pytest.approx(held, abs=1e-9)
+        assert at.circuit_friction[0] == pytest.approx(held, abs=1e-9)
 
 
 def test_numbers_are_named_changed_written_and_read(tmp_path):
@@ -204,12 +204,12 @@ def test_numbers_are_named_changed_written_and_read(tmp_path):
     machine = rig(tmp_path, given)
     second = machine.hydraulics.valves["x"].spool_b
     assert second.delay == 0.02 and second.dead_band == 0.1  # as the first, unless it says so
-    usual = circuit_of(machine).numbers
+    usual = circuit_of(machine).constants
     for name, value in OTHER.items():
         other = crane.load(tmp_path / "rig.yaml", {f"valve.x.spool_b.{name}": value + 0.1})
         changed = other.hydraulics.valves["x"].spool_b
         assert changed == dataclasses.replace(second, **{name: value + 0.1})
-        assert 1 <= np.sum(circuit_of(other).numbers != usual) <= 2, name
+        assert 1 <= np.sum(circuit_of(other).constants != usual) <= 2, name
     notes = {"valve.x.spool_b.dead_band": "as measured"}
     path = crane.write_machine(machine, tmp_path / "written", notes=notes)
     assert "as measured" in path.read_text()
@@ -228,7 +228,7 @@ def test_a_calibration_tells_the_second_spool(tmp_path):
                   friction={"viscous": 5e4})  # fmt: skip
     time = np.arange(0.0, 1.6, 0.01)
     signals = {"x": 0.5 * np.sin(8 * time), "x_b": 0.05 + 0.4 * np.sin(8 * time + 0.5)}
-    run = crane.simulate(machine, Signals(machine, time, signals), duration=1.59)
+    run = crane.simulate(machine, ValveSignals(machine, time, signals), duration=1.59)
     path = tmp_path / "run.csv"
     run.to_csv(path)
     off = {"neutral": 0.0, "delay": 0.01}
@@ -274,4 +274,4 @@ def test_what_knows_one_spool_alone_says_so(tmp_path):
     with pytest.raises(CraneError, match="two spools, which this does not tell apart"):
         crane.identify_orifices(machine, [run], "x")
     with pytest.raises(CraneError, match="no valve for 'x_c'"):
-        Signals(machine, [0.0], {"x_c": [0.0]})
+        ValveSignals(machine, [0.0], {"x_c": [0.0]})

@@ -41,7 +41,7 @@ def hold(machine):
 def test_computed_torque_names_what_nothing_drives_and_its_force(tmp_path, effort):
     """Arm and grapple held level with it: m g l = 20 * 9.81 * 0.4 = 78.48 N m at the swing."""
     machine = arm(tmp_path, effort)
-    assert machine.undriven == ("swing",)
+    assert machine.undriven_joints == ("swing",)
     with pytest.warns(CraneWarning) as caught:
         control = crane.ComputedTorque(machine, hold(machine))
     (text,) = [str(one.message) for one in caught]
@@ -63,7 +63,7 @@ def test_computed_torque_names_what_nothing_drives_and_its_force(tmp_path, effor
 )  # fmt: skip
 def test_effort_gains_and_cylinders_drive(tmp_path, effort, section):
     machine = arm(tmp_path, effort, section)
-    assert machine.undriven == ()
+    assert machine.undriven_joints == ()
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)
         crane.ComputedTorque(machine, hold(machine))
@@ -72,7 +72,7 @@ def test_effort_gains_and_cylinders_drive(tmp_path, effort, section):
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 @pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "kr300", "tx40", "ur5_robot"])
 def test_bundled_machines_and_arms_are_driven(name):
-    assert crane.load(name).undriven == ()
+    assert crane.load(name).undriven_joints == ()
 
 
 def test_motors_of_other_formats_drive(tmp_path):
@@ -84,13 +84,13 @@ def test_motors_of_other_formats_drive(tmp_path):
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        assert crane.load(tmp_path / "arm.xml").undriven == ()
+        assert crane.load(tmp_path / "arm.xml").undriven_joints == ()
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_a_locked_joint_needs_no_drive(tmp_path):
     arm(tmp_path, "")
-    assert crane.load(tmp_path / "arm.yaml", lock={"swing": 0.1}).undriven == ()
+    assert crane.load(tmp_path / "arm.yaml", lock={"swing": 0.1}).undriven_joints == ()
 
 
 def test_the_command_line_tells_it_in_one_line(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from broken import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
 
 import crane
-from crane.formats.xml import XmlFile
+from crane.formats.xml_file import XmlFile
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 

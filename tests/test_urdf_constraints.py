@@ -7,9 +7,9 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
-from crane.common.packages import giving
+from crane.common.package_search import use_load_options
 from crane.formats.check import check
-from crane.formats.urdf.read import read_urdf
+from crane.formats.urdf.urdf_reader import read_urdf
 
 TEXT = (DATA / LOOPED).read_text()
 LOOP = TEXT[TEXT.index("  <loop") : TEXT.index("</loop>") + len("</loop>")]
@@ -39,7 +39,7 @@ def test_a_constraint_is_a_loop(kind, tmp_path):
     v_a = np.ones_like(q_a)
     forces = [crane.Dynamics(x).inverse(q_a, v_a, v_a) for x in (machine, same)]
     assert np.array_equal(*forces)
-    again = crane.load(machine.reference, arguments=machine.arguments)
+    again = crane.load(machine.load_name, arguments=machine.arguments)
     assert np.array_equal(again.home, same.home)
 
 
@@ -49,10 +49,10 @@ def test_a_constraint_is_a_loop(kind, tmp_path):
 )
 def test_each_type_is_that_of_a_loop(kind, loop, tmp_path):
     path = written(tmp_path, kind, FRAMES.replace('<parent_axis xyz="0 0 2"/>', ""))
-    with giving(arguments=ASKED):
+    with use_load_options(arguments=ASKED):
         (spec,) = read_urdf(path).loops
     assert (spec.name, spec.type, spec.axis) == ("pin", loop, (1.0, 0.0, 0.0))
-    assert spec.where == f"four_bar.urdf:{BEFORE}"
+    assert spec.source_location == f"four_bar.urdf:{BEFORE}"
 
 
 def test_without_being_asked_it_is_left_out_and_the_line_says_how_to_ask(tmp_path):

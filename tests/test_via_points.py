@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 import crane
 from crane.common.errors import DescriptionError, InputError, UnreachableTipError
-from crane.motion.attitude import Inclination, roll_pitch_yaw
-from crane.motion.piecewise import Piecewise
-from crane.motion.splines import least_jerk
+from crane.motion.attitude import InclinationCoordinate, roll_pitch_yaw
+from crane.motion.piecewise_polynomial import PiecewisePolynomial
+from crane.motion.quintic_splines import least_jerk
 
 PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
 TIMES = [0.0, 0.4, 1.5, 2.0]
@@ -127,7 +127,7 @@ def test_rates_are_those_of_the_positions():
     assert np.abs((ahead[0] - back[0]) / (2 * step) - v).max() < 1e-5
     assert np.abs((ahead[1] - back[1]) / (2 * step) - a).max() < 1e-3
     # C4: the fourth derivative does not jump at a point
-    curve = path._curves[2]
+    curve = path._polynomials[2]
     for order in (1, 2):
         jump = curve(0.4 + 1e-12, order) - curve(0.4 - 1e-12, order)
         assert np.abs(jump).max() < 1e-6 * np.abs(curve(0.4, order)).max()
@@ -420,7 +420,7 @@ def test_bad_attitudes(excavator):
         with pytest.raises(InputError, match=line):
             kinematics.inverse([8.0, 0, 0], attitude=attitude)
     with pytest.raises(InputError, match="neither its y axis nor its z axis"):
-        Inclination(excavator, "base_link" if False else excavator.tree.root)
+        InclinationCoordinate(excavator, "base_link" if False else excavator.tree.root_link)
 
 
 # --- tasks of a machine file -----------------------------------------------------------------
@@ -440,9 +440,9 @@ def task(tmp_path):
     """A copy of the excavator's file with another task."""
     import shutil
 
-    from crane.description.sources import bundled
+    from crane.description.machine_lookup import bundled_machines
 
-    source = bundled()["excavator"]
+    source = bundled_machines()["excavator"]
     shutil.copytree(source.parent / "urdf" / "excavator", tmp_path / "urdf" / "excavator")
     text = source.read_text()
     start = text.index("\ntasks:") + 1
@@ -566,7 +566,7 @@ def test_piecewise_polynomials_are_those_of_scipy(degree, parts):
     knots = np.r_[-0.3, np.cumsum(draw.uniform(0.1, 2.0, parts))]
     rows = draw.normal(size=(degree + 1, parts, 3))
     time = np.r_[knots, draw.uniform(-2.0, knots[-1] + 2.0, 50)]
-    own, scipy_s = Piecewise(rows, knots), PPoly(rows, knots)
+    own, scipy_s = PiecewisePolynomial(rows, knots), PPoly(rows, knots)
     for order in range(degree + 2):
         wanted = scipy_s(time, order)
         size = np.abs(wanted).max() + 1e-300

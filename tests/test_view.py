@@ -13,13 +13,19 @@ import pytest
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, RecordingError
-from crane.formats.visuals.visuals import Box, Cylinder, Mesh
+from crane.formats.visuals.urdf_shapes import BoxShape, CylinderShape, MeshShape
 from crane.recordings.recording import Recording
 from crane.view.page import build_scene, report
-from crane.view.page.arrays import quantised
-from crane.view.page.motion import decimate, frame_rows, motion, payload_place, tree
+from crane.view.page.machine_visuals import read_visuals, skeleton_visuals
+from crane.view.page.packed_arrays import quantise
+from crane.view.page.page_motion import (
+    frame_rows,
+    joint_tree,
+    motion_data,
+    nearest_frame_rows,
+    payload_frame_data,
+)
 from crane.view.page.scene import link_poses
-from crane.view.page.visuals import read_visuals, skeleton
 
 CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.002, 0.004]]
 
@@ -123,7 +129,7 @@ def test_a_page_s_tree_gives_the_poses_of_forward_kinematics(name):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         machine = crane.load(name)
-    description = tree(machine)
+    description = joint_tree(machine)
     links = [f.name for f in machine.model.frames if f.type == pin.FrameType.BODY]
     assert list(description["links"]) == links
     rng = np.random.default_rng(7)
@@ -145,21 +151,21 @@ def unpacked(motion):
 
 def test_frames_are_recorded_postures(machine, recording):
     scene = build_scene(machine, recording)
-    time, q = unpacked(motion(scene.time, scene.q))
-    np.testing.assert_array_equal(time, recording.time[scene.rows])
-    np.testing.assert_allclose(q, machine.closure.solve(recording.q)[scene.rows], atol=2e-9)
+    time, q = unpacked(motion_data(scene.time, scene.configurations))
+    np.testing.assert_array_equal(time, recording.time[scene.frame_rows])
+    np.testing.assert_allclose(q, machine.closure.solve(recording.q)[scene.frame_rows], atol=2e-9)
 
 
 @pytest.mark.parametrize("span", [1e-9, 1.0, 1e4])
 def test_coordinates_keep_ten_digits_of_their_range(span):
     values = 5.0 + span * np.random.default_rng(1).uniform(size=1000)
-    _, q = unpacked(motion(np.arange(1000.0), values[:, None]))
+    _, q = unpacked(motion_data(np.arange(1000.0), values[:, None]))
     np.testing.assert_allclose(q[:, 0], values, rtol=0, atol=1.2e-10 * span + 1e-15)
-    assert quantised(np.full(3, 0.7)) == {"low": 0.7, "step": 0.0, "levels": ""}
+    assert quantise(np.full(3, 0.7)) == {"low": 0.7, "step": 0.0, "levels": ""}
 
 
 def test_loops_are_closed_where_channels_are_missing(machine, recording):
-    full, closed = (build_scene(machine, r).q for r in (recording, bare(recording)))
+    full, closed = (build_scene(machine, r).configurations for r in (recording, bare(recording)))
     np.testing.assert_allclose(full, closed, atol=1e-10)
 
 
@@ -167,13 +173,15 @@ def test_a_channel_in_another_unit_is_no_coordinate(machine, recording):
     """Angles in degrees, as they stand in a file of unknown units, are not taken for radians."""
     other = dataclasses.replace(recording, channel_units={"q2": "grad"})
     np.testing.assert_allclose(
-        build_scene(machine, other).q, build_scene(machine, recording).q, atol=1e-10
+        build_scene(machine, other).configurations,
+        build_scene(machine, recording).configurations,
+        atol=1e-10,
     )
 
 
 def test_home_posture_stands_still(machine):
     scene = build_scene(machine)
-    np.testing.assert_array_equal(scene.q, machine.home[None])
+    np.testing.assert_array_equal(scene.configurations, machine.home[None])
     for link in ("link7", "A2_rod"):
         expected = world(machine, machine.home, link)
         np.testing.assert_allclose(transforms(scene)[f"machine/{link}"], expected, atol=1e-12)
@@ -181,7 +189,7 @@ def test_home_posture_stands_still(machine):
 
 def test_the_box_holds_the_machine_in_every_frame(machine, recording):
     scene = build_scene(machine, recording)
-    for q in scene.q:
+    for q in scene.configurations:
         tip = world(machine, q, "link7_tip")[:3, 3]
         assert (scene.lower <= tip + 1e-9).all()
         assert (tip - 1e-9 <= scene.upper).all()
@@ -212,15 +220,17 @@ def test_the_ground_is_where_the_machine_stands_however_low_its_tip_reaches(
     down = np.array([[0.0], [-1.5]])
     moves = Recording([0, 1], ("lift",), down, 0 * down, 0 * down, {"lift": "rad"})
     scene = build_scene(mast, moves)
-    assert scene.ground == pytest.approx(ground, abs=1e-12)
+    assert scene.ground_height == pytest.approx(ground, abs=1e-12)
     assert scene.lower[2] < -0.9  # the tip digs, and stays in view
-    assert f'"ground":{scene.ground!r}' in report(mast, moves, tmp_path / "a.html").read_text()
+    assert (
+        f'"ground":{scene.ground_height!r}' in report(mast, moves, tmp_path / "a.html").read_text()
+    )
 
 
 @pytest.mark.parametrize(("step", "frames"), [(1e-3, 301), (5e-2, 201), (1.0, 11)])
 def test_frames_are_the_nearest_samples(step, frames):
     time = 7.0 + step * np.arange(round(10 / step) + 1)
-    rows = decimate(time, 30)
+    rows = nearest_frame_rows(time, 30)
     assert len(rows) == frames
     assert rows[0] == 0
     assert rows[-1] == len(time) - 1
@@ -239,12 +249,12 @@ def test_an_hour_has_fewer_frames_per_second():
 def test_the_payload_s_mark_is_its_centre_of_mass(changes):
     """What the payload adds to the machine's moment of mass."""
     loaded, empty = crane.load("patu655", changes), crane.load("patu655")
-    here = payload_place(loaded)
+    here = payload_frame_data(loaded)
     inertias = [m.model.inertias[here["joint"] + 1] for m in (loaded, empty)]
     moment = inertias[0].mass * inertias[0].lever - inertias[1].mass * inertias[1].lever
     expected = moment / (inertias[0].mass - inertias[1].mass)
     np.testing.assert_allclose(here["placement"][12:15], expected, atol=1e-9)
-    assert payload_place(empty) is None
+    assert payload_frame_data(empty) is None
 
 
 def test_what_is_not_finite_is_refused(machine, recording):
@@ -302,7 +312,7 @@ def test_every_moving_body_is_drawn_and_joined_at_its_pins(machine):
         axis = world(machine, machine.home, pin_)
         for body in bodies:
             assert any(
-                isinstance(visual.shape, Cylinder)
+                isinstance(visual.shape, CylinderShape)
                 and _on_axis(np.linalg.inv(axis) @ poses[body][0] @ visual.placement)
                 for visual in visuals
                 if visual.link == body
@@ -319,8 +329,10 @@ def _on_axis(placement):
 def test_rods_slide_in_their_barrels(machine, actuator):
     """Over the whole stroke a rod's rear end is in the barrel, and its eye outside."""
     visuals = read_visuals(machine)
-    barrel = np.concatenate([v.corners() for v in visuals if v.link == f"{actuator}_barrel"])
-    rod = np.concatenate([v.corners() for v in visuals if v.link == f"{actuator}_rod"])
+    barrel = np.concatenate(
+        [v.bounding_corners() for v in visuals if v.link == f"{actuator}_barrel"]
+    )
+    rod = np.concatenate([v.bounding_corners() for v in visuals if v.link == f"{actuator}_rod"])
     for stroke in (0.0, 0.015, 0.030):
         q = machine.closure.solve([0.0, stroke, stroke])
         shift = np.linalg.inv(world(machine, q, f"{actuator}_barrel")) @ world(
@@ -338,7 +350,7 @@ def test_cylinders_keep_their_axis(machine):
     index = next(
         i
         for i, visual in enumerate(visuals)
-        if visual.link == "A1_rod" and isinstance(visual.shape, Cylinder)
+        if visual.link == "A1_rod" and isinstance(visual.shape, CylinderShape)
     )
     placed = transforms(build_scene(machine))[f"machine/A1_rod/visual_{index}"]
     np.testing.assert_allclose(abs(placed[:3, 1]), [1, 0, 0], atol=1e-5)
@@ -355,9 +367,9 @@ def test_meshes_are_scaled_and_placed(tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.format(foot=visual))
     visuals = read_visuals(crane.load(tmp_path / "arm.urdf"))
     (found,) = (x for x in visuals if x.link == "foot")
-    assert isinstance(found.shape, Mesh)
+    assert isinstance(found.shape, MeshShape)
     assert found.colour == (1, 0.5, 0, 1)
-    corners = found.corners()
+    corners = found.bounding_corners()
     np.testing.assert_allclose(corners.min(axis=0), [-0.05, -0.2, 1 - 0.45], atol=1e-6)
     np.testing.assert_allclose(corners.max(axis=0), [0.05, 0.2, 1 + 0.45], atol=1e-6)
 
@@ -369,13 +381,13 @@ def test_missing_meshes_are_boxes_with_a_skeleton_and_a_warning(tmp_path):
     with pytest.warns(CraneWarning, match=r"1 mesh files? .*gone/foot\.stl"):
         found = read_visuals(arm)
     assert {visual.link for visual in found} == {"foot", "arm"}
-    assert [visual.link for visual in found if isinstance(visual.shape, Box)] == ["foot"]
+    assert [visual.link for visual in found if isinstance(visual.shape, BoxShape)] == ["foot"]
 
 
 def test_skeleton_reaches_joints_and_frames(tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.format(foot=""))
     arm = crane.load(tmp_path / "arm.urdf")
-    bars = [v for v in skeleton(arm) if isinstance(v.shape, Cylinder)]
+    bars = [v for v in skeleton_visuals(arm) if isinstance(v.shape, CylinderShape)]
     ends = {v.link: v.placement @ [0, 0, v.shape.length / 2, 1] for v in bars}
     np.testing.assert_allclose(ends["foot"][:3], [0, 0, 0.5], atol=1e-12)
     np.testing.assert_allclose(ends["arm"][:3], [0.4, 0.1, 0], atol=1e-12)

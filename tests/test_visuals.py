@@ -13,13 +13,20 @@ import wheel_loader
 
 import crane
 from crane.common.errors import CraneWarning
-from crane.dynamics.frames import FrameJacobians
+from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.formats.check import check
-from crane.formats.visuals import mesh_process, meshes
-from crane.formats.visuals.visuals import PLAIN, Box, Cylinder, Mesh, Sphere, read_drawn
-from crane.formats.xml import XmlFile
+from crane.formats.visuals import mesh_files, mesh_process
+from crane.formats.visuals.urdf_shapes import (
+    DEFAULT_COLOUR,
+    BoxShape,
+    CylinderShape,
+    MeshShape,
+    SphereShape,
+    read_shapes,
+)
+from crane.formats.xml_file import XmlFile
 from crane.view.page import report
-from crane.view.page.visuals import read_visuals
+from crane.view.page.machine_visuals import read_visuals
 
 ARM = """<robot name="arm">
   <link name="foot">
@@ -109,8 +116,8 @@ def test_what_cannot_be_drawn_is_told_and_left_out(drawn, line, tmp_path):
         report(machine, None, tmp_path / "arm.html")
     with pytest.warns(CraneWarning):
         shapes = [visual.shape for visual in read_visuals(machine)]
-    assert shapes[0] == Sphere(0.2)
-    assert all(isinstance(shape, Box) for shape in shapes[1:])
+    assert shapes[0] == SphereShape(0.2)
+    assert all(isinstance(shape, BoxShape) for shape in shapes[1:])
 
 
 @pytest.mark.parametrize("colour", ["255 0 0 1", "red", "nan 0 0 1", "1 0 0", ""])
@@ -120,7 +127,7 @@ def test_a_bad_colour_is_grey(colour, tmp_path):
     assert [f.line for f in check(path).findings] == [3]
     with pytest.warns(CraneWarning, match="of a colour .*; grey is drawn"):
         (visual,) = read_visuals(crane.load(path))
-    assert visual.colour == PLAIN
+    assert visual.colour == DEFAULT_COLOUR
 
 
 def test_colours_go_by_name_wherever_they_stand(tmp_path):
@@ -134,26 +141,26 @@ def test_colours_go_by_name_wherever_they_stand(tmp_path):
     )  # fmt: skip
     blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
     path.write_text(path.read_text().replace("</robot>", f"{blue}</robot>"))
-    drawn = read_drawn(XmlFile(path))
+    drawn = read_shapes(XmlFile(path))
     assert not drawn.problems
     colours = [visual.colour for visual in drawn.shapes["visual"]]
-    assert colours == [(1, 0, 0, 0.5), (1, 0, 0, 0.5), (0, 0, 1, 1), PLAIN]
+    assert colours == [(1, 0, 0, 0.5), (1, 0, 0, 0.5), (0, 0, 1, 1), DEFAULT_COLOUR]
 
 
 def test_a_capsule_is_a_cylinder_between_two_balls(tmp_path):
     """Volume by points that fall into it: pi r^2 l + 4/3 pi r^3."""
     drawn = '<visual><origin xyz="0 0 1" rpy="0 1.5707963267948966 0"/><geometry>'
     drawn += '<capsule radius="0.1" length="0.4"/></geometry></visual>'
-    found = read_drawn(XmlFile(arm(tmp_path, drawn))).shapes["visual"]
-    assert [type(visual.shape) for visual in found] == [Cylinder, Sphere, Sphere]
-    corners = np.concatenate([visual.corners() for visual in found])
+    found = read_shapes(XmlFile(arm(tmp_path, drawn))).shapes["visual"]
+    assert [type(visual.shape) for visual in found] == [CylinderShape, SphereShape, SphereShape]
+    corners = np.concatenate([visual.bounding_corners() for visual in found])
     np.testing.assert_allclose(corners.min(axis=0), [-0.3, -0.1, 0.9], atol=1e-12)
     np.testing.assert_allclose(corners.max(axis=0), [0.3, 0.1, 1.1], atol=1e-12)
     points = np.random.default_rng(1).uniform([-0.3, -0.1, 0.9], [0.3, 0.1, 1.1], (200_000, 3))
     inside = np.zeros(len(points), dtype=bool)
     for visual in found:
         local = (points - visual.placement[:3, 3]) @ visual.placement[:3, :3]
-        if isinstance(visual.shape, Cylinder):
+        if isinstance(visual.shape, CylinderShape):
             inside |= (np.hypot(*local[:, :2].T) < 0.1) & (np.abs(local[:, 2]) < 0.2)
         else:
             inside |= np.linalg.norm(local, axis=1) < 0.1
@@ -198,14 +205,14 @@ def test_damaged_meshes_are_boxes_with_one_line(tmp_path):
         assert line.isprintable() and len(line) < 250
     with pytest.warns(CraneWarning, match=f"short.stl.*\\({len(DAMAGED)} such, crane check"):
         shapes = [visual.shape for visual in read_visuals(crane.load(path))]
-    assert [type(shape) for shape in shapes] == [Box] * len(DAMAGED) + [Mesh]
+    assert [type(shape) for shape in shapes] == [BoxShape] * len(DAMAGED) + [MeshShape]
     np.testing.assert_allclose(shapes[-1].vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
 def test_too_large_a_mesh_is_not_opened(tmp_path):
     with (tmp_path / "large.stl").open("wb") as file:
         file.truncate(10**12)  # which takes no space
-    assert meshes.read_meshes([tmp_path / "large.stl"]) == {
+    assert mesh_files.read_meshes([tmp_path / "large.stl"]) == {
         tmp_path / "large.stl": "1000000 MB, more than 200"
     }
 
@@ -240,7 +247,9 @@ def test_a_small_file_that_repeats_its_parts_is_drawn_up_to_a_bound(tmp_path):
     """Half a megabyte would be four million triangles; screws that occur often are fine."""
     (tmp_path / "bomb.glb").write_bytes(instanced(10_000, 399))
     (tmp_path / "screws.glb").write_bytes(instanced(100, 900))
-    bomb, screws = meshes.read_meshes([tmp_path / "bomb.glb", tmp_path / "screws.glb"]).values()
+    bomb, screws = mesh_files.read_meshes(
+        [tmp_path / "bomb.glb", tmp_path / "screws.glb"]
+    ).values()
     assert bomb == "it repeats its 10000 triangles to more than 100000"
     (part,) = screws  # all of one colour
     assert len(part.faces) == 90_000 and part.faces.max() == len(part.vertices) - 1
@@ -253,17 +262,17 @@ def test_what_a_mesh_holds_is_kept_by_its_content(tmp_path, place, monkeypatch):
     triangle = "usemtl red\nv 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n"
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + triangle)
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
-    asked, ask = [], meshes._ask
+    asked, ask = [], mesh_files._run_mesh_process
 
     def told(names):
         asked.clear()
-        return list(meshes.read_meshes(tmp_path / name for name in names).values())
+        return list(mesh_files.read_meshes(tmp_path / name for name in names).values())
 
     def counted(files, triangles):
         asked.append([file.name for file in files])
         return ask(files, triangles)
 
-    monkeypatch.setattr(meshes, "_ask", counted)
+    monkeypatch.setattr(mesh_files, "_run_mesh_process", counted)
     names = ["a.stl", "a.off", "a.obj"]
     (first,), wrong, (red,) = told(names)
     assert asked == [names] and isinstance(wrong, str) and red.colour == (1, 0, 0, 1)
@@ -287,9 +296,9 @@ def test_what_a_mesh_holds_is_kept_by_its_content(tmp_path, place, monkeypatch):
 def test_kept_meshes_count_as_triangles_to_draw(tmp_path, place, monkeypatch):
     for faces in (30, 20):
         (tmp_path / f"{faces}.stl").write_bytes(stl(faces, faces))
-    assert not isinstance(meshes.read_meshes([tmp_path / "30.stl"])[tmp_path / "30.stl"], str)
-    monkeypatch.setattr(mesh_process, "TRIANGLES", 49)
-    kept, wrong = meshes.read_meshes([tmp_path / "30.stl", tmp_path / "20.stl"]).values()
+    assert not isinstance(mesh_files.read_meshes([tmp_path / "30.stl"])[tmp_path / "30.stl"], str)
+    monkeypatch.setattr(mesh_process, "MAX_TRIANGLES", 49)
+    kept, wrong = mesh_files.read_meshes([tmp_path / "30.stl", tmp_path / "20.stl"]).values()
     assert len(kept[0].faces) == 30 and wrong.startswith("with it there are more than")
 
 
@@ -314,7 +323,7 @@ def test_a_reader_that_ends_costs_one_mesh(tmp_path, place, monkeypatch):
     def read(*names):
         for name in names:
             (tmp_path / name).write_bytes(stl(1))
-        return list(meshes.read_meshes(tmp_path / name for name in names).values())
+        return list(mesh_files.read_meshes(tmp_path / name for name in names).values())
 
     first, second, third, fourth, fifth = read("1.stl", "end.stl", "2.stl", "long.stl", "3.stl")
     assert second == "damaged" and fourth == "reading it takes more than 20 s"
@@ -349,10 +358,10 @@ def test_bodies_without_visuals_are_bars_between_their_pins(tmp_path):
     urdf.write_text(text)
     machine = crane.load(path)
     frames, found = FrameJacobians(machine), {}
-    frames.place(machine.home)
+    frames.set_configuration(machine.home)
     for visual in read_visuals(machine):
-        if isinstance(visual.shape, Sphere):
-            place = frames.pose(visual.link).homogeneous @ visual.placement
+        if isinstance(visual.shape, SphereShape):
+            place = frames.frame_pose(visual.link).homogeneous @ visual.placement
             found.setdefault(visual.link, []).append(place[[0, 2], 3])
     known = {
         "boom": (wheel_loader.PIN, wheel_loader.CRANK, wheel_loader.LIFT_EYE),

@@ -5,7 +5,7 @@ import pytest
 from free_bodies import places
 
 import crane
-from crane.view.plots.working_range import working_range_figure
+from crane.view.plots.working_range_figure import working_range_figure
 
 COUNT = 31  # values of each stroke in the grid
 
@@ -88,7 +88,9 @@ def test_the_front_slews_within_its_radius(excavator, found, grid):
     radii = [abs(at[pin][0, 3]) for pin in pins]
     assert max(radii) == pytest.approx(one.value, abs=1e-8)
     q = excavator.closure.solve(grid[0])
-    all_pins = [crane.Kinematics(excavator, pin).positions(q)[:, 0] for pin in pins]
+    all_pins = [
+        crane.Kinematics(excavator, pin).positions_at_configurations(q)[:, 0] for pin in pins
+    ]
     brute = np.abs(all_pins).max(axis=0).min()
     assert one.value - 1e-9 <= brute < one.value + 0.05
 

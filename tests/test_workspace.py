@@ -13,7 +13,7 @@ import crane
 from crane.cli import program
 from crane.common.errors import InputError
 from crane.motion.workspaces import workspace
-from crane.motion.workspaces.patch import last_closed
+from crane.motion.workspaces.workspace_patch import last_closed_configuration
 
 CRANK, COUPLER, ROCKER, GROUND = 0.2, 0.4, 0.3, 0.4  # of data/four_bar.yaml
 
@@ -46,10 +46,15 @@ def test_a_grashof_crank_turns_all_around(tmp_path):
     """0.2 + 0.4 <= 0.3 + 0.4: the shortest link beside the ground is a crank (Grashof)."""
     assert crank_limits(0.2) == pytest.approx([0, np.pi])
     space = workspace(four_bar(tmp_path, 0.2), 400, "pin_predecessor")
-    assert space.share == 1 and not space.curves and space.area == 0
+    assert space.closed_share == 1 and not space.curves and space.area == 0
     assert len(space) == 400
     # the pin runs on the rocker's circle
-    assert np.abs(np.hypot(space.tips[:, 0] - GROUND, space.tips[:, 1]) - ROCKER).max() < 1e-12
+    assert (
+        np.abs(
+            np.hypot(space.tip_positions[:, 0] - GROUND, space.tip_positions[:, 1]) - ROCKER
+        ).max()
+        < 1e-12
+    )
 
 
 @pytest.mark.parametrize("crank", [0.34, 0.38, 0.45])
@@ -59,7 +64,7 @@ def test_a_longer_crank_only_swings(tmp_path, crank):
     ends = sorted(float(curve.q_a[0, 0]) + 1.2 for curve in space.curves)  # from the ground's line
     low, high = crank_limits(crank)
     assert ends == pytest.approx([low, high], abs=1e-5)
-    assert space.share == pytest.approx((high - low) / 6.28, abs=2 / 500)
+    assert space.closed_share == pytest.approx((high - low) / 6.28, abs=2 / 500)
     assert "end of the branch" in space.to_markdown()
     # condition grows without bounds towards the ends
     assert space.condition.max() > 10
@@ -170,15 +175,15 @@ def test_patu655_reaches_as_far_as_its_pins_allow():
         ("least height", both[1].min()), ("largest height", both[1].max()),
     ):  # fmt: skip
         assert space.extreme(name).value == pytest.approx(value, abs=1e-3), name
-    assert space.slew == "slew" and space.share == 1
+    assert space.slewing_joint_name == "slew" and space.closed_share == 1
     assert space.strokes == ("X_lift", "X_tilt", "X_ext")
-    assert space.places[:, 0] == pytest.approx(space.tips[:, 0], abs=1e-12)
+    assert space.section_positions[:, 0] == pytest.approx(space.tip_positions[:, 0], abs=1e-12)
 
 
 def test_mini_forwarder_area_by_integration(mini):
     """No stroke turns the tip back: the area is the integral of the slopes' determinant."""
     space = workspace(mini, 4000)
-    assert space.slew == "q1" and space.strokes == ("X1", "X2") and not space.curves
+    assert space.slewing_joint_name == "q1" and space.strokes == ("X1", "X2") and not space.curves
 
     def tips(x1, x2):
         return oracles.mini_forwarder(x1, x2)[1]
@@ -194,7 +199,7 @@ def test_mini_forwarder_area_by_integration(mini):
     grid = np.linspace(0, 0.03, 400)
     x1, x2 = (values.ravel() for values in np.meshgrid(grid, grid))
     both = tips(x1, x2)
-    for k, name in enumerate(space.section.names):
+    for k, name in enumerate(space.section.coordinate_names):
         assert space.extreme(f"least {name}").value == pytest.approx(both[k].min(), abs=1e-5)
         assert space.extreme(f"largest {name}").value == pytest.approx(both[k].max(), abs=1e-5)
 
@@ -228,10 +233,10 @@ def test_a_two_link_arm_has_the_area_of_its_ring(tmp_path):
     </joint><link name="tip"/></robot>"""
     (tmp_path / "two.urdf").write_text(text)
     space = workspace(crane.load(tmp_path / "two.urdf"), 6000)
-    assert space.section.names == ("x", "z")
+    assert space.section.coordinate_names == ("x", "z")
     assert space.area == pytest.approx(np.pi * (0.8**2 - 0.2**2), rel=4e-3)
     assert space.extreme("largest z").value == pytest.approx(0.8, abs=1e-9)
-    away = np.linalg.norm(np.vstack([curve.places for curve in space.curves]), axis=1)
+    away = np.linalg.norm(np.vstack([curve.section_positions for curve in space.curves]), axis=1)
     assert len(away) and np.minimum(np.abs(away - 0.8), np.abs(away - 0.2)).max() < 1e-6
 
 
@@ -240,14 +245,14 @@ def test_a_two_link_arm_has_the_area_of_its_ring(tmp_path):
 def test_arms_of_many_joints_are_drawn(name, frame):
     machine = crane.load(name)
     space = workspace(machine, 600, frame)
-    assert not space.complete and space.slew == machine.active[0]
+    assert not space.is_complete and space.slewing_joint_name == machine.active[0]
     assert "the true workspace is larger" in space.to_markdown()
-    assert (space.q_a >= space.low - 1e-12).all() and (space.q_a <= space.high + 1e-12).all()
+    assert (space.q_a >= space.lower - 1e-12).all() and (space.q_a <= space.upper + 1e-12).all()
     frame = space.frame
     tips = crane.Kinematics(machine, frame).position(space.q_a[::40])
-    assert np.abs(tips - space.tips[::40]).max() < 1e-12
-    radius = np.hypot(space.tips[:, 0], space.tips[:, 1])
-    assert np.abs(space.places[:, 0] - radius).max() < 1e-9
+    assert np.abs(tips - space.tip_positions[::40]).max() < 1e-12
+    radius = np.hypot(space.tip_positions[:, 0], space.tip_positions[:, 1])
+    assert np.abs(space.section_positions[:, 0] - radius).max() < 1e-9
     again = workspace(machine, 600, frame)
     assert np.array_equal(again.q_a, space.q_a) and again.area == space.area
 
@@ -291,7 +296,7 @@ def test_ways_stop_where_the_branch_ends(five_bar):
     home = five_bar.home[five_bar.closure.active]
     for turn in np.linspace(0, 2 * np.pi, 17):
         target = home + 2.5 * np.array([np.cos(turn), np.sin(turn)])
-        q, able = last_closed(five_bar, five_bar.home, target)
+        q, able = last_closed_configuration(five_bar, five_bar.home, target)
         q_a = q[five_bar.closure.active]
         gap = np.hypot(*np.subtract(*oracles.five_bar_tips(*q_a)))
         if able:

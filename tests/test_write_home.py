@@ -36,7 +36,7 @@ def again(path):
     before = crane.load(path, arguments={"nearest_assembly": True})
     assert write_home(path) == path.resolve()
     after = crane.load(path)
-    assert after.closure.sought is None
+    assert after.closure.home_search is None
     np.testing.assert_allclose(
         after.home, before.home, rtol=0, atol=4e-16
     )  # wound up to half a turn

@@ -5,8 +5,8 @@ from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
-from crane.closure.compiled import FastClosure
-from crane.dynamics.compiled import QuantityCode
+from crane.closure.compiled_closure import CompiledClosure
+from crane.dynamics.compiled_dynamics import CompiledQuantity
 
 PACKAGE = str(Path(__file__).parents[1] / "crane")
 
@@ -52,9 +52,9 @@ def at_most(limit):
 def passes(monkeypatch):
     """Count samples: those whose loops are closed, and those at which each quantity is computed.
 
-    Keys are "closed" and the names of `crane.dynamics.compiled.QUANTITIES`.
+    Keys are "closed" and the names of `crane.dynamics.compiled_dynamics.QUANTITIES`.
     """
-    count, made, quantities = Counter(), QuantityCode.__init__, {}
+    count, made, quantities = Counter(), CompiledQuantity.__init__, {}
 
     def named(formula, quantity, *arguments):
         made(formula, quantity, *arguments)
@@ -75,8 +75,8 @@ def passes(monkeypatch):
         return quantities.get(id(formula._program), "other")
 
     with monkeypatch.context() as patch:
-        patch.setattr(QuantityCode, "__init__", named)
-        counted(FastClosure, "follow", lambda _: ["closed"], lambda out, _: out)
-        counted(QuantityCode, "each", lambda x: ["closed", quantity(x)], lambda out, _: out)
-        counted(QuantityCode, "along", lambda x: [quantity(x)], lambda _, given: len(given[0]))
+        patch.setattr(CompiledQuantity, "__init__", named)
+        counted(CompiledClosure, "follow", lambda _: ["closed"], lambda out, _: out)
+        counted(CompiledQuantity, "each", lambda x: ["closed", quantity(x)], lambda out, _: out)
+        counted(CompiledQuantity, "along", lambda x: [quantity(x)], lambda _, given: len(given[0]))
         yield count

@@ -31,7 +31,7 @@ def cylinder(
     force: Force = False,
 ) -> None:
     """Put barrel and rod of steel between two points, driven in place of the joint they turn."""
-    from crane.formats.adding import add_cylinder
+    from crane.formats.additions import add_cylinder
 
     print(
         add_cylinder(
@@ -50,7 +50,7 @@ def loops(
     force: Force = False,
 ) -> None:
     """Close the loops that `crane check` proposes, and write the closed machine."""
-    from crane.formats.adding import add_loops
+    from crane.formats.additions import add_loops
 
     values = arguments(argument)
     print(add_loops(machine, out=out, force=force, packages=packages or (), arguments=values))

@@ -90,13 +90,13 @@ def capacity(
 
     from crane.cli.runs import check_folder, write_capacity
     from crane.common.samples import as_number
-    from crane.dynamics.stability import has_supports
+    from crane.dynamics.tipping_stability import has_supports
     from crane.ratings import capacity as rate
     from crane.ratings import torques
 
     check_folder(out, force)
     shares = _rule(rule, hydraulic, tipping)
-    lean = radians(as_number(slope, "--slope", "degrees", most=45.0))
+    lean = radians(as_number(slope, "--slope", "degrees", max_magnitude=45.0))
     slews = None if slew is None else [radians(x) for x in _angles(slew)]
     loaded = load(machine, lock, change, active, free, False, packages, argument)
     if shares.tipping < 1 and not has_supports(loaded):
@@ -129,16 +129,18 @@ def _rule(name: str, hydraulic: float | None, tipping: float | None) -> "Rule":
         InputError: An unknown rule, or a share that is none.
     """
     from crane.common.samples import as_number
-    from crane.ratings.rules import rule_of
+    from crane.ratings.rating_rules import find_rule
 
-    rule, words = rule_of(name), []
+    rule, words = find_rule(name), []
     for what, share in (("hydraulic", hydraulic), ("tipping", tipping)):
         if share is not None:
-            share = as_number(share, f"--{what}", "", above=0.0, most=1.0)
+            share = as_number(share, f"--{what}", "", greater_than=0.0, max_magnitude=1.0)
             rule = dataclasses.replace(rule, **{what: share})  # type: ignore[arg-type]
             words.append(f"{100 * share:g} % of the {what} load")
     if words:
-        rule = dataclasses.replace(rule, says=f"{rule.says}; here {' and '.join(words)}")
+        rule = dataclasses.replace(
+            rule, description=f"{rule.description}; here {' and '.join(words)}"
+        )
     return rule
 
 

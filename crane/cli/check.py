@@ -15,7 +15,7 @@ from crane.cli.shared import (
     arguments,
     names,
 )
-from crane.common.packages import NEAREST_ASSEMBLY
+from crane.common.package_search import NEAREST_ASSEMBLY
 
 
 @app.command()

@@ -18,7 +18,7 @@ from crane.cli.shared import (
     span_of,
     status,
 )
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,11 +69,11 @@ def circuit(
 ) -> None:
     """Find bulk modulus and orifices, the valve's curve, or the friction of one cylinder."""
     from crane.cli.runs import check_folder, read_run
-    from crane.common.output import staging
-    from crane.identification.hydraulics.cylinder_signals import needed
+    from crane.common.atomic_output import replace_folder
+    from crane.identification.hydraulics.cylinder_signals import required_channels
 
     if model not in MODELS:
-        raise InputError(f"model '{model}' is unknown, {known(MODELS, model)}")
+        raise InputError(f"model '{model}' is unknown, {suggest_names(MODELS, model)}")
     of_orifices = {"--method": method, "--period": period, "--validation": validation}
     given = [option for option, value in of_orifices.items() if value is not None]
     if model != "orifices" and given:
@@ -85,8 +85,10 @@ def circuit(
     span = span_of(since, until)
     loaded = load(machine, lock, change)
     if joint not in loaded.active:
-        raise InputError(f"'{joint}' is not an active joint, {known(loaded.active, joint)}")
-    needs = needed(joint) if model == "orifices" else []
+        raise InputError(
+            f"'{joint}' is not an active joint, {suggest_names(loaded.active, joint)}"
+        )
+    needs = required_channels(joint) if model == "orifices" else []
     if model == "valve":
         needs.append((f"voltage_{joint}",))
     runs = [read_run(path, loaded, columns, span, needs) for path in recording]
@@ -101,7 +103,7 @@ def circuit(
     print(text, end="")
     if out is None:
         return
-    with staging(out, force) as part:
+    with replace_folder(out, force) as part:
         (part / f"{model}.txt").write_text(text, encoding="utf-8")
         figure.savefig(part / f"{model}.png", format="png", dpi=200)
     print(f"\nwritten to {out}")
@@ -115,31 +117,31 @@ def _orifices(
     period: float | None,
     judge: "Recording | None",
 ) -> "tuple[str, Figure]":
-    from crane.identification.hydraulics.orifices import identify_orifices
-    from crane.view.plots.hydraulics import sides_figure
+    from crane.identification.hydraulics.orifice_coefficients import identify_orifices
+    from crane.view.plots.hydraulics_figures import equation_sides_figure
 
     found = identify_orifices(machine, runs, joint, method, period=period)
-    shown = {f"recording {i + 1}": both for i, both in enumerate(found.training)}
+    shown = {f"recording {i + 1}": both for i, both in enumerate(found.training_sides)}
     text = found.to_text()
     if judge is not None:
         both = found.predict(judge, period)
         shown["validation"] = both
-        text += f"validation: relative error of (29) {100 * both.relative:.3g} %\n"
-    return text, sides_figure(shown, machine.unit(joint))
+        text += f"validation: relative error of (29) {100 * both.relative_error:.3g} %\n"
+    return text, equation_sides_figure(shown, machine.unit(joint))
 
 
 def _valve(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
-    from crane.identification.hydraulics.valve import identify_valve
-    from crane.view.plots.hydraulics import valve_figure
+    from crane.identification.hydraulics.valve_curve import identify_valve
+    from crane.view.plots.hydraulics_figures import valve_curve_figure
 
     curve = identify_valve(machine, run, joint)
     unit = machine.unit(joint)
-    return curve.to_text(unit), valve_figure(curve, unit)
+    return curve.to_text(unit), valve_curve_figure(curve, unit)
 
 
 def _friction(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
     from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
-    from crane.view.plots.hydraulics import friction_figure
+    from crane.view.plots.hydraulics_figures import friction_figure
 
     found = identify_cylinder_friction(machine, run, joint)
     unit = machine.unit(joint)

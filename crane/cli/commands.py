@@ -45,24 +45,24 @@ def list_machines(
     ] = False,
 ) -> None:
     """List the machines that can be named."""
-    from crane.common.shown import counted
-    from crane.description import bundled, examples
-    from crane.description.sources import about
+    from crane.common.one_line_repr import format_count
+    from crane.description import bundled_machines, example_robots
+    from crane.description.machine_lookup import machine_summary
 
-    others = examples()
+    others = example_robots()
     if robots:
         if not others:
             raise InputError("there are no robots here, install example-robot-data")
         print("Robots of example-robot-data, open chains; some are refused by the strict reading:")
         print("\n".join(f"  {name}" for name in others))
         return
-    machines = bundled()
+    machines = bundled_machines()
     width = max(map(len, machines))
     print("Bundled machines; crane info NAME says more of one:")
     for name, path in machines.items():
-        print(f"  {name:{width}}  {about(path)}")
+        print(f"  {name:{width}}  {machine_summary(path)}")
     if others:
-        number = counted(len(others), "robot")
+        number = format_count(len(others), "robot")
         print(f"{number} of example-robot-data can be named likewise: crane list --robots")
 
 
@@ -94,16 +94,16 @@ def info(
 ) -> None:
     """Show what a machine consists of, or what of it has a name."""
     if parameters or pattern is not None:
-        from crane.common.packages import giving, package_folders
+        from crane.common.package_search import check_package_folders, use_load_options
         from crane.description import parameters as parameters_of
-        from crane.description.names import matching, names_of
-        from crane.formats import read
+        from crane.description.name_search import names_by_kind, search_names
+        from crane.formats import read_machine_spec
 
-        with giving(package_folders(packages or ()), arguments(argument)):
-            spec = read(machine)
+        with use_load_options(check_package_folders(packages or ()), arguments(argument)):
+            spec = read_machine_spec(machine)
         every = {"parameter": {name: f"{x:.6g}" for name, x in parameters_of(spec).items()}}
         if pattern is not None:
-            every = matching(names_of(spec), pattern)
+            every = search_names(names_by_kind(spec), pattern)
         width = max((len(name) for values in every.values() for name in values), default=0)
         for kind, values in every.items():
             before = f"{kind:<11}" * (pattern is not None)
@@ -135,9 +135,9 @@ def view(
 ) -> None:
     """Write a page that shows a machine, or a run with its forces and numbers, and open it."""
     from crane.cli.runs import PAGE, check_free, machine_of, read_run
-    from crane.common.output import file_name
-    from crane.recordings.overlay import differences
-    from crane.view.page.build import open_in_browser, report
+    from crane.common.atomic_output import portable_file_name
+    from crane.recordings.recording_differences import joint_differences
+    from crane.view.page.report_page import open_in_browser, report
 
     recording = other = None
     if is_run(what):
@@ -157,12 +157,12 @@ def view(
             if value is not None:
                 raise InputError(f"{option} is for runs, and '{what}' is none, leave it out")
         loaded = load(what)
-        page = out or Path(file_name(loaded.name) + ".html")
+        page = out or Path(portable_file_name(loaded.name) + ".html")
     check_free(page, force)
     report(loaded, recording, page, other)
     if recording is not None and other is not None:
-        for one in differences(recording, other):
-            print(f"{one.joint} differs by at most {' at '.join(one.words)}")
+        for one in joint_differences(recording, other):
+            print(f"{one.joint} differs by at most {' at '.join(one.formatted)}")
     print(f"written to {page}")
     if not no_open and not open_in_browser(page):
         print("no browser found here, open the page yourself")
@@ -181,7 +181,7 @@ def plot(
 ) -> None:
     """Plot displacements, velocities, forces and tip path of a run (png, svg or pdf)."""
     from crane.cli.runs import FIGURE, check_free, read_run
-    from crane.view.plots.recording import plot_recording
+    from crane.view.plots.recording_figure import plot_recording
 
     recording = read_run(run, _machine_of_run(machine, lock), columns, span_of(since, until))
     figure = out or (run if run.is_dir() else run.parent) / FIGURE
@@ -211,23 +211,23 @@ def _machine_of_run(name: str | None, lock: list[str] | None) -> "Machine | None
 
 def is_run(what: str) -> bool:
     """Whether a run is meant and no machine."""
-    from crane.description.sources import FOLDERS
+    from crane.description.machine_lookup import FOLDER_FILES
 
-    if any((Path(what) / name).is_file() for name in FOLDERS):  # a machine in a folder
+    if any((Path(what) / name).is_file() for name in FOLDER_FILES):  # a machine in a folder
         return False
     return Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz")
 
 
 def _describe(machine: "Machine") -> Iterator[str]:
     """Its facts; rows of their tables below them, without cells that say nothing."""
-    from crane.view.facts import facts_of
+    from crane.view.machine_facts import machine_facts
 
-    facts = list(facts_of(machine))
+    facts = list(machine_facts(machine))
     width = max(10, 1 + max((len(row[0]) for fact in facts for row in fact.rows), default=0))
     yield machine.name
     for fact in facts:
         yield f"  {fact.name:<12}{fact.text}"
         for row in fact.rows:
-            cells = zip(fact.head[1:], row[1:], strict=True)
+            cells = zip(fact.heading[1:], row[1:], strict=True)
             words = ", ".join(f"{head} {cell}".strip() for head, cell in cells if cell)
             yield f"    {row[0]:<{width}}{words}"

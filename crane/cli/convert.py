@@ -23,7 +23,7 @@ from crane.cli.shared import (
     load,
     span_of,
 )
-from crane.common.errors import CraneError, CraneWarning, InputError, known
+from crane.common.errors import CraneError, CraneWarning, InputError, suggest_names
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
@@ -55,13 +55,13 @@ def convert(
 ) -> None:
     """Write a machine as one URDF with loops or with them cut, as MJCF, or as machine file."""
     from crane.cli.runs import check_folder, check_free
-    from crane.common.output import replacing
+    from crane.common.atomic_output import replace_file
     from crane.formats import robot_description, write_machine, write_mjcf, write_urdf_plus
 
     suffix = out.suffix.lower()
     kind = to or _SUFFIXES.get(suffix, "machine")
     if kind not in _FORMATS:
-        raise InputError(f"--to is '{kind}', {known(_FORMATS, kind)}")
+        raise InputError(f"--to is '{kind}', {suggest_names(_FORMATS, kind)}")
     if kind == "machine" and suffix in {*_SUFFIXES, ".yaml", ".yml"}:
         raise InputError(f"{out}: a machine file comes with its URDFs, give the name of a folder")
     if to is None and suffix and suffix not in _SUFFIXES:
@@ -75,10 +75,10 @@ def convert(
         check_free(out, force)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     if kind == "machine":
-        written = write_machine(loaded, out, force=force)
+        written = write_machine(loaded, out, overwrite=force)
     elif kind == "urdf":
         written = out
-        with replacing(out) as part:
+        with replace_file(out) as part:
             part.write_text(robot_description(loaded), encoding="utf-8")
     else:
         written = out
@@ -105,21 +105,21 @@ def import_log(
 ) -> None:
     """Write the recording that is in the log of another program."""
     from crane.cli.runs import check_free
-    from crane.formats import recalled
+    from crane.formats import load_from_expression
     from crane.recordings import timeseries
-    from crane.recordings.logs import lines_of
-    from crane.recordings.reading import readings, within
+    from crane.recordings.logs import read_log_columns
+    from crane.recordings.recording_reader import read_sensor_readings, select_time_span
 
     if out.suffix.lower() != ".csv":
         raise InputError(f"{out}: a recording is written as .csv, name it so")
     span = span_of(since, until)
     check_free(out, force)
-    machine, named = None, lines_of(columns)[0].get("machine", "")
+    machine, named = None, read_log_columns(columns)[0].get("machine", "")
     try:
-        machine = recalled(named) if named else None
+        machine = load_from_expression(named) if named else None
     except CraneError as error:
         text = f"{columns}: names of columns are not checked, its machine cannot be read: {error}"
         warnings.warn(text, CraneWarning, stacklevel=2)
-    table = within(readings(log, machine, columns), span, log)
-    timeseries.write(out, table)
+    table = select_time_span(read_sensor_readings(log, machine, columns), span, log)
+    timeseries.write_table(out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {out}")

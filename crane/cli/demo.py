@@ -4,7 +4,7 @@ from pathlib import Path
 
 from crane.cli.runs import SUMMARY, write_run, write_views
 from crane.cli.simulate import control_of, under_task
-from crane.common.output import staging
+from crane.common.atomic_output import replace_folder
 from crane.formats import load
 from crane.simulation import Progress, simulate
 
@@ -30,7 +30,7 @@ def run_demo(folder: Path, progress: Progress, force: bool = True) -> str:
     """
     runs = [(machine, task) for machine in map(load, MACHINES) for task in machine.tasks]
     texts = []
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         for done, (machine, task) in enumerate(runs):
 
             def report(share: float, done: int = done) -> None:

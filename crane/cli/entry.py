@@ -13,8 +13,8 @@ import typer
 import crane
 from crane.cli.shared import INTERRUPTED, app, say
 from crane.cli.waiting import watched
-from crane.common.errors import CraneError, CraneWarning, one_line
-from crane.common.packages import giving
+from crane.common.errors import CraneError, CraneWarning, format_one_line
+from crane.common.package_search import use_load_options
 
 _SPARING = 20_000  # objects between collections: nearly all that starting makes is there to stay
 
@@ -63,7 +63,7 @@ def main() -> None:
     warnings.simplefilter("once", CraneWarning)
     try:
         run = program(*arguments[:1])
-        with watched(" ".join(["crane", *arguments[:1]])), giving(strict=strict):
+        with watched(" ".join(["crane", *arguments[:1]])), use_load_options(strict=strict):
             status = run(args=arguments, standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
@@ -85,7 +85,7 @@ def main() -> None:
             sys.exit(1)
         place = error.filename or "output"
         reason = error.strerror or error
-        say(f"error: {one_line(f'{place}: {reason}')}, check the place and try again")
+        say(f"error: {format_one_line(f'{place}: {reason}')}, check the place and try again")
         sys.exit(2)
     except Exception as error:
         # the command line parser's own errors, whose class is not public
@@ -96,7 +96,10 @@ def main() -> None:
             context = getattr(error, "ctx", None)
             command = getattr(context, "command_path", "crane")
             shows = "the commands" if command == "crane" else "what it takes"
-            say(f"error: {one_line(' '.join(text.split()))} ({command} --help shows {shows})")
+            say(
+                f"error: {format_one_line(' '.join(text.split()))} ({command} --help shows "
+                f"{shows})"
+            )
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 
@@ -123,7 +126,7 @@ def _options(
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    say(f"warning: {one_line(str(message))}")
+    say(f"warning: {format_one_line(str(message))}")
 
 
 def _abandon_output() -> None:

@@ -72,11 +72,11 @@ def excite(
     """Find a periodic motion, or with --fit signals of valves, that tell most about a machine."""
     from crane.cli.calibrate import fits
     from crane.cli.runs import check_folder
-    from crane.common.output import staging
-    from crane.description.sources import command_words
-    from crane.identification.excitation.excite import excite as find_motion
-    from crane.identification.excitation.signals import excite_valves
-    from crane.view.plots.excitation import plot_excitation, plot_signals
+    from crane.common.atomic_output import replace_folder
+    from crane.description.machine_lookup import command_line_arguments
+    from crane.identification.excitation.periodic_excitation import excite as find_motion
+    from crane.identification.excitation.signal_excitation import excite_valves
+    from crane.view.plots.excitation_figure import plot_excitation, plot_signals
 
     _check_options(context, fit is not None)
     check_folder(out, force)
@@ -96,7 +96,7 @@ def excite(
                 criterion=criterion, rate=rate, margin=margin, step=step, seed=seed,
                 progress=progress,
             )  # fmt: skip
-    with staging(out, force) as part:
+    with replace_folder(out, force) as part:
         if wanted is None:
             motion.to_csv(part / "reference.csv")
             motion.to_yaml(part / "coefficients.yaml")
@@ -106,7 +106,9 @@ def excite(
             plot_signals(signals, part / "signals.png")
     text = motion.to_text() if wanted is None else signals.to_text()
     view = f"see it with: crane view {out}/reference.csv"
-    same = command_words(machine, changes=loaded.changes, lock=loaded.locks)
+    same = command_line_arguments(
+        machine, changes=loaded.parameter_changes, lock=loaded.locked_joints
+    )
     play = f"play it with: crane simulate {same} --inputs {out}/signals.csv --out run"
     print(f"{text}\n\nwritten to {out}; {view if wanted is None else play}")
 

@@ -35,8 +35,8 @@ from crane.cli.shared import (
 from crane.common.errors import CraneWarning, InputError, RecordingError
 
 if TYPE_CHECKING:
-    from crane.description.estimation import Known, Numbers
-    from crane.identification.signals.motion import Motion
+    from crane.description.estimation_settings import ParameterPrior, TermValues
+    from crane.identification.signals.signal_processing import Motion
     from crane.machine import Machine
     from crane.recordings.recording import Recording
 
@@ -105,11 +105,11 @@ def identify(
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import (
         cross_validate,
-        settings_of,
-        trials_text,
+        format_trials,
+        identify_options,
     )
     from crane.identification.mechanics.identify import identify as run
-    from crane.identification.mechanics.write import check_rewritable
+    from crane.identification.mechanics.write_identified import check_rewritable
 
     check_folder(out, force)
     fitted, changes, known = window(train), terms(term), priors(prior)
@@ -133,7 +133,7 @@ def identify(
     judges += _read(validation or [], loaded, columns)
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in learned), 1e-3)
-        as_number(bandwidth, "the bandwidth", "Hz", above=5 / shortest)
+        as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
     options: dict[str, Any] = {
         "method": method, "prior": known, "feasible": feasible, "terms": changes,
         "bandwidth": bandwidth, "slow": slowest, "trust": trust,
@@ -141,8 +141,8 @@ def identify(
     if grid:
         with progress_bar("cross-validating") as progress:
             trials = cross_validate(loaded, learned, grid, progress, **options)
-        print(f"{trials_text(trials)}\n")
-        options = settings_of(trials[0], options)
+        print(f"{format_trials(trials)}\n")
+        options = identify_options(trials[0], options)
     with progress_bar("identifying") as progress:
         result = run(loaded, learned, judges or None, progress=progress, **options)
     with status("writing the report"):
@@ -155,13 +155,13 @@ def identify(
     print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
 
 
-def terms(words: Sequence[str] | None) -> "dict[str, Numbers | None]":
+def terms(words: Sequence[str] | None) -> "dict[str, TermValues | None]":
     """Terms by name: their numbers, None of those that are off.
 
     Raises:
         InputError: Something else is written, or a name twice.
     """
-    found: dict[str, Numbers | None] = {}
+    found: dict[str, TermValues | None] = {}
     for word in words or ():
         name, equals, text = word.partition("=")
         try:
@@ -175,22 +175,22 @@ def terms(words: Sequence[str] | None) -> "dict[str, Numbers | None]":
     return found
 
 
-def priors(words: Sequence[str] | None) -> "dict[str, Known] | None":
+def priors(words: Sequence[str] | None) -> "dict[str, ParameterPrior] | None":
     """What is known by name, "*" of a share without one; None of `none`.
 
     Raises:
         InputError: Something else is written, or a name twice.
     """
-    from crane.description.estimation import Known
+    from crane.description.estimation_settings import ParameterPrior
 
-    found: dict[str, Known] = {}
+    found: dict[str, ParameterPrior] = {}
     if words and list(words) == ["none"]:
         return None
     for word in words or ():
         name, equals, text = word.rpartition("=")
         name = name.strip() if equals else "*"
         try:
-            known = Known.read(text)
+            known = ParameterPrior.parse(text)
         except InputError:
             raise InputError(f"--prior is '{word}', write {_PRIOR}") from None
         if name in found:
@@ -199,20 +199,20 @@ def priors(words: Sequence[str] | None) -> "dict[str, Known] | None":
     return found
 
 
-def values_tried(words: Sequence[str] | None) -> "dict[str, list[float | Known]]":
+def values_tried(words: Sequence[str] | None) -> "dict[str, list[float | ParameterPrior]]":
     """Values by name: bandwidths, or what is known of parameters.
 
     Raises:
         InputError: Something else is written, or a name twice.
     """
-    from crane.description.estimation import Known
+    from crane.description.estimation_settings import ParameterPrior
 
-    found: dict[str, list[float | Known]] = {}
+    found: dict[str, list[float | ParameterPrior]] = {}
     for word in words or ():
         name, _, text = word.rpartition("=")
         name = name.strip()
         try:
-            one = float if name == "bandwidth" else Known.read
+            one = float if name == "bandwidth" else ParameterPrior.parse
             values = [one(each) for each in text.split(",")]
         except (ValueError, InputError):
             name = ""
@@ -253,7 +253,7 @@ def _divided(
 
 def _moving(machine: "Machine", recordings: "list[Recording]", trust: bool) -> "Iterator[Motion]":
     """Motions of those that can be judged by; of others it is told why they cannot."""
-    from crane.identification.mechanics.reading import smoothed_motion
+    from crane.identification.mechanics.smoothed_motion import smoothed_motion
 
     for recording in recordings:
         try:
@@ -279,7 +279,7 @@ def payload(
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of what a machine carries from a recording."""
-    from crane.identification.mechanics.payload import identify_payload
+    from crane.identification.mechanics.identify_payload import identify_payload
 
     span = span_of(since, until)
     loaded = load(machine, lock)

@@ -57,9 +57,9 @@ def live(
     """Move a machine with sliders in a browser, its loops closed at every move."""
     from crane.cli.commands import is_run
     from crane.cli.runs import machine_of, read_run
+    from crane.view.live.live_server import serve_live_view
+    from crane.view.live.live_session import Session
     from crane.view.live.playback import Playback
-    from crane.view.live.serve import serve
-    from crane.view.live.session import Session
 
     recording = None
     if is_run(what):
@@ -83,4 +83,4 @@ def live(
             recording = read_run(run, loaded, columns, span_of(since, until))
     playback = None if recording is None else Playback(loaded, recording)
     with shown():
-        serve(Session(loaded), playback, host, port)
+        serve_live_view(Session(loaded), playback, host, port)

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
-    from crane.description.external import Wrench
+    from crane.description.external_forces import Wrench
 
 Load = Annotated[
     list[str] | None,
@@ -35,7 +35,7 @@ def loads_of(words: Sequence[str] | None) -> "list[Wrench]":
 
 
 def _load(word: str) -> "Wrench":
-    from crane.description.external import Wrench
+    from crane.description.external_forces import Wrench
 
     head, equals, text = word.partition("=")
     frame, _, axes = head.partition("@")
@@ -59,19 +59,22 @@ def _table(path: Path) -> "tuple[Array, Array, Array]":
     """Times, forces, moments of a file."""
     import numpy as np
 
-    from crane.description.external import PARTS
+    from crane.description.external_forces import WRENCH_COMPONENTS
     from crane.recordings import timeseries
 
-    table = timeseries.read(path)
+    table = timeseries.read_table(path)
     names = list(table.units)
     if "time" not in names:
         raise InputError(f"{path}: has no column 'time', add it")
     for name in names:
-        if name != "time" and name not in PARTS:
-            raise InputError(f"{path}: '{name}' is no part of a wrench, {known(PARTS, name)}")
+        if name != "time" and name not in WRENCH_COMPONENTS:
+            raise InputError(
+                f"{path}: '{name}' is no part of a wrench, "
+                f"{suggest_names(WRENCH_COMPONENTS, name)}"
+            )
     if len(names) < 2:
         raise InputError(f"{path}: has no force, add columns such as force_z")
     columns = dict(zip(names, table.values.T, strict=True))
     zero = np.zeros(len(table.values))
-    every = np.stack([columns.get(part, zero) for part in PARTS], axis=1)
+    every = np.stack([columns.get(part, zero) for part in WRENCH_COMPONENTS], axis=1)
     return columns["time"], every[:, :3], every[:, 3:]

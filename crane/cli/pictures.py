@@ -20,7 +20,7 @@ from crane.cli.shared import (
     by_joint,
     load,
 )
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
@@ -57,23 +57,25 @@ def sketch(
 ) -> None:
     """Draw the mechanism of a machine, or its hydraulic circuit (png, svg or pdf)."""
     from crane.cli.runs import check_free
-    from crane.common.output import file_name
-    from crane.formats.ambiguity import near_assemblies
+    from crane.common.atomic_output import portable_file_name
+    from crane.formats.assembly_warnings import alternative_configurations
     from crane.view.sketch.circuit import sketch_circuit
-    from crane.view.sketch.draw import sketch as draw
+    from crane.view.sketch.sketch_figure import sketch as draw
 
     if circuit:
         for option, given in (("--at", at), ("--plane", plane), ("--com", com)):
             if given:
                 raise InputError(f"{option} is for the mechanism, leave it out with --circuit")
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
-    figure = out or Path(file_name(loaded.name) + ("_circuit.png" if circuit else "_sketch.png"))
+    figure = out or Path(
+        portable_file_name(loaded.name) + ("_circuit.png" if circuit else "_sketch.png")
+    )
     check_free(figure, force)
     if circuit:
         sketch_circuit(loaded, figure)
         print(f"written to {figure}")
         return
-    others = [] if at else near_assemblies(loaded)
+    others = [] if at else alternative_configurations(loaded)
     draw(loaded, figure, posture(loaded, at), plane, com, others)
     if others:
         many = f"{len(others)} other assemblies" if len(others) > 1 else "the other assembly"
@@ -89,6 +91,8 @@ def posture(machine: "Machine", at: str | None) -> "Array":
     )
     for joint, value in named.items():
         if joint not in machine.active:
-            raise InputError(f"--at: '{joint}' is no active joint, {known(machine.active, joint)}")
+            raise InputError(
+                f"--at: '{joint}' is no active joint, {suggest_names(machine.active, joint)}"
+            )
         q_a[machine.active.index(joint)] = value
     return q_a

@@ -72,8 +72,8 @@ def power(
         write_power,
         write_power_comparison,
     )
-    from crane.control.valves import circuit_of
-    from crane.studies.power import power_account
+    from crane.control.valve_commands import require_circuit
+    from crane.studies.hydraulic_power_balance import power_balance
     from crane.studies.power_comparison import PowerComparison
 
     check_folder(out, force)
@@ -82,10 +82,10 @@ def power(
     names = _names([recording, *(beside or ())])
     span = span_of(since, until)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
-    circuit_of(loaded)  # before anything is read
+    require_circuit(loaded)  # before anything is read
     run = read_run(recording, loaded, columns, span)
     with status("adding up"):
-        account = power_account(loaded, run)
+        account = power_balance(loaded, run)
     if not beside:
         print(write_power(out, account, force), end="")
         print(f"\nwritten to {out}")
@@ -94,9 +94,9 @@ def power(
     for name, path in zip(names[1:], beside, strict=True):
         other = read_run(path, None, columns, span)
         machine_ = machine_of(path, other.machine)
-        circuit_of(machine_)
+        require_circuit(machine_)
         with status("adding up"):
-            accounts[name] = power_account(machine_, other)
+            accounts[name] = power_balance(machine_, other)
     print(write_power_comparison(out, PowerComparison(accounts, moved), force), end="")
     print(f"\nwritten to {out}")
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crane.common import output
+from crane.common import atomic_output
+from crane.common.atomic_output import replace_folder
 from crane.common.errors import (
     CraneWarning,
     DescriptionError,
@@ -13,27 +14,32 @@ from crane.common.errors import (
     OutputError,
     RecordingError,
 )
-from crane.common.output import staging
-from crane.description.sources import find, unchanged
-from crane.formats import recalled
+from crane.description.machine_lookup import find_machine_file, without_changes
+from crane.formats import load_from_expression
 from crane.machine import Machine
-from crane.recordings.measured import completed, is_measured
-from crane.recordings.reading import ALWAYS, Span, quantities, read, readings
+from crane.recordings.measured_recordings import complete_recording, is_measured
 from crane.recordings.recording import Recording
-from crane.recordings.summary import heading, summarize, title
+from crane.recordings.recording_reader import (
+    FULL_TIME_SPAN,
+    TimeSpan,
+    quantities_from_readings,
+    read_quantities,
+    read_sensor_readings,
+)
+from crane.recordings.recording_summary import heading, result_title, summarize
 
 if TYPE_CHECKING:
-    from crane.identification.calibration.result import Calibration
-    from crane.identification.mechanics.result import Identification
+    from crane.identification.calibration.calibration_result import Calibration
+    from crane.identification.mechanics.identification_result import Identification
     from crane.motion.workspaces import Workspace
     from crane.ratings import Breakout, Capacity, ToolForce, Torques, WorkingRange
     from crane.simulation.linear import LinearModel
-    from crane.simulation.replays import Comparison
+    from crane.simulation.recording_replay import Comparison
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.design import Design
-    from crane.studies.power import PowerAccount
+    from crane.studies.hydraulic_power_balance import PowerBalance
     from crane.studies.power_comparison import PowerComparison
-    from crane.studies.table import Study
+    from crane.studies.study_table import Study
 
 RECORDING, RECORDING_NPZ = "recording.csv", "recording.npz"
 SUMMARY, FIGURE, PAGE = "summary.md", "figure.png", "view.html"
@@ -49,7 +55,7 @@ def check_folder(folder: Path, force: bool) -> None:
         OutputError: It holds something already and `force` is off, it cannot be written, or a
             file is in the way.
     """
-    output.check_folder(folder)
+    atomic_output.check_folder_is_writable(folder)
     if folder.is_dir() and not force:
         try:
             empty = not any(folder.iterdir())
@@ -66,7 +72,7 @@ def check_free(file: Path, force: bool) -> None:
     Raises:
         OutputError: It exists and `force` is off, or it cannot be written.
     """
-    output.check_file(file)
+    atomic_output.check_file_is_writable(file)
     if file.exists() and not force:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
@@ -88,7 +94,7 @@ def write_run(folder: Path, recording: Recording, npz: bool = False, force: bool
     Raises:
         OutputError: The folder or a file cannot be written, or it is filled and `force` is off.
     """
-    with staging(folder, force, _stale(npz)) as part:
+    with replace_folder(folder, force, _stale(npz)) as part:
         return _write_run(part, recording, npz)
 
 
@@ -122,10 +128,10 @@ def write_comparison(
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.comparison import plot_comparison
+    from crane.view.plots.comparison_figure import plot_comparison
 
     text = f"# {heading(recording)}\n\n{comparison.to_markdown()}"
-    with staging(folder, force, _stale(npz)) as part:
+    with replace_folder(folder, force, _stale(npz)) as part:
         _write_run(part, recording, npz)
         (part / COMPARISON).write_text(text, encoding="utf-8")
         if comparison.channels:
@@ -135,8 +141,8 @@ def write_comparison(
 
 def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
     """Write figure and page of a recording into a folder."""
-    from crane.view.page.build import report
-    from crane.view.plots.recording import plot_recording
+    from crane.view.page.report_page import report
+    from crane.view.plots.recording_figure import plot_recording
 
     plot_recording(recording, folder / FIGURE)
     report(machine, recording, folder / PAGE)
@@ -148,9 +154,9 @@ def write_study(folder: Path, study: "Study", force: bool = True) -> None:
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.study import plot_study
+    from crane.view.plots.study_figure import plot_study
 
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         study.to_csv(part / "study.csv")
         plot_study(study, part / "study.png")
 
@@ -162,11 +168,11 @@ def write_design(folder: Path, found: "Design", force: bool = True) -> None:
         OutputError: The folder or a file cannot be written.
     """
     from crane.formats import write_machine
-    from crane.view.plots.capacity import plot_capacity
-    from crane.view.plots.design import plot_design
+    from crane.view.plots.capacity_figure import plot_capacity
+    from crane.view.plots.design_figure import plot_design
 
-    with staging(folder, force, ("before.png", "after.png")) as part:
-        for name, chart in zip(("before", "after"), found.charts() or (), strict=False):
+    with replace_folder(folder, force, ("before.png", "after.png")) as part:
+        for name, chart in zip(("before", "after"), found.capacity_charts() or (), strict=False):
             plot_capacity(chart, part / f"{name}.png")
         (part / "design.md").write_text(found.to_markdown(), encoding="utf-8")
         found.to_csv(part / "solutions.csv")
@@ -187,10 +193,10 @@ def write_workspace(folder: Path, space: "Workspace", force: bool = True) -> str
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.workspace import plot_workspace
+    from crane.view.plots.workspace_figure import plot_workspace
 
     text = space.to_markdown()
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         space.to_csv(part / "workspace.csv")
         space.curves_to_csv(part / "curves.csv")
         (part / "workspace.md").write_text(text, encoding="utf-8")
@@ -208,7 +214,7 @@ def write_breakout(folder: Path, found: "Breakout", force: bool = True) -> str:
         OutputError: The folder or a file cannot be written.
     """
     text = found.to_markdown()
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         (part / "breakout.md").write_text(text, encoding="utf-8")
     return text
 
@@ -222,10 +228,10 @@ def write_tool_force(folder: Path, field: "ToolForce", force: bool = True) -> st
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.tool_force import plot_tool_force
+    from crane.view.plots.tool_force_figure import plot_tool_force
 
     text = field.to_markdown()
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         (part / "tool_force.md").write_text(text, encoding="utf-8")
         field.to_csv(part / "tool_force.csv")
         plot_tool_force(field, part / "tool_force.png")
@@ -241,10 +247,10 @@ def write_working_range(folder: Path, found: "WorkingRange", force: bool = True)
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.working_range import plot_working_range
+    from crane.view.plots.working_range_figure import plot_working_range
 
     text = found.to_markdown()
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         (part / "working_range.md").write_text(text, encoding="utf-8")
         found.to_csv(part / "working_range.csv")
         plot_working_range(found, part / "working_range.png")
@@ -269,18 +275,18 @@ def write_capacity(
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.page.capacity import write_capacity_page
-    from crane.view.plots.capacity import plot_capacity
-    from crane.view.plots.capacity_sheet import plot_sheet
+    from crane.view.page.capacity_page import write_capacity_page
+    from crane.view.plots.capacity_figure import plot_capacity
+    from crane.view.plots.capacity_sheet import plot_capacity_sheet
 
     text = chart.to_markdown() + (torques.to_markdown() if torques is not None else "")
-    with staging(folder, force, ("slopes.csv",)) as part:
+    with replace_folder(folder, force, ("slopes.csv",)) as part:
         chart.to_csv(part / "capacity.csv")
         (part / "capacity.md").write_text(text, encoding="utf-8")
         plot_capacity(chart, part / "capacity.png")
         if by:
-            chart.slopes_to_csv(part / "slopes.csv", by)
-        plot_sheet(chart, part / "sheet.pdf")
+            chart.derivatives_to_csv(part / "slopes.csv", by)
+        plot_capacity_sheet(chart, part / "sheet.pdf")
         write_capacity_page(chart, part / "capacity.html")
     return text
 
@@ -295,10 +301,10 @@ def write_calibration(folder: Path, found: "Calibration", force: bool = True) ->
         OutputError: The folder or a file cannot be written.
     """
     from crane.formats import write_machine
-    from crane.view.page.calibration import write_calibration_report
-    from crane.view.plots.calibration import plot_calibration
+    from crane.view.page.calibration_page import write_calibration_report
+    from crane.view.plots.calibration_figure import plot_calibration
 
-    with staging(folder, force, _machine_files(folder, found.machine)) as part:
+    with replace_folder(folder, force, _machine_files(folder, found.machine)) as part:
         write_calibration_report(found, part / REPORT)
         (part / "calibration.md").write_text(found.to_text() + "\n", encoding="utf-8")
         plot_calibration(found, part / "calibration.png")
@@ -315,15 +321,15 @@ def write_sensitivities(folder: Path, found: "Sensitivities", force: bool = True
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.sensitivities import plot_sensitivities
+    from crane.view.plots.sensitivities_figure import plot_sensitivities
 
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         (part / "sensitivities.md").write_text(found.to_text() + "\n", encoding="utf-8")
         found.to_csv(part / "sensitivities.csv")
         plot_sensitivities(found, part / "sensitivities.png")
 
 
-def write_power(folder: Path, account: "PowerAccount", force: bool = True) -> str:
+def write_power(folder: Path, account: "PowerBalance", force: bool = True) -> str:
     """Write table, powers over time and pictures into a folder, created where there is none.
 
     Returns:
@@ -332,12 +338,12 @@ def write_power(folder: Path, account: "PowerAccount", force: bool = True) -> st
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.power import plot_power
-    from crane.view.plots.sankey import plot_sankey
+    from crane.view.plots.power_figure import plot_power
+    from crane.view.plots.sankey_diagram import plot_sankey
 
-    of = title(account.machine, f"{account.task} power".strip())
+    of = result_title(account.machine_name, f"{account.task_name} power".strip())
     text = f"# {of}\n\n{account.to_markdown()}"
-    with staging(folder, force) as part:
+    with replace_folder(folder, force) as part:
         (part / "power.md").write_text(text, encoding="utf-8")
         account.to_csv(part / "power.csv")
         plot_power(account, part / "power.png")
@@ -354,10 +360,10 @@ def write_power_comparison(folder: Path, comparison: "PowerComparison", force: b
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.power_comparison import plot_power_comparison
+    from crane.view.plots.power_comparison_figure import plot_power_comparison
 
-    text = f"# power of {', '.join(comparison.accounts)}\n\n{comparison.to_markdown()}"
-    with staging(folder, force) as part:
+    text = f"# power of {', '.join(comparison.balances)}\n\n{comparison.to_markdown()}"
+    with replace_folder(folder, force) as part:
         (part / "comparison.md").write_text(text, encoding="utf-8")
         plot_power_comparison(comparison, part / "comparison.png")
     return text
@@ -380,17 +386,17 @@ def write_modes(
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.page.build import report
-    from crane.view.plots.modes import plot_modes, plot_modes_over
+    from crane.view.page.report_page import report
+    from crane.view.plots.modes_figure import plot_modes, plot_parameter_modes
 
-    with staging(folder, force, ("over.png", PAGE)) as part:
+    with replace_folder(folder, force, ("over.png", PAGE)) as part:
         model.save(part / "model.mat")
         model.save(part / "model.npz")
         (part / "modes.md").write_text(model.to_text() + "\n", encoding="utf-8")
         plot_modes(model, part / "modes.png")
         if over:
-            plot_modes_over(over, part / "over.png")
-        motion = model.motion()
+            plot_parameter_modes(over, part / "over.png")
+        motion = model.mode_animation()
         if motion is not None:
             report(model.machine, motion, part / PAGE)
 
@@ -409,9 +415,9 @@ def write_identification(
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.page.identification import identification_report
+    from crane.view.page.identification_page import identification_report
 
-    with staging(folder, force, _machine_files(folder, result.described)) as part:
+    with replace_folder(folder, force, _machine_files(folder, result.described_machine)) as part:
         identification_report(result, part / REPORT, recording, validation)
         result.to_csv(part / "parameters.csv")
         if result.parameters is not None:
@@ -430,7 +436,7 @@ def _machine_files(folder: Path, read: Machine) -> Sequence[str]:
 
 
 def _write_machine(result: "Identification", folder: Path) -> None:
-    from crane.identification.mechanics.write import write_identified
+    from crane.identification.mechanics.write_identified import write_identified
 
     try:
         write_identified(result, folder)
@@ -444,7 +450,7 @@ def read_run(
     path: Path,
     machine: Machine | None = None,
     columns: Path | None = None,
-    span: Span = ALWAYS,
+    span: TimeSpan = FULL_TIME_SPAN,
     needs: Sequence[Sequence[str]] = (),
 ) -> Recording:
     """The recording of a run's folder, of a CSV or npz file, or of a log of another program.
@@ -452,8 +458,9 @@ def read_run(
     Args:
         path: Folder or file.
         machine: What was recorded. Coordinates and forces that the file does not have are
-            computed with it, see `crane.recordings.measured`; where no machine is given, with the
-            one that the file names, if it has pressures or angles instead of forces.
+            computed with it, see `crane.recordings.measured_recordings`; where no machine is
+            given, with the one that the file names, if it has pressures or angles instead of
+            forces.
         columns: Which columns of a log are which, see `crane.recordings.logs`.
         span: From when to when [s], by the recording's clock.
         needs: Columns that have to be there besides, of each any one, where a machine is given.
@@ -468,13 +475,17 @@ def read_run(
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
         path = path / there[0]
     if machine is not None:
-        return completed(machine, read(path, machine, columns, span), path, needs)
-    table = readings(path, columns=columns)
+        return complete_recording(
+            machine, read_quantities(path, machine, columns, span), path, needs
+        )
+    table = read_sensor_readings(path, columns=columns)
     named = table.notes.get("machine", "")
     if named and is_measured(table):
         machine = machine_of(path, named)
-        return completed(machine, quantities(table, path, machine, span), path)
-    return Recording.from_table(quantities(table, path, None, span), path)
+        return complete_recording(
+            machine, quantities_from_readings(table, path, machine, span), path
+        )
+    return Recording.from_table(quantities_from_readings(table, path, None, span), path)
 
 
 def machine_of(path: str | Path, named: str) -> Machine:
@@ -490,9 +501,9 @@ def machine_of(path: str | Path, named: str) -> Machine:
             "its header row"
         )
     try:
-        find(unchanged(named))
+        find_machine_file(without_changes(named))
     except DescriptionError as error:
         raise DescriptionError(
             f"{path}: its machine is not found ({error}); add --machine to say where it is"
         ) from None
-    return recalled(named)
+    return load_from_expression(named)

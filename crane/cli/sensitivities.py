@@ -63,9 +63,14 @@ def sensitivities(
     control = control_of(loaded, task, controller)
     with progress_bar("simulating") as progress:
         found = run(
-            loaded, control, duration=duration_of(loaded, task, duration), step=step, by=by,
-            outputs=names(outputs), progress=progress,
-        )  # fmt: skip
+            loaded,
+            control,
+            duration=duration_of(loaded, task, duration),
+            step=step,
+            parameters=by,
+            outputs=names(outputs),
+            progress=progress,
+        )
     text = found.to_text()
     if out is not None:
         write_sensitivities(out, found, force)

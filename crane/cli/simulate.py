@@ -32,10 +32,10 @@ from crane.cli.shared import (
     say,
     span_of,
 )
-from crane.common.errors import CraneError, InputError, SimulationError, known
+from crane.common.errors import CraneError, InputError, SimulationError, suggest_names
 
 if TYPE_CHECKING:
-    from crane.control import Command, Controller
+    from crane.control import Controller, ValveCommand
     from crane.machine import Machine
     from crane.motion import Trajectory
 
@@ -115,12 +115,12 @@ def simulate(
 ) -> None:
     """Simulate a task, a path, measured inputs, or the home posture, held or let go."""
     from crane.cli.runs import check_folder, write_run
-    from crane.motion.paths import read_path
+    from crane.motion.path_reader import read_path
     from crane.simulation import simulate as run
 
     check_folder(out, force)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
-    loaded = under_task(loaded, task).under(*loads_of(load_))
+    loaded = under_task(loaded, task).with_external_forces(*loads_of(load_))
     if inputs is not None:
         named = {"--task": task, "--path": path, "--controller": controller, "--sway": sway}
         given = [option for option, value in named.items() if value is not None]
@@ -138,7 +138,7 @@ def simulate(
         raise InputError(f"{option} is for --inputs, leave it out")
     if path is not None and task is not None:
         raise InputError("--task does not go with --path, leave one out")
-    control: Controller | Command | None
+    control: Controller | ValveCommand | None
     if path is not None:
         reference = read_path(loaded, path)
         control = follower_of(loaded, reference, controller, sway)
@@ -184,15 +184,15 @@ def kept_in(folder: Path, npz: bool, force: bool) -> Iterator[None]:
 
 def control_of(
     machine: "Machine", task: str | None, name: str | None, sway: str | None = None
-) -> "Controller | Command | None":
-    """What drives a machine along a task, by a controller's name and a method of `without_sway`.
+) -> "Controller | ValveCommand | None":
+    """What drives a machine along a task, by a controller's name and a method of `suppress_sway`.
 
     Raises:
         InputError: There is no such task or controller.
     """
-    from crane.control import controller, joystick
-    from crane.motion.curves import point_to_point
-    from crane.motion.trajectories import task_trajectory
+    from crane.control import joystick, make_controller
+    from crane.motion.task_trajectories import task_trajectory
+    from crane.motion.trajectory import point_to_point
 
     if task is None:
         if sway is not None:
@@ -200,10 +200,10 @@ def control_of(
         if name is None:
             return None
         home = machine.home[machine.closure.active]
-        return controller(name, machine, point_to_point(home, home, 1.0))
+        return make_controller(name, machine, point_to_point(home, home, 1.0))
     if task not in machine.tasks:
         raise InputError(
-            f"machine '{machine.name}' has no task '{task}', {known(machine.tasks, task)}"
+            f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
         )
     if machine.tasks[task].space == "joystick":
         if name is not None:
@@ -216,21 +216,21 @@ def control_of(
 
 def follower_of(
     machine: "Machine", reference: "Trajectory", name: str | None, sway: str | None = None
-) -> "Controller | Command":
+) -> "Controller | ValveCommand":
     """What drives a machine along a reference, see `control_of`."""
-    from crane.control import controller, usual
-    from crane.motion.sway import without_sway
+    from crane.control import default_controller_name, make_controller
+    from crane.motion.sway import suppress_sway
 
     if sway is not None:
-        reference = without_sway(machine, reference, sway)
-    return controller(name or usual(machine), machine, reference)
+        reference = suppress_sway(machine, reference, sway)
+    return make_controller(name or default_controller_name(machine), machine, reference)
 
 
 def under_task(machine: "Machine", task: str | None) -> "Machine":
     """A machine under what acts from outside while a task is done; others tell of unknown ones."""
     if task is None or task not in machine.tasks:
         return machine
-    return machine.under(*machine.tasks[task].loads)
+    return machine.with_external_forces(*machine.tasks[task].loads)
 
 
 def duration_of(machine: "Machine", task: str | None, duration: float | None) -> float | None:
@@ -258,7 +258,7 @@ def _replay(
     force: bool,
 ) -> None:
     from crane.cli.runs import write_comparison
-    from crane.simulation.replays import replay
+    from crane.simulation.recording_replay import replay
 
     with kept_in(out, npz, force), progress_bar("simulating") as progress:
         recording, comparison = replay(machine, inputs, step, progress, columns, span)

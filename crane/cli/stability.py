@@ -41,22 +41,22 @@ def stability(
     argument: Argument = None,
 ) -> None:
     """Tell how far a machine is from tipping, and under which load it does."""
-    from crane.dynamics.stability import Stability
-    from crane.studies.tipping import tipping_load
+    from crane.dynamics.tipping_stability import TippingStability
+    from crane.studies.task_tipping_load import tipping_load
 
     loaded = load(machine, lock, change, active, free, False, packages, argument)
-    stands, q_a = Stability(loaded), posture(loaded, at)
+    stands, q_a = TippingStability(loaded), posture(loaded, at)
     found = None
     if task is not None:
         with status("tipping"):
             found = tipping_load(loaded, task)
-    (moments,), (shares,) = stands.static(q_a)
+    (moments,), (shares,) = stands.static_margins(q_a)
     hangs = None
     if loaded.tip is not None or frame is not None:
-        (mass,), (about,) = stands.tip_over_load(q_a, frame)
+        (mass,), (about,) = stands.tipping_load(q_a, frame)
         hangs = mass, about
     print("| tipping line | held by | of the weight |\n| --- | ---: | ---: |")
-    for line, moment, share in zip(stands.lines, moments, shares, strict=True):
+    for line, moment, share in zip(stands.line_names, moments, shares, strict=True):
         print(f"| {' to '.join(line)} | {moment:.4g} N m | {100 * share:.1f} % |")
     if hangs is not None:
         (mass, about), name = hangs, frame or loaded.tip
@@ -68,5 +68,5 @@ def stability(
     if found is not None:
         print(
             f"in '{task}' a payload of {found.mass:.5g} kg tips it, at t = {found.time:.4g} s; "
-            f"at rest {found.static:.5g} kg would"
+            f"at rest {found.static_mass:.5g} kg would"
         )

@@ -63,10 +63,19 @@ def study(
     axes = ranges(vary, draws)
     with progress_bar("computing variants") as progress:
         result = run(
-            load(machine, lock, change), axes, task, measure, require=require or (),
-            own=measures, frame=frame, rule=rule, draws=draws, seed=seed, scheduler=scheduler,
+            load(machine, lock, change),
+            axes,
+            task,
+            measure,
+            require=require or (),
+            user_measures=measures,
+            frame=frame,
+            rule=rule,
+            draws=draws,
+            seed=seed,
+            scheduler=scheduler,
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=progress,
-        )  # fmt: skip
+        )
     write_study(out, result, force)
     print(f"{result.to_text()}\nwritten to {out}")

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TextIO
 
-from crane.common.waiting import Watch, doing
+from crane.common.progress import MainThreadMonitor, current_activity
 
 _ERASE = "\r\x1b[2K"
 
@@ -78,9 +78,9 @@ def watched(what: str) -> Iterator[None]:
 
     def tell(frame: FrameType | None, seconds: float) -> None:
         if not _shown.is_set():
-            line.draw(f"{what}: {doing(frame) or 'working'}, {seconds:.0f} s")
+            line.draw(f"{what}: {current_activity(frame) or 'working'}, {seconds:.0f} s")
 
-    watch = Watch(tell)
+    watch = MainThreadMonitor(tell)
     sys.stderr = _Stream(errors, line)
     if out is not None:
         sys.stdout = _Stream(out, line)
@@ -88,7 +88,7 @@ def watched(what: str) -> Iterator[None]:
     try:
         yield
     finally:
-        watch.end()
+        watch.stop()
         line.erase()
         sys.stdout, sys.stderr = out, errors
 

@@ -11,29 +11,50 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from crane.closure.branch import Branch
-from crane.closure.choice import Choice, condition, proposals
-from crane.closure.compiled import Cursor, FastClosure
-from crane.closure.equations import LoopEquations
-from crane.closure.exactness import CLOSED, Exact, Rounded, Surplus
-from crane.closure.following import followed
-from crane.closure.home import Sought, settle
-from crane.closure.structure import Structure
-from crane.closure.traced import geometry_of
-from crane.codegen import TooLongError, carefully, kept_result
-from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
-from crane.common.samples import Array, as_samples, per_sample, solve
-from crane.common.shown import Brief
-from crane.common.threads import one_thread
+from crane.closure.active_joint_selection import (
+    ActiveJointSelection,
+    condition_number,
+    propose_active_joints,
+)
+from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
+from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.constraint_tolerances import (
+    CLOSED_TOLERANCE,
+    ExactConstraints,
+    RedundancyGap,
+    RoundedConstraints,
+)
+from crane.closure.home_search import HomeSearchResult, find_home
+from crane.closure.kinematics_formulas import tree_geometry
+from crane.closure.loop_equations import LoopEquations
+from crane.closure.motion_continuation import follow_motion
+from crane.closure.newton_continuation import NewtonContinuation
+from crane.codegen import FormulaTooLongError, cached_result, run_with_fallback
+from crane.common.errors import (
+    InputError,
+    MechanismError,
+    SingularConfigurationError,
+    WrongBranchError,
+)
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array, apply_per_sample, as_samples, solve_linear
+from crane.common.threads import single_threaded_blas
 from crane.description import Coupling, LoopSpec
 
-_FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
-_SAME = 1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
-_AS_GOOD = 0.1  # share of the least singular value of all equations that independent ones keep
-_STEPS = 8  # from home to a target that is far from the one before it
+_MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = (
+    100,
+    0.1,
+)  # samples worth sorting: how many, how far apart as a share of the range
+_SAME_CONFIGURATION_TOLERANCE = (
+    1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
+)
+_MIN_SINGULAR_VALUE_SHARE = (
+    0.1  # share of the least singular value of all equations that independent ones keep
+)
+_CONTINUATION_STEPS = 8  # from home to a target that is far from the one before it
 
 
-class Closure(Brief):
+class Closure(OneLineRepr):
     """The loops of a machine as functions of its active coordinates.
 
     Park, Choi, Ploen (1999); equations (3) and (4) of the reduced-scale forwarder paper, for any
@@ -47,12 +68,15 @@ class Closure(Brief):
         model: The spanning tree.
         loops: The loops that close it.
         active: Names of the active joints, in the order of q_A.
-        guess: (nq,) active coordinates of the home posture, and a first guess of the others.
+        initial_guess: (nq,) active coordinates of the home posture, and a first guess of the
+            others.
         couplings: Linear constraints of joints.
-        said: Names of joints whose home is said to be that of the guess; where the loops do not
-            close from the guess, the others are sought. None: all are said, and none is sought.
-        loose: Names of active joints that nothing holds at the guess while the others are sought.
-        wound: Whether pins keep the whole turns of the guess, which else are taken out.
+        specified: Names of joints whose home is said to be that of the guess; where the loops do
+            not close from the guess, the others are sought. None: all are said, and none is
+            sought.
+        movable: Names of active joints that nothing holds at the guess while the others are
+            sought.
+        keep_revolutions: Whether pins keep the whole turns of the guess, which else are taken out.
 
     Raises:
         MechanismError: The loops cannot be closed, or the active joints do not fit the degrees of
@@ -60,40 +84,46 @@ class Closure(Brief):
 
     Attributes:
         home: (nq,) the closed home posture.
-        guess: (nq,) what it was closed from.
-        said: Columns for which it is the file that says so.
+        initial_guess: (nq,) what it was closed from.
+        specified: Columns for which it is the file that says so.
         active: Columns of the active joints.
         passive: Columns of the passive joints.
         structure: Independent equations and the order in which they solve.
-        size: Of the machine [m], see `crane.closure.choice.size`.
-        units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size [m].
-        pace: Unit of time [s] of what moves by its weight, 1 s for a machine of 1 m: motions of
-            similar machines in the same gravity take times like the roots of their sizes (Froude).
-        sought: How home was found where it did not follow from the guess, else None.
+        characteristic_length: Of the machine [m], see
+            `crane.closure.active_joint_selection.characteristic_length`.
+        coordinate_units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size
+            [m].
+        characteristic_time: Unit of time [s] of what moves by its weight, 1 s for a machine of 1
+            m: motions of similar machines in the same gravity take times like the roots of their
+            sizes (Froude).
+        home_search: How home was found where it did not follow from the guess, else None.
     """
 
     home: Array
-    guess: Array
-    said: NDArray[np.intp]
-    structure: Structure
-    sought: Sought | None
+    initial_guess: Array
+    specified_columns: NDArray[np.intp]
+    structure: ConstraintStructure
+    home_search: HomeSearchResult | None
 
     def __init__(
         self,
         model: pin.Model,
         loops: Sequence[LoopSpec],
         active: Sequence[str],
-        guess: Array,
+        initial_guess: Array,
         couplings: Sequence[Coupling] = (),
-        said: Collection[str] | None = None,
-        loose: Collection[str] = (),
-        wound: bool = False,
+        specified: Collection[str] | None = None,
+        movable: Collection[str] = (),
+        keep_revolutions: bool = False,
     ):
         self.model = model
         self.equations = LoopEquations(model, loops, couplings)
-        self.size, self.units = self.equations.size, self.equations.units
-        self.pace = float(np.sqrt(self.size))
-        self._local = threading.local()
+        self.characteristic_length, self.units = (
+            self.equations.characteristic_length,
+            self.equations.coordinate_units,
+        )
+        self.characteristic_time = float(np.sqrt(self.characteristic_length))
+        self._thread_local = threading.local()
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
@@ -103,42 +133,63 @@ class Closure(Brief):
         def columns(names: Collection[str]) -> list[int]:
             return [coordinates.column(name) for name in names]
 
-        self.guess = guess
-        self.said = np.array(sorted(columns(said or ())), dtype=np.intp)
-        where = None if said is None else columns(said), columns(loose)
-        self.structure, self.sought = self._settled(*where)
-        if wound:
-            turns = np.round((guess - self.structure.home) / (2 * np.pi))
-            turns[coordinates.slides] = 0.0
-            home = self.structure.home + 2 * np.pi * turns
+        self.initial_guess = initial_guess
+        self.specified_columns = np.array(sorted(columns(specified or ())), dtype=np.intp)
+        where = None if specified is None else columns(specified), columns(movable)
+        self.structure, self.home_search = self._find_home(*where)
+        if keep_revolutions:
+            revolutions = np.round((initial_guess - self.structure.home) / (2 * np.pi))
+            revolutions[coordinates.is_translation] = 0.0
+            home = self.structure.home + 2 * np.pi * revolutions
             self.structure = dataclasses.replace(self.structure, home=home)
-        span = (coordinates.upper - coordinates.lower)[self.active]
-        limited = np.isfinite(span) & (span > 0)
-        self._span = np.where(limited, span, self.equations.units[self.active])
-        self._branch = Branch(
-            self.equations, self.structure, self._names, self.active, self.passive, self._span
+        ranges = (coordinates.upper - coordinates.lower)[self.active]
+        limited = np.isfinite(ranges) & (ranges > 0)
+        self._active_ranges = np.where(
+            limited, ranges, self.equations.coordinate_units[self.active]
         )
-        self.home = self._branch.home.q.copy()
+        self._continuation = NewtonContinuation(
+            self.equations,
+            self.structure,
+            self._names,
+            self.active,
+            self.passive,
+            self._active_ranges,
+        )
+        self.home = self._continuation.home.q.copy()
         self.home.flags.writeable = False
 
-    def _settled(
-        self, said: list[int] | None, loose: list[int]
-    ) -> tuple[Structure, Sought | None]:
-        def find() -> tuple[Structure, Sought | None]:
+    def _find_home(
+        self, specified: list[int] | None, movable: list[int]
+    ) -> tuple[ConstraintStructure, HomeSearchResult | None]:
+        def find() -> tuple[ConstraintStructure, HomeSearchResult | None]:
             import scipy.linalg  # noqa: F401 - which brings a library of its own
 
-            with one_thread(self.model.nv):
-                return settle(self.equations, self.active, self.passive, self.guess, said, loose)
+            with single_threaded_blas(self.model.nv):
+                return find_home(
+                    self.equations,
+                    self.active,
+                    self.passive,
+                    self.initial_guess,
+                    specified,
+                    movable,
+                )
 
         if not self.equations.names:
-            return settle(self.equations, self.active, self.passive, self.guess, said, loose)
-        told = None if said is None else tuple(said)
-        depends = (self.parts, self.active, self.guess, told, tuple(loose))
-        return kept_result(("home", depends), find, "scipy.linalg", (Structure, Surplus, Sought))
+            return find_home(
+                self.equations, self.active, self.passive, self.initial_guess, specified, movable
+            )
+        specified_key = None if specified is None else tuple(specified)
+        depends = (self.cache_key, self.active, self.initial_guess, specified_key, tuple(movable))
+        return cached_result(
+            ("home", depends),
+            find,
+            "scipy.linalg",
+            (ConstraintStructure, RedundancyGap, HomeSearchResult),
+        )
 
     @property
-    def parts(self) -> tuple[Any, ...]:
-        """All that its equations are made of, see `crane.codegen.kept_result`."""
+    def cache_key(self) -> tuple[Any, ...]:
+        """All that its equations are made of, see `crane.codegen.cached_result`."""
         loops = tuple(
             (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
             for x in self.equations.loops
@@ -148,7 +199,7 @@ class Closure(Brief):
         )
         return self.model.saveToString(), loops, couplings
 
-    def _line(self) -> str:
+    def _one_line(self) -> str:
         """Its loops, and what drives them."""
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
         return (
@@ -156,7 +207,7 @@ class Closure(Brief):
             f"{', '.join(self.active_names)}"
         )
 
-    def of_alike(
+    def with_other_masses(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure | None":
         """This closure, of a tree that differs in masses alone; None where more differs.
@@ -166,13 +217,13 @@ class Closure(Brief):
             loops: Its loops.
             couplings: Its couplings.
         """
-        if not _alike(LoopEquations(model, loops, couplings), self.equations):
+        if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other._local = threading.local()  # where a thread begins is no one else's
+        other._thread_local = threading.local()  # where a thread begins is no one else's
         return other
 
-    def near(
+    def with_perturbed_model(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure":
         """The closure of a tree whose numbers differ little, by its structure and on its branch.
@@ -188,25 +239,35 @@ class Closure(Brief):
             MechanismError: The loops do not close there, or lock up.
         """
         equations = LoopEquations(model, loops, couplings)
-        if _alike(equations, self.equations):
+        if _has_same_geometry(equations, self.equations):
             return self
         other = copy.copy(self)
-        other.model, other.equations, other._local = model, equations, threading.local()
-        other.size, other.units = equations.size, equations.units
-        other.pace = float(np.sqrt(other.size))
-        other.__dict__["_made"] = None
-        other._branch = Branch(
-            equations, self.structure, self._names, self.active, self.passive, self._span
+        other.model, other.equations, other._thread_local = model, equations, threading.local()
+        other.characteristic_length, other.units = (
+            equations.characteristic_length,
+            equations.coordinate_units,
         )
-        other.home = other._branch.home.q.copy()
+        other.characteristic_time = float(np.sqrt(other.characteristic_length))
+        other.__dict__["_optional_compiled_closure"] = None
+        other._continuation = NewtonContinuation(
+            equations, self.structure, self._names, self.active, self.passive, self._active_ranges
+        )
+        other.home = other._continuation.home.q.copy()
         other.home.flags.writeable = False
-        exact = (Exact if self.structure.surplus.allowed <= CLOSED else Rounded)(equations)
-        rows = self.structure.rows, self.structure.redundant
-        if not exact.is_closed(other.home) or exact.surplus(other.home, *rows, self.active)[0]:
+        exact = (
+            ExactConstraints
+            if self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
+            else RoundedConstraints
+        )(equations)
+        rows = self.structure.independent_rows, self.structure.redundant_rows
+        if (
+            not exact.is_closed(other.home)
+            or exact.assess_redundancy(other.home, *rows, self.active)[0]
+        ):
             raise MechanismError("the loops do not close there, or lock up")
         return other
 
-    def around(self, q: Array) -> "Closure | None":
+    def with_home_configuration(self, q: Array) -> "Closure | None":
         """The same coordinates on the branch of another closed posture.
 
         Args:
@@ -218,73 +279,82 @@ class Closure(Brief):
         Raises:
             MechanismError: The loops do not close there.
         """
-        jacobian = self.equations.scaled(q)[1][:, self.passive]
+        jacobian = self.equations.evaluate_scaled(q)[1][:, self.passive]
         least, best = (
             np.linalg.svd(rows, compute_uv=False).min(initial=1.0)
-            for rows in (jacobian[self.structure.rows], jacobian)
+            for rows in (jacobian[self.structure.independent_rows], jacobian)
         )
-        if not least > _AS_GOOD * best:
+        if not least > _MIN_SINGULAR_VALUE_SHARE * best:
             return None
         other = copy.copy(self)
-        other._local, other.sought, other.guess = threading.local(), None, q
-        other.__dict__.pop("_made", None)
+        other._thread_local, other.home_search, other.initial_guess = threading.local(), None, q
+        other.__dict__.pop("_optional_compiled_closure", None)
         other.structure = dataclasses.replace(self.structure, home=q)
-        other._branch = Branch(
-            self.equations, other.structure, self._names, self.active, self.passive, self._span
+        other._continuation = NewtonContinuation(
+            self.equations,
+            other.structure,
+            self._names,
+            self.active,
+            self.passive,
+            self._active_ranges,
         )
-        other.home = other._branch.home.q.copy()
+        other.home = other._continuation.home.q.copy()
         other.home.flags.writeable = False
-        exact = (Exact if self.structure.surplus.allowed <= CLOSED else Rounded)(self.equations)
+        exact = (
+            ExactConstraints
+            if self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
+            else RoundedConstraints
+        )(self.equations)
         if not exact.is_closed(other.home):
             raise MechanismError("the loops do not close there")
         return other
 
     @cached_property
-    def _made(self) -> FastClosure | None:
-        branch = self._branch
+    def _optional_compiled_closure(self) -> CompiledClosure | None:
+        branch = self._continuation
         try:
-            return FastClosure(
+            return CompiledClosure(
                 self.equations,
                 self.structure,
                 self.active,
                 self.passive,
                 branch.home,
-                branch.far(branch.home.q),
+                branch.rounding_scale(branch.home.q),
             )
-        except TooLongError:
+        except FormulaTooLongError:
             return None
 
     @property
-    def compiled(self) -> bool:
+    def is_compiled(self) -> bool:
         """Whether there is machine code for these loops."""
-        return self._made is not None
+        return self._optional_compiled_closure is not None
 
     @property
-    def fast(self) -> FastClosure:
+    def compiled_closure(self) -> CompiledClosure:
         """Machine code for these loops, made when it is first needed.
 
         Raises:
             TooLongError: The machine is too large for it.
         """
-        if self._made is None:
-            raise TooLongError
-        return self._made
+        if self._optional_compiled_closure is None:
+            raise FormulaTooLongError
+        return self._optional_compiled_closure
 
     @property
-    def _cursor(self) -> Cursor:
+    def _cursor(self) -> ContinuationCursor:
         """This thread's cursor."""
         try:
-            return self._local.cursor
+            return self._thread_local.cursor
         except AttributeError:
-            self._local.cursor = self.fast.cursor()
-            return self._local.cursor
+            self._thread_local.cursor = self.compiled_closure.new_cursor()
+            return self._thread_local.cursor
 
     @property
     def degrees_of_freedom(self) -> int:
         """Number of active joints n."""
         return len(self.active)
 
-    def solve(self, q_a: ArrayLike, guess: ArrayLike | None = None) -> Array:
+    def solve(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
         """Close the loops: q = f(q_A), equation (3) of the reduced-scale forwarder paper.
 
         Newton's method from the last posture this thread solved (or the guess), in one step where
@@ -295,7 +365,7 @@ class Closure(Brief):
 
         Args:
             q_a: (n,) or (N, n) active coordinates [m], [rad]. Limits are not checked here.
-            guess: (nq,) posture to start from, on the home posture's branch.
+            initial_guess: (nq,) posture to start from, on the home posture's branch.
 
         Returns:
             q, (nq,) or (N, nq).
@@ -309,25 +379,36 @@ class Closure(Brief):
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
-        near = None
-        if guess is not None:
-            near = as_samples(guess, self.model.nv, "guess", self._names)
-            if near.ndim != 1:
-                raise InputError(f"guess has the shape {near.shape}, give one ({self.model.nv},)")
-            if self.compiled and not self.fast.start_near(self._cursor, near):
-                self._cursor.start(self._branch.posture(near))
+        guessed_configuration = None
+        if initial_guess is not None:
+            guessed_configuration = as_samples(initial_guess, self.model.nv, "guess", self._names)
+            if guessed_configuration.ndim != 1:
+                raise InputError(
+                    f"guess has the shape {guessed_configuration.shape}, give one "
+                    f"({self.model.nv},)"
+                )
+            if self.is_compiled and not self.compiled_closure.start_cursor_at(
+                self._cursor, guessed_configuration
+            ):
+                self._cursor.start_from(
+                    self._continuation.nearest_closed_configuration(guessed_configuration)
+                )
         out = np.empty((*targets.shape[:-1], self.model.nv))
-        if not self.compiled:
-            known = self._branch.home if near is None else self._branch.posture(near)
+        if not self.is_compiled:
+            known = (
+                self._continuation.home
+                if guessed_configuration is None
+                else self._continuation.nearest_closed_configuration(guessed_configuration)
+            )
             for i, target in enumerate(np.atleast_2d(targets)):
                 sample = f" (sample {i})" if targets.ndim == 2 else ""
-                known = self._branch.reach(target, known, sample)
+                known = self._continuation.continue_to(target, known, sample)
                 out[(i,) if targets.ndim == 2 else ()] = known.q
             return out
-        self._close(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
+        self._solve_stack(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
         return out
 
-    def follow(self, q_a: ArrayLike, guess: ArrayLike | None = None) -> Array:
+    def follow_motion(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
         """Closed postures along a recorded motion, also behind its dead centres.
 
         `solve` keeps to the branch of home. A motion that passes a dead centre of its active
@@ -335,7 +416,7 @@ class Closure(Brief):
 
         Args:
             q_a: (N, n) active coordinates, from sample to sample as dense as the motion is smooth.
-            guess: (nq,) near the first posture; home if not given.
+            initial_guess: (nq,) near the first posture; home if not given.
 
         Returns:
             (N, nq).
@@ -347,55 +428,66 @@ class Closure(Brief):
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.ndim != 2 or not len(targets):
             raise InputError("q_a is no motion, give (N, n) samples")
-        first = self.solve(targets[0], guess)
-        return followed(self.equations, self.active, self.equations.scales, targets, first)
+        first = self.solve(targets[0], initial_guess)
+        return follow_motion(
+            self.equations, self.active, self.equations.motion_scales, targets, first
+        )
 
-    def _close(self, targets: Array, out: Array, stacked: bool) -> None:
+    def _solve_stack(self, targets: Array, out: Array, stacked: bool) -> None:
         """Close the loops at targets (N, n) into out (N, nq)."""
-        order = self._order(targets) if len(targets) > _FEW else None
+        order = self._sort_samples(targets) if len(targets) > _MIN_SAMPLES_TO_SORT else None
         sorted_targets = np.ascontiguousarray(targets if order is None else targets[order])
         closed = out if order is None else np.empty_like(out)
 
-        def reach(i: int) -> None:
+        def continue_from_home(i: int) -> None:
             sample = f" (sample {i if order is None else order[i]})" if stacked else ""
-            closed[i] = self.reach(self._cursor, sorted_targets[i], sample)
+            closed[i] = self.continue_from_home(self._cursor, sorted_targets[i], sample)
 
-        carefully(
+        run_with_fallback(
             len(targets),
-            lambda i, _: self.fast.follow(self._cursor, sorted_targets[i:], closed[i:]),
-            reach,
+            lambda i, _: self.compiled_closure.follow_targets(
+                self._cursor, sorted_targets[i:], closed[i:]
+            ),
+            continue_from_home,
         )
         if order is not None:
             out[order] = closed
 
-    def _order(self, targets: Array) -> NDArray[np.intp] | None:
+    def _sort_samples(self, targets: Array) -> NDArray[np.intp] | None:
         """An order of far samples in which neighbours are near; None for what is a path already.
 
         Cells of all coordinates but one, along the last one within a cell. Coordinates that move
         no passive joint do not count.
         """
-        counts = np.abs(self._branch.home.gamma).max(axis=0, initial=0.0) > 0
-        scaled = (targets / self._span)[:, counts]
-        if not scaled.size or np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR:
+        moves_passive_joints = (
+            np.abs(self._continuation.home.passive_gamma).max(axis=0, initial=0.0) > 0
+        )
+        scaled = (targets / self._active_ranges)[:, moves_passive_joints]
+        if (
+            not scaled.size
+            or np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE
+        ):
             return None
         cells = np.floor(scaled * len(targets) ** (1 / scaled.shape[1]))
         order: NDArray[np.intp] = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
         return order
 
-    def on_branch(self, q: Array) -> bool:
+    def is_on_branch(self, q: Array) -> bool:
         """Whether a closed posture (nq,) lies on the assembly branch of home."""
-        if self.compiled:
-            return self.fast.start_near(self._cursor, q)
+        if self.is_compiled:
+            return self.compiled_closure.start_cursor_at(self._cursor, q)
         try:
-            posture = self._branch.posture(q)
+            solution = self._continuation.nearest_closed_configuration(q)
         except WrongBranchError:
             return False
-        return bool(np.abs((posture.q - q) / self.units).max() < _SAME)
+        return bool(np.abs((solution.q - q) / self.units).max() < _SAME_CONFIGURATION_TOLERANCE)
 
-    def reach(self, cursor: Cursor, target: Array, sample: str = "") -> Array:
+    def continue_from_home(
+        self, cursor: ContinuationCursor, target: Array, sample: str = ""
+    ) -> Array:
         """The posture at a target that is too far for one step, where the cursor is left.
 
-        In several steps from home, or as `Branch` can.
+        In several steps from home, or as `NewtonContinuation` can.
 
         Args:
             cursor: Where to go on from afterwards.
@@ -405,17 +497,19 @@ class Closure(Brief):
         Returns:
             q (nq,).
         """
-        home = self._branch.home
-        way = home.q_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (target - home.q_a)
-        way[-1] = target
-        out = np.empty((_STEPS, self.model.nv))
-        for some in (way[-1:], way[1::2], way):
-            cursor.start(home)
-            if self.fast.follow(cursor, some, out) == len(some):
-                return out[len(some) - 1]
-        posture = self._branch.reach(target, home, sample)
-        cursor.start(posture)
-        return posture.q
+        home = self._continuation.home
+        line = home.q_a + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (
+            target - home.q_a
+        )
+        line[-1] = target
+        out = np.empty((_CONTINUATION_STEPS, self.model.nv))
+        for waypoints in (line[-1:], line[1::2], line):
+            cursor.start_from(home)
+            if self.compiled_closure.follow_targets(cursor, waypoints, out) == len(waypoints):
+                return out[len(waypoints) - 1]
+        solution = self._continuation.continue_to(target, home, sample)
+        cursor.start_from(solution)
+        return solution.q
 
     def gamma(self, q: ArrayLike) -> Array:
         """Derivative of f, equation (4) of the reduced-scale forwarder paper.
@@ -431,8 +525,8 @@ class Closure(Brief):
             BranchEdgeError: The passive joints are not determined there.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
-        if not self.compiled:
-            return per_sample(self._gamma, q)
+        if not self.is_compiled:
+            return apply_per_sample(self._gamma_of_sample, q)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")
         rows = np.atleast_2d(np.ascontiguousarray(q))
@@ -440,12 +534,16 @@ class Closure(Brief):
 
         def pivoted(i: int) -> None:  # what looks singular
             try:
-                out[i] = self._gamma(rows[i])
-            except BranchEdgeError as error:
+                out[i] = self._gamma_of_sample(rows[i])
+            except SingularConfigurationError as error:
                 sample = f" (sample {i})" if q.ndim == 2 else ""
-                raise BranchEdgeError(f"{error}{sample}") from None
+                raise SingularConfigurationError(f"{error}{sample}") from None
 
-        carefully(len(rows), lambda i, _: self.fast.gamma(rows[i:], out[i:]), pivoted)
+        run_with_fallback(
+            len(rows),
+            lambda i, _: self.compiled_closure.evaluate_gamma(rows[i:], out[i:]),
+            pivoted,
+        )
         return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:
@@ -464,7 +562,7 @@ class Closure(Brief):
         """
         q = as_samples(q, self.model.nv, "q", self._names)
         v = as_samples(v, self.model.nv, "v", self._names)
-        return per_sample(self._drift, q, v)
+        return apply_per_sample(self._drift_of_sample, q, v)
 
     def residual(self, q: ArrayLike) -> Array:
         """Largest absolute residual of all loop equations, redundant ones too.
@@ -476,12 +574,15 @@ class Closure(Brief):
             () or (N,) [m] for translations, [rad] for small rotations.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
-        return per_sample(lambda one: np.abs(self.equations.evaluate(one)[0]).max(initial=0.0), q)
+        return apply_per_sample(
+            lambda one: np.abs(self.equations.evaluate(one)[0]).max(initial=0.0), q
+        )
 
-    def condition(self, q: ArrayLike) -> Array:
+    def condition_number(self, q: ArrayLike) -> Array:
         """How well the active joints drive the machine: ||D^-1 gamma D_A||_2, D = diag(scales).
 
-        1 where no other joint moves, infinite where the branch ends; see `crane.closure.choice`.
+        1 where no other joint moves, infinite where the branch ends; see
+        `crane.closure.active_joint_selection`.
 
         Args:
             q: (nq,) or (N, nq) closed postures.
@@ -489,17 +590,19 @@ class Closure(Brief):
         Returns:
             () or (N,).
         """
-        return condition(self.gamma(q), self.equations.scales, self.active)
+        return condition_number(self.gamma(q), self.equations.motion_scales, self.active)
 
     @cached_property
-    def proposals(self) -> list[Choice]:
-        """Choices of active joints for this machine at home, see `crane.closure.choice`."""
-        followers = np.flatnonzero((self.equations.factors != 0).any(axis=0)).tolist()
-        rows = self.structure.rows  # the others contradict them by the digits of a file
-        jacobian = self.equations.evaluate(self.home)[1] / self.equations.row_units[:, None]
-        return proposals(self.model, jacobian[rows], followers)
+    def proposed_active_joints(self) -> list[ActiveJointSelection]:
+        """Possible choices of active joints at home, see `active_joint_selection`."""
+        coupled = np.flatnonzero((self.equations.coupling_factors != 0).any(axis=0)).tolist()
+        rows = (
+            self.structure.independent_rows
+        )  # the others contradict them by the digits of a file
+        jacobian = self.equations.evaluate(self.home)[1] / self.equations.residual_units[:, None]
+        return propose_active_joints(self.model, jacobian[rows], coupled)
 
-    def motion(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
+    def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
         """gamma, v = gamma v_A and drift of one sample, at less cost than one by one.
 
         Args:
@@ -509,50 +612,64 @@ class Closure(Brief):
         Returns:
             (nv, n), (nv,), (nv,).
         """
-        jacobian = self.equations.scaled(q)[1][self.structure.rows]
-        gamma = self._fill(self._gamma_rows(jacobian, q))
+        jacobian = self.equations.evaluate_scaled(q)[1][self.structure.independent_rows]
+        gamma = self._insert_passive_gamma(self._passive_gamma(jacobian, q))
         v = gamma @ v_a
-        return gamma, v, self._bend(jacobian, q, v)
+        return gamma, v, self._drift_from_jacobian(jacobian, q, v)
 
-    def _gamma(self, q: Array) -> Array:
-        return self._fill(self._gamma_rows(self.equations.scaled(q)[1][self.structure.rows], q))
+    def _gamma_of_sample(self, q: Array) -> Array:
+        return self._insert_passive_gamma(
+            self._passive_gamma(
+                self.equations.evaluate_scaled(q)[1][self.structure.independent_rows], q
+            )
+        )
 
-    def _gamma_rows(self, jacobian: Array, q: Array) -> Array:
+    def _passive_gamma(self, jacobian: Array, q: Array) -> Array:
         """(passive, n) of gamma, from a Jacobian in shares of the machine's size."""
-        rows = self._passive(jacobian, jacobian[:, self.active], q)
-        units = self.equations.units
-        return rows * units[self.passive, None] / units[self.active]
+        rows = self._solve_passive(jacobian, jacobian[:, self.active], q)
+        coordinate_units = self.equations.coordinate_units
+        return rows * coordinate_units[self.passive, None] / coordinate_units[self.active]
 
-    def _drift(self, q: Array, v: Array) -> Array:
-        return self._bend(self.equations.scaled(q)[1][self.structure.rows], q, v)
+    def _drift_of_sample(self, q: Array, v: Array) -> Array:
+        return self._drift_from_jacobian(
+            self.equations.evaluate_scaled(q)[1][self.structure.independent_rows], q, v
+        )
 
-    def _fill(self, passive: Array) -> Array:
+    def _insert_passive_gamma(self, passive: Array) -> Array:
         gamma = np.zeros((self.model.nv, len(self.active)))
         gamma[self.active] = np.eye(len(self.active))
         gamma[self.passive] = passive
         return gamma
 
-    def _bend(self, jacobian: Array, q: Array, v: Array) -> Array:
+    def _drift_from_jacobian(self, jacobian: Array, q: Array, v: Array) -> Array:
         drift = np.zeros(self.model.nv)
-        second = (self.equations.curvature(q, v) / self.equations.row_units)[self.structure.rows]
-        solved = self._passive(jacobian, second, q)
-        drift[self.passive] = solved * self.equations.units[self.passive]
+        acceleration_bias = (
+            self.equations.acceleration_bias(q, v) / self.equations.residual_units
+        )[self.structure.independent_rows]
+        passive_drift = self._solve_passive(jacobian, acceleration_bias, q)
+        drift[self.passive] = passive_drift * self.equations.coordinate_units[self.passive]
         return drift
 
-    def _passive(self, jacobian: Array, right: Array, q: Array) -> Array:
+    def _solve_passive(self, jacobian: Array, right_side: Array, q: Array) -> Array:
         """-J_P^-1 right, all in shares of the machine's size."""
         try:
-            solved = solve(jacobian[:, self.passive], -right)
+            solution = solve_linear(jacobian[:, self.passive], -right_side)
         except np.linalg.LinAlgError:
-            raise self._branch.edge(jacobian, q[self.active]) from None
-        self._branch.check_edge(jacobian, solved, q[self.active])
-        return solved
+            raise self._continuation.singularity_error(jacobian, q[self.active]) from None
+        self._continuation.check_singularity(jacobian, solution, q[self.active])
+        return solution
 
 
-def _alike(one: LoopEquations, other: LoopEquations) -> bool:
+def _has_same_geometry(first: LoopEquations, second: LoopEquations) -> bool:
     """Whether joints, limits and loops of two trees of one structure are at the same places."""
     pairs = [
-        [x.factors, x.offsets, x.coordinates.lower, x.coordinates.upper, geometry_of(x).numbers]
-        for x in (one, other)
+        [
+            x.coupling_factors,
+            x.coupling_offsets,
+            x.coordinates.lower,
+            x.coordinates.upper,
+            tree_geometry(x).constants,
+        ]
+        for x in (first, second)
     ]
     return all(np.array_equal(x, y) for x, y in zip(*pairs, strict=True))

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 
 FREE_FLYER = "JointModelFreeFlyer"
@@ -16,7 +16,7 @@ class Coordinates:
     """Names, limits and kinds of a tree's coordinates (nv,), and the way to Pinocchio's (nq,).
 
     Both are the same but for bodies that float: those have place and rotation vector here, place
-    and quaternion in Pinocchio's model; see `crane.description.floating`.
+    and quaternion in Pinocchio's model; see `crane.description.floating_bases`.
 
     Args:
         model: The tree. The coordinates of a free-flyer B are called B_x, B_y, B_z, B_rx, B_ry,
@@ -24,37 +24,39 @@ class Coordinates:
 
     Attributes:
         names: (nv,) in the order of Pinocchio's velocities.
-        joints: (nv,) index of the joint that each belongs to.
-        floating: First column of each free-flyer.
+        joint_of_coordinate: (nv,) index of the joint that each belongs to.
+        floating_base_columns: First column of each free-flyer.
         parents: (nv + 1,) what carries what, as if each coordinate i moved a body i + 1 of its
             own: the six of a free-flyer in a row; 0 is the world.
-        bodies: By joint of the model its body in that count.
+        body_of_joint: By joint of the model its body in that count.
     """
 
     def __init__(self, model: pin.Model):
         self.model = model
         self.names: tuple[str, ...] = ()
-        self.floating: tuple[int, ...] = ()
-        joints: list[int] = []
-        places: list[int] = []  # in Pinocchio's q, of a free-flyer those of its place
+        self.floating_base_columns: tuple[int, ...] = ()
+        joint_of_coordinate: list[int] = []
+        configuration_indices: list[
+            int
+        ] = []  # in Pinocchio's q, of a free-flyer those of its place
         for i in range(1, model.njoints):
             joint, name = model.joints[i], model.names[i]
             if joint.shortname() == FREE_FLYER:
-                self.floating += (joint.idx_v,)
+                self.floating_base_columns += (joint.idx_v,)
                 self.names += tuple(f"{name}_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
             else:
                 self.names += (name,)
-            joints += [i] * joint.nv
-            places += range(joint.idx_q, joint.idx_q + joint.nv)
-        self.joints = np.array(joints, dtype=np.intp)
-        last = {0: 0} | {joint: i + 1 for i, joint in enumerate(joints)}
-        self.bodies: tuple[int, ...] = tuple(last[joint] for joint in range(model.njoints))
+            joint_of_coordinate += [i] * joint.nv
+            configuration_indices += range(joint.idx_q, joint.idx_q + joint.nv)
+        self.joints = np.array(joint_of_coordinate, dtype=np.intp)
+        last = {0: 0} | {joint: i + 1 for i, joint in enumerate(joint_of_coordinate)}
+        self.body_of_joint: tuple[int, ...] = tuple(last[joint] for joint in range(model.njoints))
         self.parents: tuple[int, ...] = (0,) + tuple(
-            i if i and joints[i - 1] == joint else last[model.parents[joint]]
-            for i, joint in enumerate(joints)
+            i if i and joint_of_coordinate[i - 1] == joint else last[model.parents[joint]]
+            for i, joint in enumerate(joint_of_coordinate)
         )
-        self._places = np.array(places, dtype=np.intp)
-        self._index = {name: i for i, name in enumerate(self.names)}
+        self._configuration_indices = np.array(configuration_indices, dtype=np.intp)
+        self._columns_by_name = {name: i for i, name in enumerate(self.names)}
 
     def column(self, name: str) -> int:
         """Index of a coordinate.
@@ -62,22 +64,22 @@ class Coordinates:
         Raises:
             InputError: There is none of that name.
         """
-        if name not in self._index:
-            raise InputError(f"joint '{name}' is unknown, {known(self.names, name)}")
-        return self._index[name]
+        if name not in self._columns_by_name:
+            raise InputError(f"joint '{name}' is unknown, {suggest_names(self.names, name)}")
+        return self._columns_by_name[name]
 
     @cached_property
     def lower(self) -> Array:
         """(nv,) lower limits [m], [rad]."""
-        return self._limits(self.model.lowerPositionLimit, -np.inf)
+        return self._coordinate_limits(self.model.lowerPositionLimit, -np.inf)
 
     @cached_property
     def upper(self) -> Array:
         """(nv,) upper limits [m], [rad]."""
-        return self._limits(self.model.upperPositionLimit, np.inf)
+        return self._coordinate_limits(self.model.upperPositionLimit, np.inf)
 
     @cached_property
-    def slides(self) -> NDArray[np.bool_]:
+    def is_translation(self) -> NDArray[np.bool_]:
         """(nv,) whether a coordinate is a length."""
         found = np.zeros(len(self.names), dtype=bool)
         for i in range(1, self.model.njoints):
@@ -90,35 +92,35 @@ class Coordinates:
 
     def configuration(self, q: Array) -> Array:
         """Pinocchio's configuration (nq,) or (N, nq) of coordinates (nv,) or (N, nv)."""
-        if not self.floating:
+        if not self.floating_base_columns:
             return q
         out = np.zeros((*q.shape[:-1], self.model.nq))
-        out[..., self._places] = q
-        for column in self.floating:
-            at = self._places[column]
+        out[..., self._configuration_indices] = q
+        for column in self.floating_base_columns:
+            at = self._configuration_indices[column]
             out[..., at + 3 : at + 7] = _quaternion(q[..., column + 3 : column + 6])
         return out
 
-    def coordinates(self, configuration: Array) -> Array:
+    def from_configuration(self, configuration: Array) -> Array:
         """The way back: coordinates (nv,) or (N, nv) of Pinocchio's configuration."""
-        if not self.floating:
+        if not self.floating_base_columns:
             return configuration
-        out: Array = configuration[..., self._places]
-        for column in self.floating:
-            at = self._places[column]
+        out: Array = configuration[..., self._configuration_indices]
+        for column in self.floating_base_columns:
+            at = self._configuration_indices[column]
             quaternion = configuration[..., at + 3 : at + 7]
             out[..., column + 3 : column + 6] = _rotation_vector(quaternion)
         return out
 
-    def rates(self, q: Array, v: Array) -> Array:
+    def coordinate_derivatives(self, q: Array, v: Array) -> Array:
         """Time derivatives (nv,) of coordinates (nv,) at velocities (nv,).
 
         Of a free-flyer p' = R V_lin, r' = (1 + r x / 2 + c (r x)^2) V_ang.
         """
-        if not self.floating:
+        if not self.floating_base_columns:
             return v
         out = v.copy()
-        for column in self.floating:
+        for column in self.floating_base_columns:
             r, angular = q[column + 3 : column + 6], v[column + 3 : column + 6]
             out[column : column + 3] = pin.exp3(r) @ v[column : column + 3]
             half = 0.5 * float(np.linalg.norm(r))
@@ -132,22 +134,22 @@ class Coordinates:
             out[column + 3 : column + 6] = angular + 0.5 * turned + c * np.cross(r, turned)
         return out
 
-    def wrapped(self, q: Array) -> Array:
+    def wrap_rotations(self, q: Array) -> Array:
         """The same posture (nv,) with rotation vectors of at most pi."""
-        if not self.floating:
+        if not self.floating_base_columns:
             return q
         out = q.copy()
-        for column in self.floating:
+        for column in self.floating_base_columns:
             r = out[column + 3 : column + 6]
             length = float(np.linalg.norm(r))
             if length > np.pi:
                 r *= 1 - 2 * np.pi * np.round(length / (2 * np.pi)) / length
         return out
 
-    def _limits(self, given: Array, none: float) -> Array:
-        out = np.asarray(given, dtype=np.float64)[self._places].copy()
-        for column in self.floating:
-            out[column : column + 6] = none
+    def _coordinate_limits(self, joint_limits: Array, unlimited: float) -> Array:
+        out = np.asarray(joint_limits, dtype=np.float64)[self._configuration_indices].copy()
+        for column in self.floating_base_columns:
+            out[column : column + 6] = unlimited
         return out
 
 

@@ -10,24 +10,29 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from crane.closure.choice import Indices, motions, slides, units
-from crane.closure.equations import LoopEquations
-from crane.common.samples import Array, solve
+from crane.closure.active_joint_selection import (
+    Indices,
+    coordinate_units,
+    null_space_basis,
+    translational_coordinates,
+)
+from crane.closure.loop_equations import LoopEquations
+from crane.common.samples import Array, solve_linear
 
-_STEP = 0.02  # of a joint's scale
-_MOVED = 0.05  # share of a step that a finite motion keeps at least
-_OPEN = 1e-9  # residual that counts as open [rad], [machine's size]
-_AGAIN = 2  # closings of each direction
-_DIRECTIONS = 3  # drawn, beside those of single joints
-_WALK = 16  # steps to the end of the range
+_STEP_SIZE = 0.02  # of a joint's scale
+_MIN_FINITE_MOTION_RATIO = 0.05  # share of a step that a finite motion keeps at least
+_OPEN_TOLERANCE = 1e-9  # residual that counts as open [rad], [machine's size]
+_CLOSINGS_PER_DIRECTION = 2  # closings of each direction
+_RANDOM_DIRECTIONS = 3  # drawn, beside those of single joints
+_STEPS_TO_LIMIT = 16  # steps to the end of the range
 
 
-def locked_up(
+def find_locked_equation(
     equations: LoopEquations,
     q: Array,
-    freedom: int,
+    mobility: int,
     tolerance: float,
-    close: Callable[[Array], Array],
+    close_loops: Callable[[Array], Array],
 ) -> tuple[int, float] | None:
     """Where a machine has less freedom than its equations promise at a closed posture.
 
@@ -43,9 +48,9 @@ def locked_up(
     Args:
         equations: All loop equations.
         q: (nq,) closed posture.
-        freedom: What the equations leave at other closed postures.
+        mobility: What the equations leave at other closed postures.
         tolerance: Relative singular values of J below it count as zero.
-        close: Closes all loops from a near posture.
+        close_loops: Closes all loops from a near posture.
 
     Returns:
         The row that stays open by most, and by how much [rad], [machine's size]; None where all is
@@ -53,69 +58,93 @@ def locked_up(
     """
     from scipy.linalg import qr  # slow to import, and not needed without loops
 
-    scale = equations.scales
-    jacobian = equations.evaluate(q)[1] / equations.row_units[:, None]
-    basis = motions(jacobian, scale, tolerance)
-    if basis.shape[1] <= freedom:
+    scale = equations.motion_scales
+    jacobian = equations.evaluate(q)[1] / equations.residual_units[:, None]
+    basis = null_space_basis(jacobian, scale, tolerance)
+    if basis.shape[1] <= mobility:
         return None
-    group, group_of_row = equations.groups(np.arange(len(q)))
-    promised = np.linalg.norm(basis, axis=1)
-    directions = np.bincount(group, promised**2)  # of each group; the trace of a projector
+    group, group_of_row = equations.coupled_groups(np.arange(len(q)))
+    first_order_motion = np.linalg.norm(basis, axis=1)
+    directions = np.bincount(
+        group, first_order_motion**2
+    )  # of each group; the trace of a projector
     random = np.random.default_rng(1)
-    moved = np.zeros(len(q))  # shares of the step
+    finite_motion = np.zeros(len(q))  # shares of the step
     for _ in range(2 * round(directions.max())):
-        way = basis @ random.normal(size=basis.shape[1])
-        for _ in range(_AGAIN):
-            length = np.sqrt(np.bincount(group, way**2))[group]
-            near = close(q + _STEP * scale * way / np.where(length > 0, length, 1.0))
+        direction = basis @ random.normal(size=basis.shape[1])
+        for _ in range(_CLOSINGS_PER_DIRECTION):
+            length = np.sqrt(np.bincount(group, direction**2))[group]
+            closed = close_loops(
+                q + _STEP_SIZE * scale * direction / np.where(length > 0, length, 1.0)
+            )
             gap = np.zeros(len(directions))
-            np.maximum.at(gap, group_of_row, np.abs(equations.scaled(near)[0]))
-            way = np.where(gap[group] < _OPEN, (near - q) / scale, 0.0)
-            moved = np.maximum(moved, np.abs(way) / _STEP)
-            if not way.any():
+            np.maximum.at(gap, group_of_row, np.abs(equations.evaluate_scaled(closed)[0]))
+            direction = np.where(gap[group] < _OPEN_TOLERANCE, (closed - q) / scale, 0.0)
+            finite_motion = np.maximum(finite_motion, np.abs(direction) / _STEP_SIZE)
+            if not direction.any():
                 break
-    if not ((promised > 1e-3) & (moved < _MOVED * promised)).any():
+    if not (
+        (first_order_motion > 1e-3)
+        & (finite_motion < _MIN_FINITE_MOTION_RATIO * first_order_motion)
+    ).any():
         return None
     rank = equations.model.nv - basis.shape[1]
     rows = qr((jacobian * scale).T, mode="r", pivoting=True)[1][:rank].astype(np.intp)
-    worst, size = 0, 0.0
-    for way in basis.T:
-        beside = _closed(equations, q + _STEP * scale * way, rows, basis / scale[:, None])
-        if beside is None:
+    worst, largest_gap = 0, 0.0
+    for direction in basis.T:
+        closed_neighbour = _close_independent_rows(
+            equations, q + _STEP_SIZE * scale * direction, rows, basis / scale[:, None]
+        )
+        if closed_neighbour is None:
             continue
-        phi = np.abs(equations.scaled(beside)[0])
-        if phi.max() > size:
-            worst, size = int(phi.argmax()), float(phi.max())
-    return worst, size
+        phi = np.abs(equations.evaluate_scaled(closed_neighbour)[0])
+        if phi.max() > largest_gap:
+            worst, largest_gap = int(phi.argmax()), float(phi.max())
+    return worst, largest_gap
 
 
-def surplus_open(
-    equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
+def largest_redundant_gap(
+    equations: LoopEquations,
+    home: Array,
+    independent_rows: Indices,
+    redundant_rows: Indices,
+    active: Indices,
 ) -> tuple[int, float] | None:
     """The surplus equation that holds least beside home, and how far it is open, in shares.
 
     Active joints step one by one, and all together in drawn directions; the others follow by the
     independent rows. What is open far enough to tell ends the search.
     """
-    if not len(surplus) or not len(active):
+    if not len(redundant_rows) or not len(active):
         return None
-    scale = equations.scales
-    worst = int(surplus[0]), 0.0
-    for held, way in _ways(equations.model.nv, active):
+    scale = equations.motion_scales
+    worst = int(redundant_rows[0]), 0.0
+    for active_columns, direction in _active_directions(equations.model.nv, active):
         # the smaller step where the branch ends within the larger one
-        starts = [home + held @ (size * scale[active] * way) for size in (_STEP, _STEP / 16)]
-        closed = (_closed(equations, q, rows, held) for q in starts)
-        moved = next((q for q in closed if q is not None), None)
-        if moved is not None:
-            phi = np.abs(equations.scaled(moved)[0][surplus])
-            worst = max(worst, (int(surplus[phi.argmax()]), float(phi.max())), key=lambda x: x[1])
-        if worst[1] > _OPEN:
+        starts = [
+            home + active_columns @ (size * scale[active] * direction)
+            for size in (_STEP_SIZE, _STEP_SIZE / 16)
+        ]
+        closed = (
+            _close_independent_rows(equations, q, independent_rows, active_columns) for q in starts
+        )
+        neighbour = next((q for q in closed if q is not None), None)
+        if neighbour is not None:
+            phi = np.abs(equations.evaluate_scaled(neighbour)[0][redundant_rows])
+            worst = max(
+                worst, (int(redundant_rows[phi.argmax()]), float(phi.max())), key=lambda x: x[1]
+            )
+        if worst[1] > _OPEN_TOLERANCE:
             break
     return worst
 
 
-def surplus_along(
-    equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
+def redundant_gaps_along_motions(
+    equations: LoopEquations,
+    home: Array,
+    independent_rows: Indices,
+    redundant_rows: Indices,
+    active: Indices,
 ) -> tuple[Array, bool]:
     """How far each surplus equation opens all along the motions from home, in shares.
 
@@ -126,53 +155,66 @@ def surplus_along(
         (k,), and whether each active joint moves at all.
     """
     model = equations.model
-    unit, turns = units(model)[active], ~slides(model)[active]
-    room = [
+    unit, turns = coordinate_units(model)[active], ~translational_coordinates(model)[active]
+    distances_to_limits = [
         np.abs(limit[active] - home[active])
         for limit in (equations.coordinates.lower, equations.coordinates.upper)
     ]
-    reach = [
-        np.where(np.isfinite(x), np.maximum(x, unit), np.where(turns, np.pi, unit)) for x in room
+    ranges = [
+        np.where(np.isfinite(x), np.maximum(x, unit), np.where(turns, np.pi, unit))
+        for x in distances_to_limits
     ]
-    widest = np.abs(equations.scaled(home)[0][surplus])
+    largest_gaps = np.abs(equations.evaluate_scaled(home)[0][redundant_rows])
     moves = np.zeros(len(active), dtype=bool)
-    for held, way in _ways(model.nv, active):
-        for side, far in zip((-1.0, 1.0), reach, strict=True):
+    for active_columns, direction in _active_directions(model.nv, active):
+        for side, distance in zip((-1.0, 1.0), ranges, strict=True):
             q = home
-            for _ in range(_WALK):
-                near = _closed(equations, q + held @ (side * way * far / _WALK), rows, held)
+            for _ in range(_STEPS_TO_LIMIT):
+                near = _close_independent_rows(
+                    equations,
+                    q + active_columns @ (side * direction * distance / _STEPS_TO_LIMIT),
+                    independent_rows,
+                    active_columns,
+                )
                 if near is None:
                     break
                 q = near
-                moves |= way != 0
-                widest = np.maximum(widest, np.abs(equations.scaled(q)[0][surplus]))
-    return widest, bool(moves.all())
+                moves |= direction != 0
+                largest_gaps = np.maximum(
+                    largest_gaps, np.abs(equations.evaluate_scaled(q)[0][redundant_rows])
+                )
+    return largest_gaps, bool(moves.all())
 
 
-def _ways(nv: int, active: Indices) -> Iterator[tuple[Array, Array]]:
+def _active_directions(nv: int, active: Indices) -> Iterator[tuple[Array, Array]]:
     """Columns (nv, n) of the active joints and directions (n,): one by one, then some drawn."""
-    held = np.zeros((nv, len(active)))
-    held[active, np.arange(len(active))] = 1.0
-    ways = [*np.eye(len(active))]
+    active_columns = np.zeros((nv, len(active)))
+    active_columns[active, np.arange(len(active))] = 1.0
+    directions = [*np.eye(len(active))]
     if len(active) > 1:
-        ways += [*np.random.default_rng(2).uniform(-1, 1, (_DIRECTIONS, len(active)))]
-    return ((held, way) for way in ways)
+        directions += [*np.random.default_rng(2).uniform(-1, 1, (_RANDOM_DIRECTIONS, len(active)))]
+    return ((active_columns, way) for way in directions)
 
 
-def _closed(equations: LoopEquations, q: Array, rows: Indices, held: Array) -> Array | None:
+def _close_independent_rows(
+    equations: LoopEquations, q: Array, independent_rows: Indices, held_directions: Array
+) -> Array | None:
     """The posture near q (nq,) where independent rows are closed and held^T q is what it was."""
     q = q.copy()
-    none = np.zeros(held.shape[1])
+    none = np.zeros(held_directions.shape[1])
     for _ in range(12):
-        phi, jacobian = equations.scaled(q)
-        if np.abs(phi[rows]).max(initial=0.0) < 1e-13:
+        phi, jacobian = equations.evaluate_scaled(q)
+        if np.abs(phi[independent_rows]).max(initial=0.0) < 1e-13:
             return q
-        ways = held.T * equations.units
+        scaled_directions = held_directions.T * equations.coordinate_units
         try:
-            change = solve(np.vstack([jacobian[rows], ways]), np.concatenate([-phi[rows], none]))
+            change = solve_linear(
+                np.vstack([jacobian[independent_rows], scaled_directions]),
+                np.concatenate([-phi[independent_rows], none]),
+            )
         except np.linalg.LinAlgError:
             return None
         if not np.abs(change).max() < 1.0:
             return None
-        q += change * equations.units
-    return q if np.abs(phi[rows]).max(initial=0.0) < 1e-11 else None
+        q += change * equations.coordinate_units
+    return q if np.abs(phi[independent_rows]).max(initial=0.0) < 1e-11 else None

@@ -1,14 +1,29 @@
 """Machine code from traced arithmetic."""
 
-from crane.codegen.callback import Callback
-from crane.codegen.driver import carefully
-from crane.codegen.layout import Layout, Parts
-from crane.codegen.program import Bound, Program, TooLongError
-from crane.codegen.representation import Array, Routine, Value, select
-from crane.codegen.results import kept_result
-from crane.codegen.scalar import Expression, Number, Tape, largest, maximum
+from crane.codegen.fallback_driver import run_with_fallback
+from crane.codegen.intermediate_representation import ArrayPointer, Routine, RoutineValue, select
+from crane.codegen.layout import Layout, LayoutView
+from crane.codegen.program import BoundFunction, FormulaTooLongError, Program
+from crane.codegen.python_callback import PythonCallback
+from crane.codegen.result_cache import cached_result
+from crane.codegen.symbolic import Scalar, SymbolicExpression, Tape, max_abs, maximum
 
 __all__ = [
-    "Array", "Bound", "Callback", "Expression", "Layout", "Number", "Parts", "Program", "Routine",
-    "Tape", "TooLongError", "Value", "carefully", "kept_result", "largest", "maximum", "select",
-]  # fmt: skip
+    "ArrayPointer",
+    "BoundFunction",
+    "PythonCallback",
+    "SymbolicExpression",
+    "Layout",
+    "Scalar",
+    "LayoutView",
+    "Program",
+    "Routine",
+    "Tape",
+    "FormulaTooLongError",
+    "RoutineValue",
+    "run_with_fallback",
+    "cached_result",
+    "max_abs",
+    "maximum",
+    "select",
+]

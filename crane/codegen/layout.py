@@ -17,10 +17,10 @@ class Layout:
 
     def __init__(self, **parts: int):
         self.parts: Mapping[str, int] = parts
-        self._starts: dict[str, int] = {}
+        self._start_indices: dict[str, int] = {}
         at = 0
         for name, length in parts.items():
-            self._starts[name] = at
+            self._start_indices[name] = at
             at += length
         self.size = at
 
@@ -35,18 +35,18 @@ class Layout:
 
     def __getitem__(self, name: str) -> slice:
         """Where a part is."""
-        return slice(self._starts[name], self._starts[name] + self.parts[name])
+        return slice(self._start_indices[name], self._start_indices[name] + self.parts[name])
 
-    def start(self, name: str) -> int:
+    def start_index(self, name: str) -> int:
         """Index of a part's first element."""
-        return self._starts[name]
+        return self._start_indices[name]
 
-    def view(self, array: Any) -> "Parts":
+    def view(self, array: Any) -> "LayoutView":
         """The parts of an array (..., size) or of a sequence, by name."""
-        return Parts(self, array)
+        return LayoutView(self, array)
 
 
-class Parts:
+class LayoutView:
     """Parts of one array as attributes; see `Layout.view`."""
 
     def __init__(self, layout: Layout, array: Any):
@@ -61,6 +61,6 @@ class Parts:
         raise AttributeError(f"no part '{name}', there are {', '.join(vars(self))}")
 
 
-def laid_out(parts: Mapping[str, Sequence]) -> Layout:
+def layout_of(parts: Mapping[str, Sequence]) -> Layout:
     """The layout of sequences one after the other."""
     return Layout(**{name: len(values) for name, values in parts.items()})

@@ -7,7 +7,7 @@ stop, and arrays of its own. Nothing here is written in a machine's language: an
 
     with program.routine("each", counts=("count",), arrays=("inputs", "out")) as r:
         with r.loop(r.count) as i:
-            r.call("formula", r.inputs.row(i, 3), r.out.row(i, 2))
+            r.call("formula", r.inputs.row_pointer(i, 3), r.out.row_pointer(i, 2))
         r.give(r.count)
 """
 
@@ -20,25 +20,25 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen.kept import Note, Signature, place_of
-from crane.codegen.layout import Layout, laid_out
-from crane.codegen.llvm.engine import Code
-from crane.codegen.representation import Formula, Routine
-from crane.codegen.scalar import Number, needed
+from crane.codegen.intermediate_representation import Formula, Routine
+from crane.codegen.layout import Layout, layout_of
+from crane.codegen.llvm.machine_code import MachineCode
+from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
+from crane.codegen.symbolic import Scalar, required_operations
 
-MOST = 200_000  # operations of a formula; longer ones take minutes to compile
+MAX_OPERATIONS = 200_000  # operations of a formula; longer ones take minutes to compile
 
 
-class TooLongError(Exception):
-    """A formula has more than `MOST` operations.
+class FormulaTooLongError(Exception):
+    """A formula has more than `MAX_OPERATIONS` operations.
 
     Args:
-        operations: How many, where it is known.
+        operation_count: How many, where it is known.
     """
 
     def __init__(self, operations: int = 0):
         super().__init__(operations)
-        self.operations = operations
+        self.operation_count = operations
 
 
 class Program:
@@ -46,59 +46,64 @@ class Program:
 
     Attributes:
         functions: By name, in the order in which they were added; none of a program that was kept.
-        longest: Operations of the longest formula.
+        max_formula_length: Operations of the longest formula.
     """
 
     def __init__(self) -> None:
         self.functions: dict[str, Formula | Routine] = {}
-        self.longest = 0
-        self._signatures: dict[str, Signature] = {}
-        self._code: Any = None
+        self.max_formula_length = 0
+        self._signatures: dict[str, FunctionSignature] = {}
+        self._machine_code: Any = None
 
     @classmethod
-    def kept(cls, depends: Any, build: Callable[["Program"], None]) -> "Program":
+    def from_cache(cls, dependencies: Any, build: Callable[["Program"], None]) -> "Program":
         """A compiled program, which is built only where none is kept between runs.
 
         Args:
-            depends: All that it depends on besides the package's own files, see `place_of`; None
-                where it depends on more.
+            dependencies: All that it depends on besides the package's own files, see
+                `cache_entry_name`; None where it depends on more.
             build: Adds its formulas and routines.
 
         Raises:
             TooLongError: A formula has too many operations.
         """
-        place = place_of(depends)
-        note = Note.read(place)
-        if note is not None and note.longest > MOST:
-            raise TooLongError(note.longest)
-        code = None if note is None else Code.kept(note.code)
-        if note is not None and code is not None:
-            return cls._of(note, code)
+        entry_name = cache_entry_name(dependencies)
+        record = ProgramRecord.from_cache(entry_name)
+        if record is not None and record.max_formula_length > MAX_OPERATIONS:
+            raise FormulaTooLongError(record.max_formula_length)
+        code = None if record is None else MachineCode.from_cache(record.code_name)
+        if record is not None and code is not None:
+            return cls._from_record(record, code)
         program = cls()
         try:
             build(program)
-        except TooLongError as error:
-            Note("", error.operations, {}).write(place)
+        except FormulaTooLongError as error:
+            ProgramRecord("", error.operation_count, {}).write_to_cache(entry_name)
             raise
         program.compile()
-        Note(program._code.name, program.longest, program._signatures).write(place)
+        ProgramRecord(
+            program._machine_code.cache_name, program.max_formula_length, program._signatures
+        ).write_to_cache(entry_name)
         return program
 
     @classmethod
-    def _of(cls, note: Note, code: Code) -> "Program":
+    def _from_record(cls, record: ProgramRecord, code: MachineCode) -> "Program":
         program = cls()
-        program.longest, program._code = note.longest, code
-        program._signatures = dict(note.functions)
+        program.max_formula_length, program._machine_code = record.max_formula_length, code
+        program._signatures = dict(record.signatures)
         return program
 
-    def add(
-        self, name: str, arrays: int, outputs: Sequence[Number] | Mapping[str, Sequence[Number]]
+    def add_formula(
+        self,
+        name: str,
+        input_count: int,
+        outputs: Sequence[Scalar] | Mapping[str, Sequence[Scalar]],
     ) -> Layout:
         """Add a formula.
 
         Args:
             name: Its name.
-            arrays: Number of arguments that are read; one more takes the outputs.
+            input_count: Number of arguments that are read; one more takes the outputs.
             outputs: (m,), or parts of them by name.
 
         Returns:
@@ -109,16 +114,16 @@ class Program:
         """
         parts = outputs if isinstance(outputs, Mapping) else {"all": outputs}
         flat = [value for part in parts.values() for value in part]
-        operations = len(needed(flat))
-        if operations > MOST:
-            raise TooLongError(operations)
-        self.longest = max(self.longest, operations)
-        formula = self.functions[name] = Formula(name, arrays, flat, laid_out(parts))
-        self._signatures[name] = Signature(formula.kinds, formula.layout)
+        operations = len(required_operations(flat))
+        if operations > MAX_OPERATIONS:
+            raise FormulaTooLongError(operations)
+        self.max_formula_length = max(self.max_formula_length, operations)
+        formula = self.functions[name] = Formula(name, input_count, flat, layout_of(parts))
+        self._signatures[name] = FunctionSignature(formula.argument_kinds, formula.layout)
         return formula.layout
 
     @contextmanager
-    def routine(
+    def add_routine(
         self,
         name: str,
         *,
@@ -131,9 +136,9 @@ class Program:
         routine = Routine(name, self.functions, counts, functions, named)
         yield routine
         self.functions[name] = routine
-        self._signatures[name] = Signature(routine.kinds, None)
+        self._signatures[name] = FunctionSignature(routine.argument_kinds, None)
 
-    def outputs(self, name: str) -> Layout:
+    def formula_outputs(self, name: str) -> Layout:
         """Parts of what a formula writes."""
         layout = self._signatures[name].outputs
         assert layout is not None
@@ -141,11 +146,11 @@ class Program:
 
     def compile(self) -> None:
         """Translate everything that was added."""
-        self._code = Code.of(self.functions.values())
+        self._machine_code = MachineCode.compile_functions(self.functions.values())
 
-    def address(self, name: str) -> int:
+    def function_address(self, name: str) -> int:
         """Where a compiled function is, for as long as the program lives."""
-        return int(self._code.address(name))
+        return int(self._machine_code.function_address(name))
 
     def call(self, name: str, *arguments: "int | np.ndarray") -> int:
         """Call a compiled formula or routine once, other threads running meanwhile.
@@ -157,48 +162,48 @@ class Program:
         Returns:
             What a routine returns, 0 of a formula.
         """
-        answer: int = self._entry(name, arguments)(_addresses(arguments))
-        return answer
+        result: int = self._entry_point(name, arguments)(_pack_addresses(arguments))
+        return result
 
-    def bound(self, name: str, *arguments: "int | np.ndarray") -> "Bound":
+    def bind(self, name: str, *arguments: "int | np.ndarray") -> "BoundFunction":
         """A function with its arguments, for many calls that must cost little."""
-        return Bound(self, self._entry(name, arguments), arguments)
+        return BoundFunction(self, self._entry_point(name, arguments), arguments)
 
-    def _entry(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
-        expected = len(self._signatures[name].kinds)
+    def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
+        expected = len(self._signatures[name].argument_kinds)
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
-        return self._code.entry(name)
+        return self._machine_code.entry_point(name)
 
 
-class Bound(partial[int]):
+class BoundFunction(partial[int]):
     """A compiled function together with its arguments, which it keeps alive; see `Program.call`.
 
     One pointer costs a call from Python far less than a dozen.
 
     Args:
         program: Where the function is, kept alive.
-        entry: Takes the address of the arguments' addresses.
+        entry_point: Takes the address of the arguments' addresses.
         arguments: See `Program.call`.
     """
 
-    _kept: tuple[Any, ...]
+    _references: tuple[Any, ...]
 
     def __new__(
         cls, program: Program, entry: Any, arguments: Sequence["int | np.ndarray"]
-    ) -> "Bound":
+    ) -> "BoundFunction":
         """Keep all of it."""
-        addresses = np.frombuffer(_addresses(arguments), dtype=np.int64)
+        addresses = np.frombuffer(_pack_addresses(arguments), dtype=np.int64)
         self = super().__new__(cls, entry, addresses.ctypes.data)
-        self._kept = program, addresses, arguments
+        self._references = program, addresses, arguments
         return self
 
 
-def _addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:
-    return pack(f"{len(arguments)}q", *map(_address, arguments))
+def _pack_addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:
+    return pack(f"{len(arguments)}q", *map(_argument_address, arguments))
 
 
-def _address(argument: "int | np.ndarray") -> int:
+def _argument_address(argument: "int | np.ndarray") -> int:
     if isinstance(argument, int):
         return argument
     try:  # takes a tenth of the time of numpy's own way

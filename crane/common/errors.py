@@ -7,40 +7,47 @@ from collections.abc import Iterable
 from difflib import SequenceMatcher, get_close_matches
 from typing import Any
 
-_WORD, _LINE = 1000, 4000  # characters of a word and of a line that anybody reads
+_MAX_WORD_LENGTH, _MAX_LINE_LENGTH = (
+    1000,
+    4000,
+)  # characters of a word and of a line that anybody reads
 
 
-def one_line(text: str) -> str:
+def format_one_line(text: str) -> str:
     """Text as one line that can be read.
 
     What cannot be printed (a name may hold it) becomes a space; of words and lines without end
     the middle is left out.
     """
     text = "".join(c if c.isprintable() else " " for c in text)
-    if len(text) > _WORD:
-        text = " ".join(_shortened(word, _WORD) for word in text.split(" "))
-    return _shortened(text, _LINE)
+    if len(text) > _MAX_WORD_LENGTH:
+        text = " ".join(_shorten(word, _MAX_WORD_LENGTH) for word in text.split(" "))
+    return _shorten(text, _MAX_LINE_LENGTH)
 
 
-def at(place: str, error: Exception) -> str:
+def prefix_location(location: str, error: Exception) -> str:
     """`place: message`, and the message alone where that begins with the place."""
     text = str(error)
-    return text if text.startswith(place) else f"{place}: {text}"
+    return text if text.startswith(location) else f"{location}: {text}"
 
 
-def _shortened(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
+def _shorten(text: str, max_length: int) -> str:
+    return (
+        text
+        if len(text) <= max_length
+        else f"{text[: max_length // 2]}...{text[-max_length // 4 :]}"
+    )
 
 
 class CraneError(Exception):
     """Base class of everything this package raises on purpose.
 
     Args:
-        message: One line, see `one_line`.
+        message: One line, see `format_one_line`.
     """
 
     def __init__(self, message: str):
-        super().__init__(one_line(message))
+        super().__init__(format_one_line(message))
 
 
 class DescriptionError(CraneError):
@@ -52,14 +59,14 @@ class MechanismError(CraneError):
 
     Args:
         message: See `CraneError`.
-        about: What of the description it is about: "active", "home", or "loop" and its name.
-        posture: (nq,) where the loops close, if that was found.
+        subject: What of the description it is about: "active", "home", or "loop" and its name.
+        configuration: (nq,) where the loops close, if that was found.
     """
 
-    def __init__(self, message: str, about: str = "", posture: Any = None):
+    def __init__(self, message: str, subject: str = "", configuration: Any = None):
         super().__init__(message)
-        self.about = about
-        self.posture = posture
+        self.subject = subject
+        self.configuration = configuration
 
 
 class InputError(CraneError):
@@ -78,7 +85,7 @@ class OutOfReachError(ClosureError):
     """No posture closes the loops at these active coordinates."""
 
 
-class BranchEdgeError(ClosureError):
+class SingularConfigurationError(ClosureError):
     """The loops close, but at a posture where the passive joints are not determined."""
 
 
@@ -113,29 +120,36 @@ class CraneWarning(UserWarning):
     """Something is unusual enough to be told, and not wrong enough to refuse."""
 
 
-_MANY = 2000  # names to search for a similar one
+_MAX_SEARCHED_NAMES = 2000  # names to search for a similar one
 _HOLDS = 0.7  # likeness of names of which one holds the other
-_LISTED, _NEAREST = 20, 8  # names that a line has of all, and of many: those like the wanted one
+_MAX_LISTED_NAMES, _NEAREST = (
+    20,
+    8,
+)  # names that a line has of all, and of many: those like the wanted one
 
 
-def known(names: Iterable[str], wanted: str | None = None) -> str:
+def suggest_names(names: Iterable[str], unknown_name: str | None = None) -> str:
     """Words an error ends with: the name that was meant, all there are, or of many the nearest.
 
     Args:
         names: Those that exist.
-        wanted: What was asked for, and is none of them.
+        unknown_name: What was asked for, and is none of them.
     """
     names = list(names)
     if not names:
         return "there are none"
-    few = len(names) <= _MANY
-    if few and wanted is not None and (near := get_close_matches(wanted, names, 1, 0.75)):
-        return f"did you mean '{near[0]}'?"
-    if len(names) <= _LISTED:
+    is_searchable = len(names) <= _MAX_SEARCHED_NAMES
+    if (
+        is_searchable
+        and unknown_name is not None
+        and (similar := get_close_matches(unknown_name, names, 1, 0.75))
+    ):
+        return f"did you mean '{similar[0]}'?"
+    if len(names) <= _MAX_LISTED_NAMES:
         return "known: " + ", ".join(sorted(names))
-    if wanted is None or not few:
+    if unknown_name is None or not is_searchable:
         return f"known: {', '.join(sorted(names)[:_NEAREST])} and {len(names) - _NEAREST} more"
-    listed = sorted(names, key=lambda name: (-_likeness(name, wanted), name))[:_NEAREST]
+    listed = sorted(names, key=lambda name: (-_likeness(name, unknown_name), name))[:_NEAREST]
     return f"the nearest of {len(names)} known ones are {', '.join(listed)}"
 
 

@@ -10,86 +10,97 @@ from crane.common.errors import ClosureError, InputError
 Array = NDArray[np.float64]
 
 
-def as_samples(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()) -> Array:
+def as_samples(value: ArrayLike, size: int, label: str, names: Sequence[str] = ()) -> Array:
     """A finite float64 array (size,) or (N, size).
 
     Args:
         value: What the user gave.
         size: Length of one sample.
-        what: Its name, for errors.
+        label: Its name, for errors.
         names: Names of the columns, for errors.
 
     Raises:
         InputError: Wrong shape, not numbers, or not finite.
     """
-    array = _numbers(value, what, f"give {size} per sample")
+    array = _as_real_array(value, label, f"give {size} per sample")
     if array.ndim not in (1, 2) or array.shape[-1] != size:
         columns = f" ({', '.join(names)})" if names else ""
         raise InputError(
-            f"{what} has the shape {array.shape}, give ({size},) or (N, {size}){columns}"
+            f"{label} has the shape {array.shape}, give ({size},) or (N, {size}){columns}"
         )
     bad = ~np.isfinite(array)
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         column = names[index[-1]] if names else f"column {index[-1]}"
         sample = f" of sample {index[0]}" if len(index) == 2 else ""
-        raise InputError(f"{what} is {array[index]} at {column}{sample}, give finite numbers")
+        raise InputError(f"{label} is {array[index]} at {column}{sample}, give finite numbers")
     return array
 
 
-def as_sample(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()) -> Array:
+def as_sample(value: ArrayLike, size: int, label: str, names: Sequence[str] = ()) -> Array:
     """`as_samples` of exactly one sample (size,).
 
     Raises:
         InputError: Also for a stack.
     """
-    shape = _numbers(value, what, f"give {size}").shape
+    shape = _as_real_array(value, label, f"give {size}").shape
     if shape != (size,):
         columns = f" ({', '.join(names)})" if names else ""
-        raise InputError(f"{what} has the shape {shape}, give ({size},){columns}")
-    return as_samples(value, size, what, names)
+        raise InputError(f"{label} has the shape {shape}, give ({size},){columns}")
+    return as_samples(value, size, label, names)
 
 
 # Between these lies every quantity of a machine in SI units but zero, and its square is a number.
-SMALLEST, LARGEST = 1e-30, 1e30
-FARTHEST = 1e6  # coordinate [m], [rad] whose sine still has ten digits
-MOST_SEEDS = 2**64 - 1
+MIN_QUANTITY, MAX_QUANTITY = 1e-30, 1e30
+MAX_COORDINATE = 1e6  # coordinate [m], [rad] whose sine still has ten digits
+MAX_SEED = 2**64 - 1
 
 
 def as_number(
-    value: object, what: str, unit: str, above: float = -np.inf, most: float = LARGEST
+    value: object,
+    label: str,
+    unit: str,
+    greater_than: float = -np.inf,
+    max_magnitude: float = MAX_QUANTITY,
 ) -> float:
     """A number that a quantity of a machine can have.
 
     Args:
         value: What the user gave.
-        what: Its name, for errors.
+        label: Its name, for errors.
         unit: Its unit, for errors.
-        above: What it has to be above; of what has to be above zero, `SMALLEST` is the least.
-        most: What it may be at most, to both sides of zero.
+        greater_than: What it has to be above; of what has to be above zero, `MIN_QUANTITY` is the
+            least.
+        max_magnitude: What it may be at most, to both sides of zero.
 
     Raises:
         InputError: It is not.
     """
-    array = _numbers(value, what, "give a number")
-    shown = " ".join(f"{what} is {value} {unit}".split())
-    if array.ndim or not np.isfinite(array) or not array > above:
-        bound = f" above {above:g}" if above > -np.inf else ""
+    array = _as_real_array(value, label, "give a number")
+    shown = " ".join(f"{label} is {value} {unit}".split())
+    if array.ndim or not np.isfinite(array) or not array > greater_than:
+        bound = f" above {greater_than:g}" if greater_than > -np.inf else ""
         raise InputError(f"{shown}, give a number{bound}")
-    if abs(array) > most or (above == 0 and array < SMALLEST):
-        least = SMALLEST if above == 0 else above if above > -np.inf else -most
-        raise InputError(f"{shown}, give a number from {least:g} to {most:g}")
+    if abs(array) > max_magnitude or (greater_than == 0 and array < MIN_QUANTITY):
+        least = (
+            MIN_QUANTITY
+            if greater_than == 0
+            else greater_than
+            if greater_than > -np.inf
+            else -max_magnitude
+        )
+        raise InputError(f"{shown}, give a number from {least:g} to {max_magnitude:g}")
     return float(array)
 
 
-def as_count(value: object, what: str, least: int = 1, most: int = 10**9) -> int:
+def as_count(value: object, label: str, minimum: int = 1, maximum: int = 10**9) -> int:
     """A whole number within bounds.
 
     Raises:
         InputError: It is not.
     """
-    if not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise InputError(f"{what} is {value}, give a whole number from {least} to {most}")
+    if not isinstance(value, int | np.integer) or not minimum <= value <= maximum:
+        raise InputError(f"{label} is {value}, give a whole number from {minimum} to {maximum}")
     return int(value)
 
 
@@ -99,25 +110,25 @@ def as_seed(value: object) -> int:
     Raises:
         InputError: It is negative, or no whole number.
     """
-    return as_count(value, "the seed", 0, MOST_SEEDS)
+    return as_count(value, "the seed", 0, MAX_SEED)
 
 
-def _numbers(value: object, what: str, wanted: str) -> Array:
+def _as_real_array(value: object, label: str, hint: str) -> Array:
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "biuf":
             raise TypeError
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError):
-        raise InputError(f"{what} is not made of real numbers, {wanted}") from None
+        raise InputError(f"{label} is not made of real numbers, {hint}") from None
 
 
-def solve(matrix: Array, right: Array) -> Array:
+def solve_linear(matrix: Array, right_side: Array) -> Array:
     """Solution x of matrix x = right, float64 for the type checker too."""
-    return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
+    return np.asarray(np.linalg.solve(matrix, right_side), dtype=np.float64)
 
 
-def _named(sample: int, function: Callable[..., Array], *arrays: Array) -> Array:
+def _call_with_sample_number(sample: int, function: Callable[..., Array], *arrays: Array) -> Array:
     """Call a function and name the sample in errors of the closure."""
     try:
         return function(*arrays)
@@ -125,7 +136,7 @@ def _named(sample: int, function: Callable[..., Array], *arrays: Array) -> Array
         raise type(error)(f"{error} (sample {sample})") from None
 
 
-def per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
+def apply_per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
     """Apply a function of single samples to single samples or row by row to stacks.
 
     Single samples among stacks hold for every row.
@@ -140,7 +151,9 @@ def per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
         raise InputError(f"stacks of {sorted(lengths)} samples do not go together, give equal N")
     (count,) = lengths
     rows: Iterable[Array] = (
-        _named(i, function, *(array[i] if array.ndim == 2 else array for array in arrays))
+        _call_with_sample_number(
+            i, function, *(array[i] if array.ndim == 2 else array for array in arrays)
+        )
         for i in range(count)
     )
     first = next(iter(rows), None)

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-_LENGTH = 8  # bytes
-_KINDS = "biufSU"  # of arrays; no objects
+_HEAD_LENGTH_SIZE = 8  # bytes
+_ARRAY_KINDS = "biufSU"  # of arrays; no objects
 
 
 def serialize(value: Any, classes: Sequence[type] = ()) -> bytes:
@@ -39,7 +39,7 @@ def serialize(value: Any, classes: Sequence[type] = ()) -> bytes:
             return {"bytes": [len(blob) - len(value), len(value)]}
         if isinstance(value, tuple):
             return [plain(item) for item in value]
-        if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in _KINDS:
+        if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in _ARRAY_KINDS:
             start = len(blob)
             blob.extend(value.tobytes())
             return {"array": [value.dtype.str, list(value.shape), start]}
@@ -52,7 +52,7 @@ def serialize(value: Any, classes: Sequence[type] = ()) -> bytes:
         return {"of": type(value).__qualname__, "state": {k: plain(v) for k, v in state.items()}}
 
     head = json.dumps(plain(value)).encode()
-    return len(head).to_bytes(_LENGTH, "little") + head + bytes(blob)
+    return len(head).to_bytes(_HEAD_LENGTH_SIZE, "little") + head + bytes(blob)
 
 
 def deserialize(data: bytes, classes: Sequence[type]) -> Any:
@@ -66,7 +66,7 @@ def deserialize(data: bytes, classes: Sequence[type]) -> Any:
         ValueError: Not such bytes.
         KeyError: An object of another class.
     """
-    start = _LENGTH + int.from_bytes(data[:_LENGTH], "little")
+    start = _HEAD_LENGTH_SIZE + int.from_bytes(data[:_HEAD_LENGTH_SIZE], "little")
     named = {item.__qualname__: item for item in classes}
 
     def value_of(plain: Any) -> Any:
@@ -87,4 +87,4 @@ def deserialize(data: bytes, classes: Sequence[type]) -> Any:
         vars(out).update({key: value_of(x) for key, x in plain["state"].items()})
         return out
 
-    return value_of(json.loads(data[_LENGTH:start]))
+    return value_of(json.loads(data[_HEAD_LENGTH_SIZE:start]))

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 
 # Unit: other units to read it in, how many of them make one, from which value on (in SI).
-READING: Mapping[str, tuple[tuple[str, float, float], ...]] = {
+DISPLAY_UNITS: Mapping[str, tuple[tuple[str, float, float], ...]] = {
     "rad": (("deg", 180 / math.pi, 0.0),),
     "rad/s": (("deg/s", 180 / math.pi, 0.0),),
     "m": (("m", 1.0, 5.0), ("mm", 1e3, 0.0)),
@@ -19,7 +19,7 @@ READING: Mapping[str, tuple[tuple[str, float, float], ...]] = {
     "kg": (("t", 1e-3, 1e4),),
 }
 # unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
-TO_SI = {
+SI_CONVERSIONS = {
     "ms": ("s", 1.0, 1e3),
     "deg": ("rad", math.pi, 180.0),
     "deg/s": ("rad/s", math.pi, 180.0),
@@ -35,32 +35,32 @@ TO_SI = {
     "l/min": ("m3/s", 1.0, 6e4),
     "mV": ("V", 1.0, 1e3),
 }
-_NOTHING = 1e-6  # is rounding noise in any of these units
+_ZERO_TOLERANCE = 1e-6  # is rounding noise in any of these units
 
 
-def reading(unit: str, peak: float) -> tuple[str, float]:
+def display_unit(unit: str, peak: float) -> tuple[str, float]:
     """Unit to read numbers up to a peak (in SI) in, and how many of it make one."""
-    for name, scale, start in READING.get(unit, ()):
+    for name, scale, start in DISPLAY_UNITS.get(unit, ()):
         if abs(peak) >= start:
             return name, scale
     return unit, 1.0
 
 
-def number(value: float, digits: int = 3) -> str:
+def format_number(value: float, digits: int = 3) -> str:
     """So many digits before zeros, without an exponent, and 0 for what is rounding noise."""
-    if abs(value) < _NOTHING:
+    if abs(value) < _ZERO_TOLERANCE:
         return "0"
     places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
     text = f"{value:.{places}f}"
     return text.rstrip("0").rstrip(".") if places else text
 
 
-def quantity(value: float, unit: str, digits: int = 3) -> str:
+def format_quantity(value: float, unit: str, digits: int = 3) -> str:
     """A number (in SI) in the unit to read it in: 13.36 t, 4.2 kN, 350 bar."""
-    name, scale = reading(unit, value)
-    return f"{number(scale * value, digits)} {name}"
+    name, scale = display_unit(unit, value)
+    return f"{format_number(scale * value, digits)} {name}"
 
 
-def spellings(unit: str) -> list[str]:
+def accepted_units(unit: str) -> list[str]:
     """An SI unit and the units of a file that are converted to it."""
-    return [unit, *(other for other, (si, _, _) in TO_SI.items() if si == unit)]
+    return [unit, *(other for other, (si, _, _) in SI_CONVERSIONS.items() if si == unit)]

@@ -1,19 +1,46 @@
 """Controllers: forces of the active joints, or signals of valves, from time and motion."""
 
-from crane.control.base import At, Controller, Feedback, Free, Law, TracedController, reference_of
-from crane.control.drive import ValveDrive
-from crane.control.feedforward import ValveFeedforward
-from crane.control.forces import PI, ComputedTorque
-from crane.control.levers import joystick
-from crane.control.names import CONTROLLERS, controller, usual
-from crane.control.openings import fastest, flow_share
-from crane.control.phases import Phases
-from crane.control.tip import TipVelocity
-from crane.control.valves import Command, Sampled, Signals, ValvePD
+from crane.control.control_law import (
+    ControlLaw,
+    Controller,
+    ControllerInputs,
+    FunctionController,
+    TracedController,
+    ZeroForce,
+    controller_reference,
+)
+from crane.control.controller_registry import CONTROLLERS, default_controller_name, make_controller
+from crane.control.force_controllers import PI, ComputedTorque
+from crane.control.lever_phases import LeverPhases
+from crane.control.lever_signals import joystick
+from crane.control.tip_velocity import TipVelocity
+from crane.control.valve_commands import SampledCommand, ValveCommand, ValvePD, ValveSignals
+from crane.control.valve_drive import ValveDrive
+from crane.control.valve_feedforward import ValveFeedforward
+from crane.control.valve_openings import fastest_trajectory, largest_flow_share
 
 __all__ = [
-    "CONTROLLERS", "PI", "At", "Command", "ComputedTorque", "Controller", "Feedback", "Free",
-    "Law", "Phases", "Sampled", "Signals", "TipVelocity", "TracedController", "ValveDrive",
-    "ValveFeedforward", "ValvePD", "controller", "fastest", "flow_share", "joystick",
-    "reference_of", "usual",
-]  # fmt: skip
+    "CONTROLLERS",
+    "PI",
+    "ControllerInputs",
+    "ValveCommand",
+    "ComputedTorque",
+    "Controller",
+    "FunctionController",
+    "ZeroForce",
+    "ControlLaw",
+    "LeverPhases",
+    "SampledCommand",
+    "ValveSignals",
+    "TipVelocity",
+    "TracedController",
+    "ValveDrive",
+    "ValveFeedforward",
+    "ValvePD",
+    "make_controller",
+    "fastest_trajectory",
+    "largest_flow_share",
+    "joystick",
+    "controller_reference",
+    "default_controller_name",
+]

@@ -1,15 +1,20 @@
 """What a machine is described by, whatever file it comes from, and changes of it."""
 
-from crane.description.changes import changed, driven, locked, parameters
-from crane.description.inertia import inertia_problem
+from crane.description.inertia_feasibility import inertia_problem
+from crane.description.machine_lookup import bundled_machines, example_robots
+from crane.description.parameter_changes import (
+    apply_parameter_changes,
+    lock_joints,
+    parameters,
+    set_active_joints,
+)
 from crane.description.sensors import Sensor
-from crane.description.sources import bundled, examples
-from crane.description.spec import (
+from crane.description.specification import (
     LOOP_TYPES,
+    AnyForceElement,
     Chain,
     Coupling,
     Drive,
-    Element,
     EndStop,
     ForceElement,
     Friction,
@@ -22,7 +27,26 @@ from crane.description.spec import (
 )
 
 __all__ = [
-    "LOOP_TYPES", "Chain", "Coupling", "Drive", "Element", "EndStop", "ForceElement", "Friction",
-    "GasSpring", "LoopSpec", "MachineSpec", "PIGains", "Rope", "Sensor", "Task", "bundled",
-    "changed", "driven", "examples", "inertia_problem", "locked", "parameters",
-]  # fmt: skip
+    "LOOP_TYPES",
+    "Chain",
+    "Coupling",
+    "Drive",
+    "AnyForceElement",
+    "EndStop",
+    "ForceElement",
+    "Friction",
+    "GasSpring",
+    "LoopSpec",
+    "MachineSpec",
+    "PIGains",
+    "Rope",
+    "Sensor",
+    "Task",
+    "bundled_machines",
+    "apply_parameter_changes",
+    "set_active_joints",
+    "example_robots",
+    "inertia_problem",
+    "lock_joints",
+    "parameters",
+]

@@ -1,8 +1,8 @@
 """What is wrong with a description: all of it where it is checked, else the first.
 
-Readers raise at the first problem. Within `collecting` they go on instead: `recoverable` writes an
-error down and ends only the part that has it, a link or an item of a section; `flag` does not end
-even that.
+Readers raise at the first problem. Within `collect_findings` they go on instead: `error_recovery`
+writes an error down and ends only the part that has it, a link or an item of a section;
+`report_error` does not end even that.
 """
 
 from collections.abc import Iterator
@@ -12,20 +12,20 @@ from types import TracebackType
 from typing import Any
 
 from crane.common.errors import CraneError
-from crane.common.packages import given
+from crane.common.package_search import load_options
 
-MOST = 200  # findings in one run: who has more has one cause for most of them
+MAX_FINDINGS = 200  # findings in one run: who has more has one cause for most of them
 
 
 class FollowUpError(CraneError):
     """Follows from an error that was noted before: not worth a line of its own."""
 
 
-class TooManyError(CraneError):
+class TooManyFindingsError(CraneError):
     """Enough has been found."""
 
 
-class Anything(tuple[Any, ...]):
+class UnknownNames(tuple[Any, ...]):
     """Names that could not be read: whatever is asked for is among them."""
 
     def __contains__(self, _: object) -> bool:
@@ -34,7 +34,7 @@ class Anything(tuple[Any, ...]):
     def __bool__(self) -> bool:
         return True
 
-    def __add__(self, _: object) -> "Anything":
+    def __add__(self, _: object) -> "UnknownNames":
         return self
 
     __radd__ = __add__
@@ -45,17 +45,17 @@ class Findings:
 
     Attributes:
         errors: In the order in which they were found.
-        files: URDFs that could be parsed.
-        usable: Whether the machine can be assembled in spite of the errors.
-        full: Whether there were more than are noted.
+        parsed_files: URDFs that could be parsed.
+        can_be_assembled: Whether the machine can be assembled in spite of the errors.
+        is_truncated: Whether there were more than are noted.
     """
 
     def __init__(self) -> None:
         self.errors: list[CraneError] = []
-        self.files: list[Any] = []
-        self.usable = True
-        self.full = False
-        self.harmless = 0  # open blocks whose errors do not keep it from being assembled
+        self.parsed_files: list[Any] = []
+        self.can_be_assembled = True
+        self.is_truncated = False
+        self.harmless_depth = 0  # open blocks whose errors do not keep it from being assembled
 
     def add(self, error: CraneError) -> None:
         """Write an error down, once.
@@ -63,33 +63,33 @@ class Findings:
         Raises:
             TooManyError: These are enough.
         """
-        if not self.harmless:
-            self.usable = False
+        if not self.harmless_depth:
+            self.can_be_assembled = False
         if isinstance(error, FollowUpError) or str(error) in map(str, self.errors):
             return
-        if len(self.errors) == MOST:
-            self.full = True
-            raise TooManyError(f"more than {MOST} errors")
+        if len(self.errors) == MAX_FINDINGS:
+            self.is_truncated = True
+            raise TooManyFindingsError(f"more than {MAX_FINDINGS} errors")
         self.errors.append(error)
 
 
-_current: ContextVar[Findings | None] = ContextVar("findings", default=None)
+_current_findings: ContextVar[Findings | None] = ContextVar("findings", default=None)
 
 
 @contextmanager
-def collecting() -> Iterator[Findings]:
-    """Collect what goes wrong within, as far as it is raised within `recoverable`."""
-    found = Findings()
-    token = _current.set(found)
+def collect_findings() -> Iterator[Findings]:
+    """Collect what goes wrong within, as far as it is raised within `error_recovery`."""
+    findings = Findings()
+    token = _current_findings.set(findings)
     try:
-        yield found
-    except TooManyError:
+        yield findings
+    except TooManyFindingsError:
         pass
     finally:
-        _current.reset(token)
+        _current_findings.reset(token)
 
 
-class recoverable:  # noqa: N801  read as a word: `with recoverable():`
+class error_recovery:  # noqa: N801  read as a word: `with recoverable():`
     """A part of a description whose errors end only this part while findings are collected.
 
     An error after others of the same part follows from them and is not noted.
@@ -99,15 +99,15 @@ class recoverable:  # noqa: N801  read as a word: `with recoverable():`
     """
 
     def __init__(self, harmless: bool = False):
-        self._harmless = harmless
-        self._found: Findings | None = None
-        self._before = 0
+        self._is_harmless = harmless
+        self._findings: Findings | None = None
+        self._initial_error_count = 0
 
     def __enter__(self) -> None:
-        self._found = _current.get()
-        if self._found is not None:
-            self._before = len(self._found.errors)
-            self._found.harmless += self._harmless
+        self._findings = _current_findings.get()
+        if self._findings is not None:
+            self._initial_error_count = len(self._findings.errors)
+            self._findings.harmless_depth += self._is_harmless
 
     def __exit__(
         self,
@@ -115,22 +115,22 @@ class recoverable:  # noqa: N801  read as a word: `with recoverable():`
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> bool:
-        found = self._found
-        if found is None:
+        findings = self._findings
+        if findings is None:
             return False
         try:
-            if not isinstance(error, CraneError) or isinstance(error, TooManyError):
+            if not isinstance(error, CraneError) or isinstance(error, TooManyFindingsError):
                 return False
-            if len(found.errors) > self._before:
-                found.usable &= bool(found.harmless)
+            if len(findings.errors) > self._initial_error_count:
+                findings.can_be_assembled &= bool(findings.harmless_depth)
             else:
-                found.add(error)
+                findings.add(error)
             return True
         finally:
-            found.harmless -= self._harmless
+            findings.harmless_depth -= self._is_harmless
 
 
-def flag(error: CraneError, harmless: bool = False) -> None:
+def report_error(error: CraneError, harmless: bool = False) -> None:
     """Raise an error, or write it down where findings are collected.
 
     Args:
@@ -140,34 +140,34 @@ def flag(error: CraneError, harmless: bool = False) -> None:
     Raises:
         CraneError: The error, where findings are not collected.
     """
-    found = _current.get()
-    if found is None:
+    findings = _current_findings.get()
+    if findings is None:
         raise error
-    with recoverable(harmless):
+    with error_recovery(harmless):
         raise error
 
 
 @contextmanager
-def aside() -> Iterator[None]:
+def raise_errors() -> Iterator[None]:
     """Whatever is raised within is raised, and not written down."""
-    token = _current.set(None)
+    token = _current_findings.set(None)
     try:
         yield
     finally:
-        _current.reset(token)
+        _current_findings.reset(token)
 
 
-def remember_file(file: object) -> None:
+def record_parsed_file(file: object) -> None:
     """Keep a parsed file for further checks."""
-    if (found := _current.get()) is not None:
-        found.files.append(file)
+    if (found := _current_findings.get()) is not None:
+        found.parsed_files.append(file)
 
 
 def is_strict() -> bool:
     """Whether what only has an odd form is an error: in a check, and where the user says so."""
-    return going_on() or given().strict
+    return is_collecting() or load_options().strict
 
 
-def going_on() -> bool:
+def is_collecting() -> bool:
     """Whether findings are collected, so that reading goes on after errors."""
-    return _current.get() is not None
+    return _current_findings.get() is not None

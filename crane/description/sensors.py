@@ -18,18 +18,28 @@ from typing import TypeVar
 
 import numpy as np
 
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_number
-from crane.description.tree import Tree
+from crane.description.kinematic_tree import Tree
 
 T = TypeVar("T", float, Array)
 
-SENSOR = "sensor."  # what the names of its numbers begin with
-TIME, VELOCITY, FORCE, INCLINATION = "time", "_velocity", "_force", "inclination_"
-SIGNAL, PRESSURE, SUPPLY, TANK = "voltage_", "pressure_", "pressure_supply", "pressure_tank"
+SENSOR_PREFIX = "sensor."  # what the names of its numbers begin with
+TIME, VELOCITY_SUFFIX, FORCE_SUFFIX, INCLINATION_PREFIX = (
+    "time",
+    "_velocity",
+    "_force",
+    "inclination_",
+)
+VALVE_SIGNAL_PREFIX, PRESSURE_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE = (
+    "voltage_",
+    "pressure_",
+    "pressure_supply",
+    "pressure_tank",
+)
 VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
 FORCE_UNITS = {"rad": "N m", "m": "N"}
-NUMBERS = ("zero", "scale", "delay", "noise")
+SENSOR_PARAMETERS = ("zero", "scale", "delay", "noise")
 
 
 @dataclass(frozen=True)
@@ -60,7 +70,7 @@ class Sensor:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in NUMBERS:
+        for name in SENSOR_PARAMETERS:
             value = as_number(getattr(self, name), f"{name} of a sensor", "")
             if name in ("delay", "noise") and value < 0:
                 raise InputError(f"{name} of a sensor is {value:g}, it must not be negative")
@@ -68,115 +78,126 @@ class Sensor:
             raise InputError("scale of a sensor is 0, which tells nothing, give another")
 
     @property
-    def ideal(self) -> bool:
+    def is_ideal(self) -> bool:
         """Whether readings are the quantity itself."""
         return (self.zero, self.scale, self.delay) == (0.0, 1.0, 0.0)
 
-    def out(self, x: T) -> T:
+    def apply(self, quantity: T) -> T:
         """Of what enters: scale x + zero."""
-        return self.scale * x + self.zero
+        return self.scale * quantity + self.zero
 
-    def into(self, y: T) -> T:
+    def invert(self, reading: T) -> T:
         """What entered: (y - zero) / scale."""
-        return (y - self.zero) / self.scale
+        return (reading - self.zero) / self.scale
 
-    def quantity(self, name: str, time: Array, reading: Array) -> Array:
+    def correct_readings(self, quantity_name: str, time: Array, readings: Array) -> Array:
         """What a channel (N,) of a log stands for; where it ends first, its end goes on.
 
         Raises:
             InputError: A signal is late, which its valve would have to be.
         """
-        if name.startswith(SIGNAL):
+        if quantity_name.startswith(VALVE_SIGNAL_PREFIX):
             if self.delay:
-                raise late_signal(name, name)
-            return self.out(reading)
-        moved = np.interp(time + self.delay, time, reading) if self.delay else reading
-        return self.into(moved)
+                raise signal_delay_error(quantity_name, quantity_name)
+            return self.apply(readings)
+        undelayed = np.interp(time + self.delay, time, readings) if self.delay else readings
+        return self.invert(undelayed)
 
-    def numbers(self) -> dict[str, float]:
+    def parameters(self) -> dict[str, float]:
         """By the last word of their names."""
-        return {name: getattr(self, name) for name in NUMBERS}
+        return {name: getattr(self, name) for name in SENSOR_PARAMETERS}
 
 
-def unit_of(tree: Tree, name: str) -> str | None:
+def quantity_unit(tree: Tree, name: str) -> str | None:
     """SI unit of a quantity of a machine, None if it has none of that name."""
-    fixed = {TIME: "s", SUPPLY: "Pa", TANK: "Pa"}
-    if name in fixed:
-        return fixed[name]
-    kinds = {x.name: "m" if x.kind == "prismatic" else "rad" for x in tree.moving}
-    if name in kinds:
-        return kinds[name]
-    for end, units in ((VELOCITY, VELOCITY_UNITS), (FORCE, FORCE_UNITS)):
-        if (joint := name.removesuffix(end)) != name and joint in kinds:
-            return units[kinds[joint]]
-    if (what := name.removeprefix(INCLINATION)) != name:
-        if what in tree.links:
+    fixed_units = {TIME: "s", SUPPLY_PRESSURE: "Pa", TANK_PRESSURE: "Pa"}
+    if name in fixed_units:
+        return fixed_units[name]
+    joint_units = {x.name: "m" if x.kind == "prismatic" else "rad" for x in tree.moving_joints}
+    if name in joint_units:
+        return joint_units[name]
+    for suffix, units in ((VELOCITY_SUFFIX, VELOCITY_UNITS), (FORCE_SUFFIX, FORCE_UNITS)):
+        if (joint := name.removesuffix(suffix)) != name and joint in joint_units:
+            return units[joint_units[joint]]
+    if (link_name := name.removeprefix(INCLINATION_PREFIX)) != name:
+        if link_name in tree.links:
             return "rad"
-        return "rad/s" if what.removesuffix(VELOCITY) in tree.links else None
+        return "rad/s" if link_name.removesuffix(VELOCITY_SUFFIX) in tree.links else None
     chambers, spools = ("_a", "_b"), ("", "_b")
-    for head, unit, ends in (
-        (PRESSURE, "Pa", chambers), (SIGNAL, "V", spools), ("spool_", "", spools),
-    ):  # fmt: skip
-        for end in ends:
-            if name.startswith(head) and name.endswith(end):
-                joint = name[len(head) : len(name) - len(end)]
-                if joint in kinds:
+    for prefix, unit, suffixes in (
+        (PRESSURE_PREFIX, "Pa", chambers),
+        (VALVE_SIGNAL_PREFIX, "V", spools),
+        ("spool_", "", spools),
+    ):
+        for suffix in suffixes:
+            if name.startswith(prefix) and name.endswith(suffix):
+                joint = name[len(prefix) : len(name) - len(suffix)]
+                if joint in joint_units:
                     return unit
     return None
 
 
-def quantities(tree: Tree) -> list[str]:
+def quantity_names(tree: Tree) -> list[str]:
     """Names of what sensors of a machine can measure."""
-    joints = [joint.name for joint in tree.moving]
-    names = [TIME, SUPPLY, TANK]
-    names += [x + end for x in joints for end in ("", VELOCITY, FORCE)]
-    names += [f"{PRESSURE}{x}_{side}" for x in joints for side in "ab"]
-    names += [head + x for x in joints for head in (SIGNAL, "spool_")]
-    return names + [INCLINATION + link + end for link in tree.links for end in ("", VELOCITY)]
+    joints = [joint.name for joint in tree.moving_joints]
+    names = [TIME, SUPPLY_PRESSURE, TANK_PRESSURE]
+    names += [x + end for x in joints for end in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)]
+    names += [f"{PRESSURE_PREFIX}{x}_{side}" for x in joints for side in "ab"]
+    names += [head + x for x in joints for head in (VALVE_SIGNAL_PREFIX, "spool_")]
+    return names + [
+        INCLINATION_PREFIX + link + end for link in tree.links for end in ("", VELOCITY_SUFFIX)
+    ]
 
 
-def parsed(name: str) -> tuple[str, str]:
+def parse_sensor_parameter(name: str) -> tuple[str, str]:
     """Quantity and number of 'sensor.QUANTITY.zero'.
 
     Raises:
         InputError: A sensor has no such number.
     """
-    quantity, _, what = name.removeprefix(SENSOR).rpartition(".")
-    if what not in NUMBERS:
-        raise InputError(f"'{name}': a sensor has no '{what}', {known(NUMBERS, what)}")
-    if what == "delay" and quantity.startswith(SIGNAL):
-        raise late_signal(name, quantity)
-    return quantity, what
+    quantity, _, parameter = name.removeprefix(SENSOR_PREFIX).rpartition(".")
+    if parameter not in SENSOR_PARAMETERS:
+        raise InputError(
+            f"'{name}': a sensor has no '{parameter}', "
+            f"{suggest_names(SENSOR_PARAMETERS, parameter)}"
+        )
+    if parameter == "delay" and quantity.startswith(VALVE_SIGNAL_PREFIX):
+        raise signal_delay_error(name, quantity)
+    return quantity, parameter
 
 
-def late_signal(name: str, quantity: str) -> InputError:
+def signal_delay_error(parameter_name: str, quantity: str) -> InputError:
     """What to say of a delay that a signal is given by a name."""
-    joint = quantity.removeprefix(SIGNAL)
-    return InputError(f"'{name}': a signal is not late, its valve is: give 'valve.{joint}.delay'")
+    joint = quantity.removeprefix(VALVE_SIGNAL_PREFIX)
+    return InputError(
+        f"'{parameter_name}': a signal is not late, its valve is: give 'valve.{joint}.delay'"
+    )
 
 
-def with_numbers(sensors: Mapping[str, Sensor], numbers: Mapping[str, float]) -> dict[str, Sensor]:
+def with_sensor_parameters(
+    sensors: Mapping[str, Sensor], values: Mapping[str, float]
+) -> dict[str, Sensor]:
     """Sensors with other numbers, by names such as 'sensor.q2.zero'.
 
     Raises:
         InputError: A sensor has no such number, or cannot have that value.
     """
     found = dict(sensors)
-    for name, value in numbers.items():
-        quantity, what = parsed(name)
+    for name, value in values.items():
+        quantity, parameter = parse_sensor_parameter(name)
         try:
-            found[quantity] = replace(found.get(quantity, Sensor()), **{what: value})  # type: ignore[arg-type]
+            found[quantity] = replace(found.get(quantity, Sensor()), **{parameter: value})  # type: ignore[arg-type]
         except InputError as error:
             raise InputError(f"'{name}': {error}") from None
     return found
 
 
-def named_numbers(sensors: Mapping[str, Sensor]) -> dict[str, float]:
+def sensor_parameters(sensors: Mapping[str, Sensor]) -> dict[str, float]:
     """Numbers of sensors by name."""
     return {
-        f"{SENSOR}{quantity}.{what}": value
+        f"{SENSOR_PREFIX}{quantity}.{what}": value
         for quantity, sensor in sensors.items()
         if quantity != TIME
-        for what, value in sensor.numbers().items()
-        if what != "delay" or not quantity.startswith(SIGNAL)
+        for what, value in sensor.parameters().items()
+        if what != "delay" or not quantity.startswith(VALVE_SIGNAL_PREFIX)
     }

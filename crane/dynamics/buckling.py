@@ -7,20 +7,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_samples
-from crane.common.shown import Brief
 from crane.hydraulics.components import Cylinder
 from crane.machine import Machine
 
-STEEL = 2.1e11  # [Pa] Young's modulus
-_TURNING = ("revolute", "spherical", "cylindrical")  # loops that hold an end as a pin does
-_SAME = 1e-6  # of the machine's size, that joints of one pin lie apart
-_HALVINGS = 60
-_LEAST = 1e-9  # of the whole length, that a rod sticks out at least
+YOUNGS_MODULUS_STEEL = 2.1e11  # [Pa] Young's modulus
+_PIN_LOOP_TYPES = ("revolute", "spherical", "cylindrical")  # loops that hold an end as a pin does
+_SAME_PIN_TOLERANCE = 1e-6  # of the machine's size, that joints of one pin lie apart
+_BISECTION_STEPS = 60
+_MIN_ROD_RATIO = 1e-9  # of the whole length, that a rod sticks out at least
 
 
 @dataclass(frozen=True)
-class Column:
+class CylinderColumn:
     """A cylinder between two pins, or several side by side.
 
     Attributes:
@@ -29,10 +29,10 @@ class Column:
         bore: Of one of them [m].
         rod: Diameter of its rod [m].
         tube: Outer diameter of its tube [m]; 0 where it is not known.
-        start: From one pin to the other at q = 0, in the frame of what carries the joint [m].
-        axis: Of the slide in that frame, a unit vector.
-        lower: Least coordinate of the joint [m].
-        upper: Largest.
+        pin_offset: From one pin to the other at q = 0, in the frame of what carries the joint [m].
+        slide_axis: Of the slide in that frame, a unit vector.
+        lower_limit: Least coordinate of the joint [m].
+        upper_limit: Largest.
     """
 
     joint: str
@@ -40,20 +40,20 @@ class Column:
     bore: float
     rod: float
     tube: float
-    start: Array
-    axis: Array
-    lower: float
-    upper: float
+    pin_offset: Array
+    slide_axis: Array
+    lower_limit: float
+    upper_limit: float
 
-    def length(self, x: ArrayLike) -> Array:
+    def pin_distance(self, x: ArrayLike) -> Array:
         """Pin to pin [m] at coordinates x of the joint [m], any shape."""
-        way = self.start + np.asarray(x, dtype=np.float64)[..., None] * self.axis
-        return np.asarray(np.linalg.norm(way, axis=-1))
+        pin_vector = self.pin_offset + np.asarray(x, dtype=np.float64)[..., None] * self.slide_axis
+        return np.asarray(np.linalg.norm(pin_vector, axis=-1))
 
     @property
-    def pushes(self) -> float:
+    def compression_sign(self) -> float:
         """1 where a force in the joint's direction presses the rod, -1 where it pulls it."""
-        first, last = self.length([self.lower, self.upper])
+        first, last = self.pin_distance([self.lower_limit, self.upper_limit])
         return 1.0 if last > first else -1.0
 
     @property
@@ -63,11 +63,11 @@ class Column:
         With the rod in, all but what sticks out then: one bore, or a fourth of what the cylinder
         has beside its stroke where that is less, as `crane.add_cylinder` builds them.
         """
-        ends = self.length([self.lower, self.upper])
-        least, stroke = float(ends.min()), self.upper - self.lower
+        ends = self.pin_distance([self.lower_limit, self.upper_limit])
+        least, stroke = float(ends.min()), self.upper_limit - self.lower_limit
         return least - min(self.bore, (least - stroke) / 4)
 
-    def euler(self, x: ArrayLike) -> Array:
+    def euler_load(self, x: ArrayLike) -> Array:
         """Euler's load of a rod that reaches from pin to pin: pi^2 E I / L^2.
 
         On the safe side wherever the tube is the stiffer part.
@@ -78,9 +78,9 @@ class Column:
         Returns:
             The same shape, of all side by side [N].
         """
-        return np.pi**2 * self.count * _stiffness(self.rod) / self.length(x) ** 2
+        return np.pi**2 * self.count * _bending_stiffness(self.rod) / self.pin_distance(x) ** 2
 
-    def load(self, x: ArrayLike) -> Array:
+    def buckling_load(self, x: ArrayLike) -> Array:
         """The load that buckles it: of rod and tube where the tube is known, else Euler's.
 
         Both parts bend as y'' = -k_i^2 y, k_i = sqrt(P / (E I_i)), from pins that hold no moment.
@@ -103,26 +103,29 @@ class Column:
         Elastic Stability, 2.14.
         """
         if not self.tube:
-            return self.euler(x)
-        whole = self.length(x)
-        out = np.maximum(whole - self.tube_length, _LEAST * whole)
+            return self.euler_load(x)
+        total_length = self.pin_distance(x)
+        rod_length = np.maximum(total_length - self.tube_length, _MIN_ROD_RATIO * total_length)
         parts = (
-            (_stiffness(self.tube, self.bore), np.asarray(whole - out)),
-            (_stiffness(self.rod), out),
+            (_bending_stiffness(self.tube, self.bore), np.asarray(total_length - rod_length)),
+            (_bending_stiffness(self.rod), rod_length),
         )
-        low = np.zeros_like(whole)
+        low = np.zeros_like(total_length)
         high = np.minimum(*(np.pi**2 * stiff / length**2 for stiff, length in parts))
-        for _ in range(_HALVINGS):
+        for _ in range(_BISECTION_STEPS):
             middle = 0.5 * (low + high)
-            falling = np.zeros_like(whole)
-            for stiff, length in parts:
-                k = np.sqrt(middle / stiff)
-                falling += k / np.tan(k * length)
-            low, high = np.where(falling > 0, middle, low), np.where(falling > 0, high, middle)
+            characteristic = np.zeros_like(total_length)
+            for bending_stiffness, length in parts:
+                k = np.sqrt(middle / bending_stiffness)
+                characteristic += k / np.tan(k * length)
+            low, high = (
+                np.where(characteristic > 0, middle, low),
+                np.where(characteristic > 0, high, middle),
+            )
         return np.asarray(self.count * 0.5 * (low + high))
 
 
-class Buckling(Brief):
+class Buckling(OneLineRepr):
     """Whether a machine's cylinders buckle.
 
     A cylinder counts that lies in a loop and has one pin at either end, so that what its ends are
@@ -134,7 +137,7 @@ class Buckling(Brief):
 
     Attributes:
         columns: Those that count, by joint.
-        left_out: The others, and why, by joint.
+        unsupported: The others, and why, by joint.
 
     Raises:
         InputError: It has no circuit.
@@ -146,17 +149,17 @@ class Buckling(Brief):
                 f"'{machine.name}' has no cylinders, give it a circuit under 'hydraulics'"
             )
         self.machine = machine
-        self.columns: dict[str, Column] = {}
-        self.left_out: dict[str, str] = {}
+        self.columns: dict[str, CylinderColumn] = {}
+        self.unsupported: dict[str, str] = {}
         for joint, cylinder in machine.hydraulics.cylinders.items():
-            made = _column(machine, cylinder)
+            made = _cylinder_column(machine, cylinder)
             if isinstance(made, str):
-                self.left_out[joint] = made
+                self.unsupported[joint] = made
             else:
                 self.columns[joint] = made
 
-    def loads(self, q_a: ArrayLike) -> Array:
-        """The loads that buckle the cylinders, see `Column.load`.
+    def buckling_loads(self, q_a: ArrayLike) -> Array:
+        """The loads that buckle the cylinders, see `CylinderColumn.buckling_load`.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -168,16 +171,16 @@ class Buckling(Brief):
         given = as_samples(q_a, len(active), "q_a", active)
         out = np.empty((*given.shape[:-1], len(self.columns)))
         for i, (joint, column) in enumerate(self.columns.items()):
-            out[..., i] = column.load(given[..., active.index(joint)])
+            out[..., i] = column.buckling_load(given[..., active.index(joint)])
         return out
 
-    def margins(self, q_a: ArrayLike, tau_a: ArrayLike) -> Array:
+    def buckling_margins(self, q_a: ArrayLike, tau_a: ArrayLike) -> Array:
         """How many times the force that presses a cylinder buckles it.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             tau_a: The same shape, forces of the active joints, as of `Dynamics.inverse` or
-                `Reactions.drives` [N], [N m].
+                `Reactions.drive_forces` [N], [N m].
 
         Returns:
             (c,) or (N, c) in the order of `columns`: 1 at the load that buckles it, more below it,
@@ -187,25 +190,27 @@ class Buckling(Brief):
             InputError: Shapes that do not go together.
         """
         active = self.machine.active
-        loads = self.loads(q_a)
+        loads = self.buckling_loads(q_a)
         forces = as_samples(tau_a, len(active), "tau_a", active)
         if forces.shape[:-1] != loads.shape[:-1]:
             raise InputError(
                 f"q_a and tau_a have the shapes {np.shape(q_a)} and {forces.shape}, give the same"
             )
-        which = [active.index(joint) for joint in self.columns]
-        pressed = forces[..., which] * [column.pushes for column in self.columns.values()]
+        active_indices = [active.index(joint) for joint in self.columns]
+        compressive_forces = forces[..., active_indices] * [
+            column.compression_sign for column in self.columns.values()
+        ]
         out = np.full_like(loads, np.inf)
-        np.divide(loads, pressed, out=out, where=pressed > 0)
+        np.divide(loads, compressive_forces, out=out, where=compressive_forces > 0)
         return out
 
 
-def _stiffness(outer: float, inner: float = 0.0) -> float:
+def _bending_stiffness(outer: float, inner: float = 0.0) -> float:
     """E I of a round bar or tube [N m2]."""
-    return STEEL * np.pi / 64 * (outer**4 - inner**4)
+    return YOUNGS_MODULUS_STEEL * np.pi / 64 * (outer**4 - inner**4)
 
 
-def _column(machine: Machine, cylinder: Cylinder) -> Column | str:
+def _cylinder_column(machine: Machine, cylinder: Cylinder) -> CylinderColumn | str:
     """A cylinder as a column, or why it is none."""
     index = machine.column(cylinder.joint)
     if machine.unit(cylinder.joint) != "m":
@@ -217,14 +222,19 @@ def _column(machine: Machine, cylinder: Cylinder) -> Column | str:
     joint = int(machine.coordinates.joints[index])
     carrier = int(machine.model.parents[joint])
     for body in (carrier, joint):
-        places, turns = zip(*_held(machine, body, joint), strict=True) if body else ((), ())
+        places, turns = (
+            zip(*_pins_of_body(machine, body, joint), strict=True) if body else ((), ())
+        )
         if not places or not all(turns):
             return "one of its ends is no pin"
-        if np.ptp(places, axis=0).max() > _SAME * machine.closure.size:
+        if (
+            np.ptp(places, axis=0).max()
+            > _SAME_PIN_TOLERANCE * machine.closure.characteristic_length
+        ):
             return "one of its ends has more than one pin"
     slide, limits = machine.tree.joints[cylinder.joint], machine.coordinates
     placed = machine.model.jointPlacements[joint]
-    return Column(
+    return CylinderColumn(
         cylinder.joint,
         cylinder.count,
         cylinder.bore,
@@ -237,15 +247,15 @@ def _column(machine: Machine, cylinder: Cylinder) -> Column | str:
     )
 
 
-def _held(machine: Machine, body: int, slide: int) -> Iterator[tuple[Array, bool]]:
+def _pins_of_body(machine: Machine, body: int, slide_joint: int) -> Iterator[tuple[Array, bool]]:
     """Where the joints and loops of a body are but its slide, and whether they are pins."""
     model, equations = machine.model, machine.closure.equations
     for joint in range(1, model.njoints):
         turns = "JointModelR" in model.joints[joint].shortname()
-        if joint != slide and joint == body:
+        if joint != slide_joint and joint == body:
             yield np.zeros(3), turns
-        if joint != slide and model.parents[joint] == body:
+        if joint != slide_joint and model.parents[joint] == body:
             yield model.jointPlacements[joint].translation.copy(), turns
     for i, (of, place) in enumerate(equations.frames):
         if of == body:
-            yield place.translation.copy(), equations.loops[i // 2].type in _TURNING
+            yield place.translation.copy(), equations.loops[i // 2].type in _PIN_LOOP_TYPES

@@ -6,23 +6,33 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.closure.traced import geometry_of
-from crane.codegen import TooLongError, carefully
-from crane.common.errors import InputError, MechanismError, known
-from crane.common.samples import Array, as_number, as_samples, per_sample, solve
-from crane.common.shown import Brief
-from crane.description.external import PARTS
-from crane.dynamics.compiled import FRICTION, SLOPES, NamedCode, QuantityCode
-from crane.dynamics.frames import FrameJacobians
+from crane.closure.kinematics_formulas import tree_geometry
+from crane.codegen import FormulaTooLongError, run_with_fallback
+from crane.common.errors import InputError, MechanismError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array, apply_per_sample, as_number, as_samples, solve_linear
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics.compiled_dynamics import (
+    DERIVATIVES_OF,
+    WITH_FRICTION,
+    CompiledParameterDerivatives,
+    CompiledQuantity,
+)
+from crane.dynamics.constant_derivatives import ConstantDerivatives
+from crane.dynamics.dynamics_formulas import (
+    FormulaStructure,
+    circuit_friction_indices,
+    dynamics_constants,
+    stick_slip_mode_indices,
+)
+from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
-from crane.dynamics.named import Named
-from crane.dynamics.traced import Form, grips_at, modes_at, numbers_of
-from crane.dynamics.tree import TreeDynamics
+from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.machine import Machine
-from crane.machine.masses import has_mass
+from crane.machine.mass_checks import has_mass
 
 BACKENDS = ("compiled", "pinocchio")
-ARGUMENTS = {  # of the quantities that `derivatives` takes
+QUANTITY_ARGUMENTS = {  # of the quantities that `derivatives` takes
     "inverse": ("q_a", "v_a", "a_a"),
     "forward": ("q_a", "v_a", "tau_a"),
     "mass_matrix": ("q_a",),
@@ -36,7 +46,7 @@ ARGUMENTS = {  # of the quantities that `derivatives` takes
 }
 
 
-class Dynamics(Brief):
+class Dynamics(OneLineRepr):
     """Dynamics of a machine in its active coordinates, without multipliers.
 
     The tree's dynamics projected by gamma (Park, Choi, Ploen 1999), equations (4) and (6) of the
@@ -68,7 +78,7 @@ class Dynamics(Brief):
 
     def __init__(self, machine: Machine, formulation: str = "exact", backend: str = "compiled"):
         if backend not in BACKENDS:
-            raise InputError(f"backend '{backend}' is unknown, {known(BACKENDS, backend)}")
+            raise InputError(f"backend '{backend}' is unknown, {suggest_names(BACKENDS, backend)}")
         if not isinstance(machine, Machine):
             raise InputError(f"{machine!r} is not a machine, load it with crane.load")
         if not has_mass(machine.model):
@@ -78,23 +88,31 @@ class Dynamics(Brief):
             )
         self.machine, self.formulation = machine, formulation
         self.forces = JointForces(machine)
-        self.form = Form.of(machine, formulation, self.forces)
-        self.backend = backend if machine.closure.compiled else "pinocchio"
-        self.tree = TreeDynamics(machine, self.forces, self.form.carriers)
-        self._formulas: dict[str, QuantityCode | None] = {}
-        self._named_codes: dict[tuple[str, tuple[str, ...]], NamedCode] = {}
+        self.formula_structure = FormulaStructure.from_machine(machine, formulation, self.forces)
+        self.backend = backend if machine.closure.is_compiled else "pinocchio"
+        self.tree_dynamics = PinocchioDynamics(
+            machine, self.forces, self.formula_structure.carrier_bodies
+        )
+        self._compiled_quantities: dict[str, CompiledQuantity | None] = {}
+        self._parameter_derivatives: dict[
+            tuple[str, tuple[str, ...]], CompiledParameterDerivatives
+        ] = {}
         self.numbers = np.zeros(0)
         if self.backend == "compiled":
-            geometry = machine.closure.fast.geometry
-            self.numbers = np.ascontiguousarray(numbers_of(machine, geometry, self.forces))
+            geometry = machine.closure.compiled_closure.geometry
+            self.numbers = np.ascontiguousarray(dynamics_constants(machine, geometry, self.forces))
         # what becomes part of formulas; not what changes with the motion
-        self.pattern = self.numbers.copy()
-        self._modes = modes_at(machine, self.forces) if self.backend == "compiled" else []
-        self.pattern[self._modes] = np.nan
-        self._grips = grips_at(machine, self.forces) if self.backend == "compiled" else []
-        self.pattern[self._grips] = np.nan
+        self.constant_pattern = self.numbers.copy()
+        self._mode_indices = (
+            stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
+        )
+        self.constant_pattern[self._mode_indices] = np.nan
+        self._circuit_friction_indices = (
+            circuit_friction_indices(machine, self.forces) if self.backend == "compiled" else []
+        )
+        self.constant_pattern[self._circuit_friction_indices] = np.nan
 
-    def _line(self) -> str:
+    def _one_line(self) -> str:
         """Of what, and how it is computed."""
         return f"Dynamics of '{self.machine.name}', {self.backend}"
 
@@ -106,7 +124,7 @@ class Dynamics(Brief):
         I_xz, I_yz, I_zz [kg, kg m, kg m2]. After them the rotor inertias that are not zero, nr of
         them, in the same order [kg m2], [kg].
         """
-        return self.tree.parameters
+        return self.tree_dynamics.inertial_parameters
 
     def inverse(
         self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, friction: bool = False
@@ -165,13 +183,16 @@ class Dynamics(Brief):
         Source: Featherstone 2008, Rigid Body Dynamics Algorithms, 9.2 (hybrid dynamics); Spong
         1994, Partial feedback linearization of underactuated mechanical systems (collocated).
         """
-        a_a = self.machine.spread(a_d, "a_d")
+        a_a = self.machine.expand_driven(a_d, "a_d")
         c = self.inverse(q_a, v_a, a_a, friction)
-        driven = self.machine.driven
+        driven = self.machine.is_driven
         mass = self.mass_matrix(q_a)
-        across, own = mass[..., driven, :][..., ~driven], mass[..., ~driven, :][..., ~driven]
-        a_f = -solve(own, c[..., ~driven, None])
-        return c[..., driven] + (across @ a_f)[..., 0], a_f[..., 0]
+        coupling_block, free_block = (
+            mass[..., driven, :][..., ~driven],
+            mass[..., ~driven, :][..., ~driven],
+        )
+        a_f = -solve_linear(free_block, c[..., ~driven, None])
+        return c[..., driven] + (coupling_block @ a_f)[..., 0], a_f[..., 0]
 
     def mass_matrix(self, q_a: ArrayLike) -> Array:
         """M_A = gamma^T M gamma.
@@ -182,7 +203,7 @@ class Dynamics(Brief):
         Returns:
             (n, n) or (N, n, n) [kg], [kg m], [kg m2].
         """
-        return self._evaluate("mass matrix", (self._n, self._n), q_a)
+        return self._evaluate("mass matrix", (self._mobility, self._mobility), q_a)
 
     def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Active forces at zero acceleration: gamma^T (rnea(q, v, drift) - f).
@@ -231,7 +252,7 @@ class Dynamics(Brief):
         """
         return self._evaluate("passive", (), q_a, v_a)
 
-    def applied(self, q_a: ArrayLike, wrenches: Mapping[str, ArrayLike]) -> Array:
+    def project_wrenches(self, q_a: ArrayLike, wrenches: Mapping[str, ArrayLike]) -> Array:
         """What wrenches from outside do at the active joints: gamma^T sum J^T w.
 
         M_A a_A + bias = tau_A + applied: the active forces of a motion under them are `inverse`
@@ -249,9 +270,9 @@ class Dynamics(Brief):
         Raises:
             InputError: Unknown link, or shapes that do not go together.
         """
-        q_a = as_samples(q_a, self._n, "q_a", self.machine.active)
+        q_a = as_samples(q_a, self._mobility, "q_a", self.machine.active)
         given = {
-            link: as_samples(wrench, 6, f"the wrench on '{link}'", PARTS)
+            link: as_samples(wrench, 6, f"the wrench on '{link}'", WRENCH_COMPONENTS)
             for link, wrench in wrenches.items()
         }
         for link in given:
@@ -262,14 +283,14 @@ class Dynamics(Brief):
                 f"stacks of {sorted(lengths)} samples do not go together, give equal N"
             )
         stacked, count = bool(lengths), lengths.pop() if lengths else 1
-        q = self.machine.closure.solve(np.broadcast_to(q_a, (count, self._n)))
-        out = np.zeros((count, self._n))
+        q = self.machine.closure.solve(np.broadcast_to(q_a, (count, self._mobility)))
+        out = np.zeros((count, self._mobility))
         jacobians = FrameJacobians(self.machine)
         rows = {link: np.broadcast_to(wrench, (count, 6)) for link, wrench in given.items()}
         for i, gamma in enumerate(self.machine.closure.gamma(q)):
-            jacobians.place(q[i])
+            jacobians.set_configuration(q[i])
             for link, wrench in rows.items():
-                out[i] += gamma.T @ (jacobians.of(link).T @ wrench[i])
+                out[i] += gamma.T @ (jacobians.jacobian(link).T @ wrench[i])
         return out if stacked else out[0]
 
     def energy(self, q_a: ArrayLike, v_a: ArrayLike) -> tuple[Array, Array]:
@@ -298,7 +319,7 @@ class Dynamics(Brief):
         """
         model = self.machine.model
         size = 10 * (model.njoints - 1) + np.count_nonzero(model.armature)
-        return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
+        return self._evaluate("regressor", (self._mobility, size), q_a, v_a, a_a, "a_a")
 
     def derivatives(
         self,
@@ -315,10 +336,10 @@ class Dynamics(Brief):
         By the state and the second argument, along the motions of the active joints:
         dq = gamma dq_A (of a floating base along its twist). By numbers of the machine at the same
         q_A, v_A and second argument: J_P dq_P = -(dphi/dp) dp. Inverse and forward dynamics
-        without floating bases have formulas of their own (`crane.dynamics.sensitivity`), which
-        cost a few evaluations; everything else is differentiated operation by operation. Friction
-        that sticks has, at rest, the derivatives of its offset alone; an end stop those of the
-        side that it is on.
+        without floating bases have formulas of their own (`crane.dynamics.dynamics_derivatives`),
+        which cost a few evaluations; everything else is differentiated operation by operation.
+        Friction that sticks has, at rest, the derivatives of its offset alone; an end stop those
+        of the side that it is on.
 
         Args:
             quantity: "inverse", "forward", "mass_matrix", "bias", "gravity", "friction",
@@ -341,19 +362,21 @@ class Dynamics(Brief):
             InputError: An unknown quantity or name, a missing argument, or a machine whose
                 formulas take too long to compile.
         """
-        if quantity not in ARGUMENTS:
-            raise InputError(f"quantity '{quantity}' is unknown, {known(ARGUMENTS, quantity)}")
-        n, asked = self._n, ARGUMENTS[quantity]
+        if quantity not in QUANTITY_ARGUMENTS:
+            raise InputError(
+                f"quantity '{quantity}' is unknown, {suggest_names(QUANTITY_ARGUMENTS, quantity)}"
+            )
+        n, arguments = self._mobility, QUANTITY_ARGUMENTS[quantity]
         if friction and quantity not in ("inverse", "forward"):
             raise InputError(
                 f"'{quantity}' is without friction or with its own, leave friction out"
             )
         rows: dict[str, Array] = {}
-        for name, given in zip(asked, (q_a, v_a, x), strict=False):
+        for name, given in zip(arguments, (q_a, v_a, x), strict=False):
             if given is None:
                 raise InputError(f"derivatives of '{quantity}' need {name}, give it")
             rows[name] = as_samples(given, n, name, self.machine.active)
-        by = asked if by is None else by
+        by = arguments if by is None else by
         lengths = {len(array) for array in rows.values() if array.ndim == 2}
         if len(lengths) > 1:
             raise InputError(
@@ -363,32 +386,32 @@ class Dynamics(Brief):
         stacked = any(array.ndim == 2 for array in rows.values())
         q = self.machine.closure.solve(np.broadcast_to(rows["q_a"], (count, n)))
         inputs = np.zeros((count, 2 * n))
-        for i, name in enumerate(asked[1:]):
+        for i, name in enumerate(arguments[1:]):
             inputs[:, i * n : (i + 1) * n] = rows[name]
-        key = quantity.replace("_", " ") + (FRICTION if friction else "")
-        shape = self.shape(quantity)
-        states = [name for name in by if name in asked]
-        numbers = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
-        if wrong := [name for name in by if name not in (*states, *numbers)]:
-            hint = known(asked, wrong[0])
-            raise InputError(f"'{quantity}' does not depend on '{wrong[0]}', {hint}")
+        key = quantity.replace("_", " ") + (WITH_FRICTION if friction else "")
+        shape = self.result_shape(quantity)
+        states = [name for name in by if name in arguments]
+        formula_constants = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
+        if unknown_names := [name for name in by if name not in (*states, *formula_constants)]:
+            hint = suggest_names(arguments, unknown_names[0])
+            raise InputError(f"'{quantity}' does not depend on '{unknown_names[0]}', {hint}")
         found: dict[str, Array] = {}
         if states:
-            formula = self._compiled(SLOPES + key)
+            formula = self._required_formula(DERIVATIVES_OF + key)
             flat = np.empty((count, formula.size))
-            formula.along(np.ascontiguousarray(q), inputs, flat)
+            formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, flat)
             parts = flat.reshape(count, 3, *shape, n)
-            found = {name: parts[:, asked.index(name)].copy() for name in states}
-        if numbers:
-            code = self._named_code(key, numbers)
-            every = np.array([code.at(*row) for row in zip(q, inputs, strict=True)])
-            every = every.reshape(count, *shape, len(numbers))
-            found |= {name: every[..., i].copy() for i, name in enumerate(numbers)}
+            found = {name: parts[:, arguments.index(name)].copy() for name in states}
+        if formula_constants:
+            code = self._parameter_derivative_code(key, formula_constants)
+            every = np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
+            every = every.reshape(count, *shape, len(formula_constants))
+            found |= {name: every[..., i].copy() for i, name in enumerate(formula_constants)}
         return {name: found[name] if stacked else found[name][0] for name in by}
 
-    def shape(self, quantity: str) -> tuple[int, ...]:
+    def result_shape(self, quantity: str) -> tuple[int, ...]:
         """Of one sample of a quantity that `derivatives` takes."""
-        n, model = self._n, self.machine.model
+        n, model = self._mobility, self.machine.model
         shapes = {
             "mass_matrix": (n, n),
             "energy": (2,),
@@ -397,41 +420,51 @@ class Dynamics(Brief):
         }
         return shapes.get(quantity, (n,))
 
-    def _compiled(self, quantity: str) -> QuantityCode:
-        formula = self._formula(quantity)
+    def _required_formula(self, quantity: str) -> CompiledQuantity:
+        formula = self._compiled_quantity(quantity)
         if formula is None:
             raise InputError(
                 f"'{self.machine.name}' has no formulas to differentiate, "
                 + (
                     "take the compiled backend"
-                    if self.machine.closure.compiled and self.backend != "compiled"
+                    if self.machine.closure.is_compiled and self.backend != "compiled"
                     else "it is too large: lock joints"
                 )
             )
         return formula
 
-    def _named_code(self, quantity: str, names: Sequence[str]) -> NamedCode:
+    def _parameter_derivative_code(
+        self, quantity: str, names: Sequence[str]
+    ) -> CompiledParameterDerivatives:
         """Machine code of derivatives by numbers of the machine."""
-        self._compiled(quantity)
+        self._required_formula(quantity)
         key = quantity, tuple(names)
-        if key not in self._named_codes:
+        if key not in self._parameter_derivatives:
             closure = self.machine.closure
-            constants = Named(self.machine).slopes(names, self.constants)
-            geometry, numbers = np.split(constants, [len(closure.fast.geometry.numbers)], axis=1)
-            geometry[:, -1] = 0.0  # the size that residuals are measured by
-            self._named_codes[key] = NamedCode(
-                quantity, self.machine, self.numbers, self.pattern, self.form, geometry, numbers
+            constants = ConstantDerivatives(self.machine).jacobian(names, self.constants_of)
+            geometry, numbers = np.split(
+                constants, [len(closure.compiled_closure.geometry.constants)], axis=1
             )
-        return self._named_codes[key]
+            geometry[:, -1] = 0.0  # the size that residuals are measured by
+            self._parameter_derivatives[key] = CompiledParameterDerivatives(
+                quantity,
+                self.machine,
+                self.numbers,
+                self.constant_pattern,
+                self.formula_structure,
+                geometry,
+                numbers,
+            )
+        return self._parameter_derivatives[key]
 
-    def constants(self, variant: Machine) -> Array:
-        """Those of its formulas: geometry, then `numbers`."""
+    def constants_of(self, variant: Machine) -> Array:
+        """Those of its formulas: geometry, then `formula_constants`."""
         variant = replace(variant, tip=self.machine.tip)
-        geometry = geometry_of(variant.closure.equations)
-        if geometry.parents != self.machine.closure.fast.geometry.parents:
+        geometry = tree_geometry(variant.closure.equations)
+        if geometry.parents != self.machine.closure.compiled_closure.geometry.parents:
             raise InputError("the tree is not the same")
         return np.concatenate(
-            [geometry.numbers, numbers_of(variant, geometry, JointForces(variant))]
+            [geometry.constants, dynamics_constants(variant, geometry, JointForces(variant))]
         )
 
     def drive_forces(
@@ -458,21 +491,27 @@ class Dynamics(Brief):
         Raises:
             InputError: Unknown drive, or a weight that is not above 0.
         """
-        n, drives = self._n, self.machine.drives
+        n, drives = self._mobility, self.machine.drives
         names = [drive.name for drive in drives]
         weights = np.ones(len(drives))
         for name, given in (sharing or {}).items():
             if name not in names:
-                raise InputError(f"sharing names the drive '{name}', {known(names, name)}")
-            weights[names.index(name)] = as_number(given, f"the share of '{name}'", "", above=0)
-        reach = self._reach(q_a)
+                raise InputError(f"sharing names the drive '{name}', {suggest_names(names, name)}")
+            weights[names.index(name)] = as_number(
+                given, f"the share of '{name}'", "", greater_than=0
+            )
+        drive_jacobian = self._drive_jacobian(q_a)
         tau_a = as_samples(tau_a, n, "tau_a", self.machine.active)
         units = self.machine.closure.units[self.machine.closure.active]
-        reach = reach * units[:, None]  # virtual work per 1 rad and the machine's size: to compare
-        shared = weights[:, None] * np.swapaxes(reach, -1, -2)
-        inverse = np.linalg.pinv(reach @ shared, rcond=1e-12, hermitian=True)
-        forces: Array = np.einsum("...ij,...jk,...k->...i", shared, inverse, tau_a * units)
-        return forces
+        drive_jacobian = (
+            drive_jacobian * units[:, None]
+        )  # virtual work per 1 rad and the machine's size: to compare
+        weighted_jacobian = weights[:, None] * np.swapaxes(drive_jacobian, -1, -2)
+        inverse = np.linalg.pinv(drive_jacobian @ weighted_jacobian, rcond=1e-12, hermitian=True)
+        joint_forces: Array = np.einsum(
+            "...ij,...jk,...k->...i", weighted_jacobian, inverse, tau_a * units
+        )
+        return joint_forces
 
     def active_forces(self, q_a: ArrayLike, forces: ArrayLike) -> Array:
         """Active forces of the drives': tau_A = (S gamma)^T u, see `drive_forces`.
@@ -486,10 +525,10 @@ class Dynamics(Brief):
         """
         names = [drive.name for drive in self.machine.drives]
         u = as_samples(forces, len(names), "forces", names)
-        found: Array = np.einsum("...ij,...j->...i", self._reach(q_a), u)
+        found: Array = np.einsum("...ij,...j->...i", self._drive_jacobian(q_a), u)
         return found
 
-    def _reach(self, q_a: ArrayLike) -> Array:
+    def _drive_jacobian(self, q_a: ArrayLike) -> Array:
         """B = (S gamma)^T, (n, m) or (N, n, m), of the drives."""
         machine = self.machine
         lengths = np.zeros((len(machine.drives), machine.model.nv))  # S
@@ -500,14 +539,14 @@ class Dynamics(Brief):
         return np.swapaxes(lengths @ gamma, -1, -2)
 
     def backend_of(self, quantity: str = "forward") -> str:
-        """Which backend computes a quantity of `crane.dynamics.compiled.QUANTITIES`."""
-        return "pinocchio" if self._formula(quantity) is None else "compiled"
+        """Which backend computes a quantity of `crane.dynamics.compiled_dynamics.QUANTITIES`."""
+        return "pinocchio" if self._compiled_quantity(quantity) is None else "compiled"
 
-    def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
+    def evaluate_closed(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
         """A quantity at postures that are closed already, which are not checked.
 
         Args:
-            quantity: A key of `crane.dynamics.compiled.QUANTITIES`.
+            quantity: A key of `crane.dynamics.compiled_dynamics.QUANTITIES`.
             q: (nq,) or (N, nq) closed postures.
             v_a: (n,) or (N, n) [m/s], [rad/s].
             x: The same shape, a_A or tau_A, whatever the quantity asks for.
@@ -515,52 +554,63 @@ class Dynamics(Brief):
         Returns:
             The results, each flattened.
         """
-        formula = self._formula(quantity)
+        formula = self._compiled_quantity(quantity)
         if formula is None:
-            return per_sample(lambda *one: self.tree.at(quantity, *one), q, v_a, x)
+            return apply_per_sample(
+                lambda *one: self.tree_dynamics.evaluate(quantity, *one), q, v_a, x
+            )
         inputs = np.ascontiguousarray(np.concatenate([v_a, x], axis=-1))
         if q.ndim == 1:
-            return formula.at(np.ascontiguousarray(q), inputs)
+            return formula.evaluate_closed(np.ascontiguousarray(q), inputs)
         out = np.empty((len(q), formula.size))
-        formula.along(np.ascontiguousarray(q), inputs, out)
+        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, out)
         return out
 
-    def set_modes(self, slip: Array, held: Array, pace: Array, moving: bool) -> None:
-        """Say what the joints do whose friction sticks; see `JointForces.set_modes`.
+    def set_stick_slip_modes(
+        self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
+    ) -> None:
+        """Say what the joints do whose friction sticks; see `JointForces.set_stick_slip_modes`.
 
         It counts for "rates" and "observation" alone, which only an integration asks for.
         """
-        self.forces.set_modes(slip, held, pace, moving)
-        if self._modes:
-            self.numbers[self._modes] = [*np.column_stack([slip, held, pace]).ravel(), moving]
+        self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
+        if self._mode_indices:
+            self.numbers[self._mode_indices] = [
+                *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
+                is_moving,
+            ]
 
-    def set_grip(self, grip: Array) -> None:
-        """Say what a circuit adds to Coulomb friction; see `JointForces.set_grip`.
+    def set_circuit_friction(self, circuit_friction: Array) -> None:
+        """Say what a circuit adds to Coulomb friction; see `JointForces.set_circuit_friction`.
 
-        It counts where `set_modes` does.
+        It counts where `set_stick_slip_modes` does.
         """
-        self.forces.set_grip(grip)
+        self.forces.set_circuit_friction(circuit_friction)
         if self.backend == "compiled":
-            self.numbers[self._grips] = grip
+            self.numbers[self._circuit_friction_indices] = circuit_friction
 
     @property
-    def _n(self) -> int:
+    def _mobility(self) -> int:
         return len(self.machine.active)
 
-    def _formula(self, quantity: str) -> QuantityCode | None:
+    def _compiled_quantity(self, quantity: str) -> CompiledQuantity | None:
         """Machine code of a quantity, or None on the Pinocchio backend."""
-        if quantity not in self._formulas:
+        if quantity not in self._compiled_quantities:
             made = None
             try:
                 if self.backend == "compiled":
-                    made = QuantityCode(
-                        quantity, self.machine, self.numbers, self.pattern, self.form
+                    made = CompiledQuantity(
+                        quantity,
+                        self.machine,
+                        self.numbers,
+                        self.constant_pattern,
+                        self.formula_structure,
                     )
-            except TooLongError:
+            except FormulaTooLongError:
                 pass
             # of two threads' that made it at once one counts, in which both follow the branch
-            self._formulas.setdefault(quantity, made)
-        return self._formulas[quantity]
+            self._compiled_quantities.setdefault(quantity, made)
+        return self._compiled_quantities[quantity]
 
     def _evaluate(
         self,
@@ -573,12 +623,12 @@ class Dynamics(Brief):
     ) -> Array:
         """A quantity of samples or stacks, single samples among stacks held for every row.
 
-        `shape` is that of one result, () for a vector.
+        `result_shape` is that of one result, () for a vector.
         """
-        formula = self._formulas.get(quantity)
-        if formula is not None and (out := formula.one(q_a, v_a, x)) is not None:
+        formula = self._compiled_quantities.get(quantity)
+        if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:
             return out.reshape(shape) if shape else out
-        names, n = self.machine.active, self._n
+        names, n = self.machine.active, self._mobility
         q_a = as_samples(q_a, n, "q_a", names)
         checked = [
             as_samples(value, n, what, names)
@@ -598,21 +648,27 @@ class Dynamics(Brief):
         for i, array in enumerate(checked):
             rows[:, i * n : (i + 1) * n] = array
         targets = np.ascontiguousarray(np.broadcast_to(q_a, (count, n)))
-        out = self._fill(quantity, targets, rows, q_a.ndim == 2)
+        out = self._evaluate_stack(quantity, targets, rows, q_a.ndim == 2)
         if shape:
             return out.reshape((count, *shape) if stacked else shape)
         return out if stacked else out[0]
 
-    def _fill(self, quantity: str, targets: Array, rows: Array, stacked: bool) -> Array:
-        closure, n = self.machine.closure, self._n
-        formula = self._formula(quantity)
+    def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
+        closure, n = self.machine.closure, self._mobility
+        formula = self._compiled_quantity(quantity)
         if formula is None:
-            return self.at(quantity, closure.solve(targets), rows[:, :n], rows[:, n:])
+            return self.evaluate_closed(quantity, closure.solve(targets), rows[:, :n], rows[:, n:])
         out = np.empty((len(targets), formula.size))
 
         def reach(i: int) -> None:
-            sample = f" (sample {i})" if stacked else ""
-            out[i] = formula.at(closure.reach(formula.cursor, targets[i], sample), rows[i])
+            sample = f" (sample {i})" if is_stack else ""
+            out[i] = formula.evaluate_closed(
+                closure.continue_from_home(formula.cursor, targets[i], sample), rows[i]
+            )
 
-        carefully(len(targets), lambda i, _: formula.each(targets[i:], rows[i:], out[i:]), reach)
+        run_with_fallback(
+            len(targets),
+            lambda i, _: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
+            reach,
+        )
         return out

@@ -1,12 +1,12 @@
 """What carries what: the exact dynamics, and the published one of chains on bases held still."""
 
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
 from crane.machine import Machine
 
 FORMULATIONS = ("exact", "decoupled")
 
 
-def carriers(machine: Machine, formulation: str) -> tuple[int, ...]:
+def carrier_bodies(machine: Machine, formulation: str) -> tuple[int, ...]:
     """The body whose motion each body shares.
 
     "exact": the parent in the tree. "decoupled": the same within a sub-chain, but every sub-chain
@@ -25,7 +25,7 @@ def carriers(machine: Machine, formulation: str) -> tuple[int, ...]:
     """
     if formulation not in FORMULATIONS:
         raise InputError(
-            f"formulation '{formulation}' is unknown, {known(FORMULATIONS, formulation)}"
+            f"formulation '{formulation}' is unknown, {suggest_names(FORMULATIONS, formulation)}"
         )
     parents = machine.coordinates.parents
     if formulation == "exact":

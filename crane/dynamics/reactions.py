@@ -7,40 +7,42 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from crane.closure.equations import turned
+from crane.closure.loop_equations import rotation_with_z_axis
 from crane.common.errors import InputError
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_samples
-from crane.common.shown import Brief
-from crane.description.external import PARTS
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics.frame_distances import MIN_LENGTH
 from crane.dynamics.joint_forces import JointForces
-from crane.dynamics.lengths import LEAST
 from crane.machine import Machine
 
-_EDGE = 1e-10  # share of the largest pivot under which the closure is asked whether it ends there
-_NOTHING = 10.0  # times what loops may be open by: a share of a stress that is none
+_SINGULAR_TOLERANCE = (
+    1e-10  # share of the largest pivot under which the closure is asked whether it ends there
+)
+_ZERO_STRESS_FACTOR = 10.0  # times what loops may be open by: a share of a stress that is none
 
 
-class _Placed(NamedTuple):
+class _StackKinematics(NamedTuple):
     """N postures.
 
     Attributes:
-        turns: (N, nj + 1, 3, 3) of all bodies in the world, that of the world first.
+        rotations: (N, nj + 1, 3, 3) of all bodies in the world, that of the world first.
         origins: (N, nj + 1, 3) likewise [m].
         columns: (N, 6, nv) of the joints, at the world's origin.
-        ends: (N, 2 l, 3, 3) and (N, 2 l, 3), the loops' frames.
-        rows: (N, r, 6) the loops' equations as wrenches at the world's origin.
-        slopes: (N, m, nv) of all equations, in shares of the machine's size.
+        loop_frames: (N, 2 l, 3, 3) and (N, 2 l, 3), the loops' frames.
+        loop_wrenches: (N, r, 6) the loops' equations as wrenches at the world's origin.
+        scaled_jacobian: (N, m, nv) of all equations, in shares of the machine's size.
     """
 
-    turns: Array
+    rotations: Array
     origins: Array
     columns: Array
-    ends: tuple[Array, Array]
-    rows: Array
-    slopes: Array
+    loop_frames: tuple[Array, Array]
+    loop_wrenches: Array
+    scaled_jacobian: Array
 
 
-class Reactions(Brief):
+class Reactions(OneLineRepr):
     """Wrenches in the joints of a machine with closed loops.
 
     With tau the forces along the tree's joints that its motion asks for (rnea) less those of
@@ -64,8 +66,8 @@ class Reactions(Brief):
     Forces along pins and moments across them then depend on how stiff the bodies are and how well
     they fit, which no file says; so do all components of a part that stresses itself. Taken is the
     least-norm solution, forces counted times the machine's size, as the smallest that bodies have
-    which fit; `determined` tells which components do not depend on that. Drive forces do not, and
-    equal `Dynamics.inverse`, to the digits that the loops are closed by.
+    which fit; `statically_determined` tells which components do not depend on that. Drive forces
+    do not, and equal `Dynamics.inverse`, to the digits that the loops are closed by.
 
     Args:
         machine: The machine; its payload and parameters are those at this moment.
@@ -79,28 +81,37 @@ class Reactions(Brief):
     def __init__(self, machine: Machine):
         if not isinstance(machine, Machine):
             raise InputError(f"{machine!r} is not a machine, load it with crane.load")
-        self.machine, self._forces = machine, JointForces(machine)
+        self.machine, self._joint_forces = machine, JointForces(machine)
         self._model = model = pin.Model(machine.model)
         self._data = model.createData()
         self._equations = equations = machine.closure.equations
         self.names = (*list(model.names)[1:], *(loop.name for loop in equations.loops))
-        self._moved = machine.coordinates.joints - 1  # by column, the joint in the wrenches' order
+        self._joint_of_column = (
+            machine.coordinates.joints - 1
+        )  # by column, the joint in the wrenches' order
         # whether a joint (column) carries a body (row), and a loop's successor but not predecessor
-        self._carries = np.zeros((model.njoints, model.njoints - 1))
+        self._is_carried_by = np.zeros((model.njoints, model.njoints - 1))
         for body in range(1, model.njoints):
-            self._carries[body, [joint - 1 for joint in model.supports[body] if joint]] = 1.0
-        self._bodies = [joint for joint, _ in equations.frames]
-        ends = self._carries[self._bodies]
-        self._around = ends[1::2] - ends[::2]
-        self._signs = equations.sign[equations.loop_of_row[: len(equations.axis1)]]
-        self._owners = np.eye(len(equations.loops))[:, equations.loop_of_row[: len(self._signs)]]
+            self._is_carried_by[body, [joint - 1 for joint in model.supports[body] if joint]] = 1.0
+        self._loop_bodies = [joint for joint, _ in equations.frames]
+        ends = self._is_carried_by[self._loop_bodies]
+        self._loop_paths = ends[1::2] - ends[::2]
+        self._row_joint_signs = equations.sign[
+            equations.loop_of_row[: len(equations.axis_of_frame1)]
+        ]
+        self._loop_of_row = np.eye(len(equations.loops))[
+            :, equations.loop_of_row[: len(self._row_joint_signs)]
+        ]
         # z along the axis, as the loops' frames have it
         of = machine.tree.joints
-        self._axes = np.array(
-            [turned(of[x].axis) if x in of else np.eye(3) for x in list(model.names)[1:]]
+        self._local_axes = np.array(
+            [
+                rotation_with_z_axis(of[x].axis) if x in of else np.eye(3)
+                for x in list(model.names)[1:]
+            ]
         ).reshape(-1, 3, 3)
 
-    def at(
+    def joint_wrenches(
         self,
         q: ArrayLike,
         v: ArrayLike | None = None,
@@ -129,9 +140,9 @@ class Reactions(Brief):
             InputError: Unknown link, or shapes that do not go together.
             BranchEdgeError: The passive joints are not determined there.
         """
-        return self._solved(q, v, a, wrenches, friction)[0]
+        return self._solve_wrenches_and_drives(q, v, a, wrenches, friction)[0]
 
-    def drives(
+    def drive_forces(
         self,
         q: ArrayLike,
         v: ArrayLike | None = None,
@@ -139,18 +150,18 @@ class Reactions(Brief):
         wrenches: Mapping[str, ArrayLike] | None = None,
         friction: bool = False,
     ) -> Array:
-        """Forces u of the active joints that go with `at`, (n,) or (N, n) [N], [N m].
+        """Forces u of the active joints that go with `joint_wrenches`, (n,) or (N, n) [N], [N m].
 
         Args:
-            q: See `at`.
-            v: See `at`.
-            a: See `at`.
-            wrenches: See `at`.
-            friction: See `at`.
+            q: See `joint_wrenches`.
+            v: See `joint_wrenches`.
+            a: See `joint_wrenches`.
+            wrenches: See `joint_wrenches`.
+            friction: See `joint_wrenches`.
         """
-        return self._solved(q, v, a, wrenches, friction)[1]
+        return self._solve_wrenches_and_drives(q, v, a, wrenches, friction)[1]
 
-    def unit(self, q: ArrayLike, link: str) -> Array:
+    def unit_load_wrenches(self, q: ArrayLike, link: str) -> Array:
         """What a force at a link's origin adds to the wrenches, per force.
 
         Args:
@@ -158,21 +169,21 @@ class Reactions(Brief):
             link: Where it acts.
 
         Returns:
-            (k, 6, 3) or (N, k, 6, 3): `at` of a unit force in the world's x, y, z, less that
-            without.
+            (k, 6, 3) or (N, k, 6, 3): `joint_wrenches` of a unit force in the world's x, y, z,
+            less that without.
         """
-        body, place = self._end(link)
-        rows, stacked = self._stack(q, "q")
-        placed = self._place(rows)
-        point = self._points(placed, body, place)
+        body, place = self._frame_point(link)
+        rows, stacked = self._as_stack(q, "q")
+        kinematics = self._evaluate_kinematics(rows)
+        point = self._point_in_world(kinematics, body, place)
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         load = np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)
-        held = -self._carries[body][None, :, None, None] * load[:, None]
+        carried = -self._is_carried_by[body][None, :, None, None] * load[:, None]
         none = np.zeros((len(rows), self._model.nv, 3))
-        out = self._held(placed, rows, held, none)[0]
+        out = self._solve_loop_forces(kinematics, rows, carried, none)[0]
         return out if stacked else out[0]
 
-    def axes(self, q: ArrayLike) -> Array:
+    def joint_axes(self, q: ArrayLike) -> Array:
         """The joints' own axes in the world, (k, 3, 3) or (N, k, 3, 3) with x, y, z as columns.
 
         z is the axis that the joint turns about or slides along, of a loop that which it leaves
@@ -182,12 +193,12 @@ class Reactions(Brief):
         Args:
             q: (nq,) or (N, nq) closed postures [m], [rad].
         """
-        rows, stacked = self._stack(q, "q")
-        out = self._own(self._place(rows))
+        rows, stacked = self._as_stack(q, "q")
+        out = self._axes_in_world(self._evaluate_kinematics(rows))
         return out if stacked else out[0]
 
-    def determined(self, q: ArrayLike) -> NDArray[np.bool_]:
-        """Which components of the wrenches statics determines, in the joints' own `axes`.
+    def statically_determined(self, q: ArrayLike) -> NDArray[np.bool_]:
+        """Which components of the wrenches statics determines, in the joints' own `joint_axes`.
 
         Those that no stress of the bodies in themselves has, that is no lambda with
         Phi_P^T lambda = 0.
@@ -198,21 +209,23 @@ class Reactions(Brief):
         Returns:
             (k, 6) or (N, k, 6), three forces and three moments.
         """
-        rows, stacked = self._stack(q, "q")
-        placed = self._place(rows)
+        rows, stacked = self._as_stack(q, "q")
+        kinematics = self._evaluate_kinematics(rows)
         passive = self.machine.closure.passive
-        basis = np.linalg.qr(placed.slopes[:, :, passive], mode="complete")[0]
+        basis = np.linalg.qr(kinematics.scaled_jacobian[:, :, passive], mode="complete")[0]
         stress = basis[:, :, len(passive) :]
-        none = np.zeros((len(rows), len(self._axes), 6, stress.shape[2]))
-        wrenches = self._gathered(placed, none, stress / self._equations.row_units[:, None])
+        none = np.zeros((len(rows), len(self._local_axes), 6, stress.shape[2]))
+        wrenches = self._wrenches_with_loop_forces(
+            kinematics, none, stress / self._equations.residual_units[:, None]
+        )
         halves = wrenches.reshape(*wrenches.shape[:2], 2, 3, -1)
-        own = np.einsum("nkab,nkhac->nkhbc", self._own(placed), halves)
-        own[:, :, 0] *= self._equations.size
-        least = _NOTHING * self.machine.closure.structure.surplus.allowed
-        out = np.abs(own).max(axis=-1, initial=0.0).reshape(len(rows), -1, 6) < least
+        own = np.einsum("nkab,nkhac->nkhbc", self._axes_in_world(kinematics), halves)
+        own[:, :, 0] *= self._equations.characteristic_length
+        tolerance = _ZERO_STRESS_FACTOR * self.machine.closure.structure.redundancy.tolerance
+        out = np.abs(own).max(axis=-1, initial=0.0).reshape(len(rows), -1, 6) < tolerance
         return out if stacked else out[0]
 
-    def _solved(
+    def _solve_wrenches_and_drives(
         self,
         q: ArrayLike,
         v: ArrayLike | None,
@@ -221,138 +234,173 @@ class Reactions(Brief):
         friction: bool,
     ) -> tuple[Array, Array]:
         """Wrenches and drives."""
-        rows, stacked = self._stack(q, "q")
-        moves = np.zeros_like(rows) if v is None else self._like(v, rows, "v")
+        rows, stacked = self._as_stack(q, "q")
+        velocities = np.zeros_like(rows) if v is None else self._as_matching_stack(v, rows, "v")
         if a is not None:
-            gains = self._like(a, rows, "a")
+            accelerations = self._as_matching_stack(a, rows, "a")
         else:
-            gains = np.zeros_like(rows) if v is None else self.machine.closure.drift(rows, moves)
-        nv, forces = self._model.nv, self._forces
-        held = np.empty((len(rows), len(self._axes), 6))
-        placed = self._place(rows, held, moves, gains)
-        along, _ = forces.along(rows, moves)
-        for ends, force in zip(forces.lengths.ends, along[:, nv:].T, strict=True):
-            one, two = (self._points(placed, *end) for end in ends)
+            accelerations = (
+                np.zeros_like(rows) if v is None else self.machine.closure.drift(rows, velocities)
+            )
+        nv, forces = self._model.nv, self._joint_forces
+        carried = np.empty((len(rows), len(self._local_axes), 6))
+        kinematics = self._evaluate_kinematics(rows, carried, velocities, accelerations)
+        element_forces, _ = forces.passive_forces_by_element(rows, velocities)
+        for ends, force in zip(forces.lengths.end_points, element_forces[:, nv:].T, strict=True):
+            one, two = (self._point_in_world(kinematics, *end) for end in ends)
             way = two - one
-            push = force[:, None] * way / np.maximum(np.linalg.norm(way, axis=1), LEAST)[:, None]
+            push = (
+                force[:, None] * way / np.maximum(np.linalg.norm(way, axis=1), MIN_LENGTH)[:, None]
+            )
             for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-                self._load(placed, held, end, sign * np.hstack([push, 0 * push]))
+                self._subtract_wrench(kinematics, carried, end, sign * np.hstack([push, 0 * push]))
         for link, given in (wrenches or {}).items():
-            wrench = as_samples(given, 6, f"the wrench on '{link}'", PARTS)
+            wrench = as_samples(given, 6, f"the wrench on '{link}'", WRENCH_COMPONENTS)
             if wrench.ndim == 2 and (not stacked or len(wrench) != len(rows)):
                 raise InputError(
                     f"the wrench on '{link}' has {len(wrench)} samples and q "
                     f"{len(rows) if stacked else 'is one'}, give as many"
                 )
-            self._load(placed, held, self._end(link), wrench)
-        own = along[:, :nv] - self._model.armature * gains
+            self._subtract_wrench(kinematics, carried, self._frame_point(link), wrench)
+        joint_forces = element_forces[:, :nv] - self._model.armature * accelerations
         if friction:
-            own -= forces.friction(moves) + forces.starting(moves, gains)
-        found, drives = self._held(placed, rows, held[..., None], own[..., None])
+            joint_forces -= forces.friction_forces(velocities) + forces.breakaway_forces(
+                velocities, accelerations
+            )
+        found, drives = self._solve_loop_forces(
+            kinematics, rows, carried[..., None], joint_forces[..., None]
+        )
         wrench, drive = found[..., 0], drives[..., 0]
         return (wrench, drive) if stacked else (wrench[0], drive[0])
 
-    def _end(self, link: str) -> tuple[int, Array]:
+    def _frame_point(self, link: str) -> tuple[int, Array]:
         """The body that carries a link, and where its origin is in that body's frame."""
         frame = self._model.frames[self.machine.frame(link)]
         return int(frame.parentJoint), frame.placement.translation
 
-    def _load(self, placed: _Placed, held: Array, end: tuple[int, Array], wrench: Array) -> None:
+    def _subtract_wrench(
+        self, kinematics: _StackKinematics, carried: Array, point: tuple[int, Array], wrench: Array
+    ) -> None:
         """Take a wrench (6,) or (N, 6) about a point of a body off what joints hold."""
-        about = np.array(np.broadcast_to(wrench, (len(held), 6)))
-        about[:, 3:] += np.cross(self._points(placed, *end), about[:, :3])
-        held -= self._carries[end[0]][:, None] * about[:, None]
+        about = np.array(np.broadcast_to(wrench, (len(carried), 6)))
+        about[:, 3:] += np.cross(self._point_in_world(kinematics, *point), about[:, :3])
+        carried -= self._is_carried_by[point[0]][:, None] * about[:, None]
 
-    def _held(self, placed: _Placed, q: Array, held: Array, own: Array) -> tuple[Array, Array]:
+    def _solve_loop_forces(
+        self, kinematics: _StackKinematics, q: Array, carried: Array, joint_forces: Array
+    ) -> tuple[Array, Array]:
         """Wrenches about the joints' origins and drives, of c cases at once.
 
         Args:
-            placed: The postures.
+            kinematics: The postures.
             q: (N, nq) the same.
-            held: (N, nj, 6, c) what each joint carries, as if there were no loops, at the world's
-                origin.
-            own: (N, nv, c) what acts along the joints beside the drives.
+            carried: (N, nj, 6, c) what each joint carries, as if there were no loops, at the
+                world's origin.
+            joint_forces: (N, nv, c) what acts along the joints beside the drives.
 
         Returns:
             (N, k, 6, c) and (N, n, c).
         """
         closure, equations = self.machine.closure, self._equations
-        asked = np.einsum("nsi,nisc->nic", placed.columns, held[:, self._moved]) - own
-        slopes = placed.slopes[:, :, closure.passive]
-        turn, pivots = np.linalg.qr(slopes)
+        required_forces = (
+            np.einsum("nsi,nisc->nic", kinematics.columns, carried[:, self._joint_of_column])
+            - joint_forces
+        )
+        passive_jacobian = kinematics.scaled_jacobian[:, :, closure.passive]
+        turn, pivots = np.linalg.qr(passive_jacobian)
         size = np.abs(np.diagonal(pivots, axis1=1, axis2=2))
-        if (edge := size.min(axis=1, initial=1.0) < _EDGE * size.max(axis=1, initial=0.0)).any():
+        if (
+            edge := size.min(axis=1, initial=1.0)
+            < _SINGULAR_TOLERANCE * size.max(axis=1, initial=0.0)
+        ).any():
             closure.gamma(q[edge])
-        right = equations.units[closure.passive, None] * asked[:, closure.passive]
+        right = (
+            equations.coordinate_units[closure.passive, None] * required_forces[:, closure.passive]
+        )
         # least squares of numbers that are the same whatever the machine's size
         shares = turn @ np.linalg.solve(np.swapaxes(pivots, 1, 2), right)
-        lambdas = shares / equations.row_units[:, None]
-        pull = np.einsum("nmi,nmc->nic", placed.slopes[:, :, closure.active], shares)
-        drives = asked[:, closure.active] - pull / equations.units[closure.active, None]
-        return self._gathered(placed, held, lambdas), drives
+        lambdas = shares / equations.residual_units[:, None]
+        pull = np.einsum("nmi,nmc->nic", kinematics.scaled_jacobian[:, :, closure.active], shares)
+        drives = (
+            required_forces[:, closure.active]
+            - pull / equations.coordinate_units[closure.active, None]
+        )
+        return self._wrenches_with_loop_forces(kinematics, carried, lambdas), drives
 
-    def _gathered(self, placed: _Placed, held: Array, lambdas: Array) -> Array:
+    def _wrenches_with_loop_forces(
+        self, kinematics: _StackKinematics, carried: Array, multipliers: Array
+    ) -> Array:
         """Wrenches (N, k, 6, c) about the joints' origins, under multipliers (N, m, c)."""
-        loaded = placed.rows[..., None] * lambdas[:, : placed.rows.shape[1], None, :]
-        loops = np.einsum("lr,nrsc->nlsc", self._owners, loaded)
-        joints = held - np.einsum("lj,nlsc->njsc", self._around, loops)
+        loaded = (
+            kinematics.loop_wrenches[..., None]
+            * multipliers[:, : kinematics.loop_wrenches.shape[1], None, :]
+        )
+        loops = np.einsum("lr,nrsc->nlsc", self._loop_of_row, loaded)
+        joints = carried - np.einsum("lj,nlsc->njsc", self._loop_paths, loops)
         out = np.concatenate([joints, loops], axis=1)
-        at = np.concatenate([placed.origins[:, 1:], placed.ends[1][:, 1::2]], axis=1)
+        at = np.concatenate(
+            [kinematics.origins[:, 1:], kinematics.loop_frames[1][:, 1::2]], axis=1
+        )
         out[:, :, 3:] -= np.cross(at[..., None], out[:, :, :3], axis=2)
         return out
 
-    def _place(
+    def _evaluate_kinematics(
         self,
         q: Array,
-        held: Array | None = None,
+        carried: Array | None = None,
         v: Array | None = None,
         a: Array | None = None,
-    ) -> _Placed:
-        """Postures (N, nq), and into `held` what joints carry (N, nj, 6) at the world's origin."""
+    ) -> _StackKinematics:
+        """Postures (N, nq) and the joints' wrenches (N, nj, 6) at the world's origin."""
         model, data, equations = self._model, self._data, self._equations
         configurations = self.machine.coordinates.configuration(q)
         columns = np.empty((len(q), 6, model.nv))
         bodies = np.empty((len(q), model.njoints, 4, 4))
-        placements, carried = list(data.oMi), list(data.f)[1:]  # seen as they change
+        joint_placements, joint_forces = list(data.oMi), list(data.f)[1:]  # seen as they change
         for i, at in enumerate(configurations):
             columns[i] = pin.computeJointJacobians(model, data, at).reshape(6, -1)
-            bodies[i] = [placement.homogeneous for placement in placements]
-            if held is not None and v is not None and a is not None:
+            bodies[i] = [placement.homogeneous for placement in joint_placements]
+            if carried is not None and v is not None and a is not None:
                 pin.rnea(model, data, at, v[i], a[i])
-                held[i] = [force.vector for force in carried]
-        turns, origins = bodies[..., :3, :3], bodies[..., :3, 3]
-        if held is not None:
-            held[..., :3] = (turns[:, 1:] @ held[..., :3, None])[..., 0]
-            held[..., 3:] = (turns[:, 1:] @ held[..., 3:, None])[..., 0]
-            held[..., 3:] += np.cross(origins[:, 1:], held[..., :3])
+                carried[i] = [force.vector for force in joint_forces]
+        rotations, origins = bodies[..., :3, :3], bodies[..., :3, 3]
+        if carried is not None:
+            carried[..., :3] = (rotations[:, 1:] @ carried[..., :3, None])[..., 0]
+            carried[..., 3:] = (rotations[:, 1:] @ carried[..., 3:, None])[..., 0]
+            carried[..., 3:] += np.cross(origins[:, 1:], carried[..., :3])
         local = [placement for _, placement in equations.frames]
         rotated = np.array([x.rotation for x in local]).reshape(-1, 3, 3)
         moved = np.array([x.translation for x in local]).reshape(-1, 3)
-        of = turns[:, self._bodies]
-        ends = of @ rotated, (of @ moved[..., None])[..., 0] + origins[:, self._bodies]
-        rows = equations.wrenches(*ends)
-        slopes = np.empty((len(q), len(equations.row_units), model.nv))
-        slopes[:, : rows.shape[1]] = self._signs * (rows @ columns)
-        slopes[:, rows.shape[1] :] = equations.factors
-        slopes *= equations.units / equations.row_units[:, None]
-        return _Placed(turns, origins, columns, ends, rows, slopes)
+        of = rotations[:, self._loop_bodies]
+        ends = of @ rotated, (of @ moved[..., None])[..., 0] + origins[:, self._loop_bodies]
+        rows = equations.constraint_wrenches(*ends)
+        scaled_jacobian = np.empty((len(q), len(equations.residual_units), model.nv))
+        scaled_jacobian[:, : rows.shape[1]] = self._row_joint_signs * (rows @ columns)
+        scaled_jacobian[:, rows.shape[1] :] = equations.coupling_factors
+        scaled_jacobian *= equations.coordinate_units / equations.residual_units[:, None]
+        return _StackKinematics(rotations, origins, columns, ends, rows, scaled_jacobian)
 
-    def _own(self, placed: _Placed) -> Array:
-        return np.concatenate([placed.turns[:, 1:] @ self._axes, placed.ends[0][:, 1::2]], axis=1)
+    def _axes_in_world(self, kinematics: _StackKinematics) -> Array:
+        return np.concatenate(
+            [kinematics.rotations[:, 1:] @ self._local_axes, kinematics.loop_frames[0][:, 1::2]],
+            axis=1,
+        )
 
-    def _points(self, placed: _Placed, body: int, place: Array) -> Array:
+    def _point_in_world(
+        self, kinematics: _StackKinematics, body: int, local_point: Array
+    ) -> Array:
         """(N, 3) of a point of a body in the world."""
-        out: Array = placed.origins[:, body] + placed.turns[:, body] @ place
+        out: Array = kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
         return out
 
-    def _stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
+    def _as_stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
         given = as_samples(value, self._model.nv, what, self.machine.joints)
         if not given.size:
             raise InputError(f"{what} is an empty stack, give at least one sample")
         return np.atleast_2d(given), given.ndim == 2
 
-    def _like(self, value: ArrayLike, q: Array, what: str) -> Array:
-        given = self._stack(value, what)[0]
+    def _as_matching_stack(self, value: ArrayLike, q: Array, what: str) -> Array:
+        given = self._as_stack(value, what)[0]
         if given.shape != q.shape:
             raise InputError(f"{what} has {len(given)} samples and q {len(q)}, give as many")
         return given

@@ -14,39 +14,39 @@ from crane.dynamics.dynamics import Dynamics
 from crane.machine import Machine
 
 
-class AtRest(NamedTuple):
+class StaticQuantities(NamedTuple):
     """A machine at N postures, all in the world's directions.
 
     Attributes:
-        moment: (N, 3) first moment of all masses, s = sum m c, about the origin [kg m].
-        slopes: (N, 3, n) ds/dq_A.
-        mass: (N,) of the machine [kg].
-        passive: (N, n) gamma^T f, see `Dynamics.passive`.
-        tip: (N, 3) [m].
-        ways: (N, 3, n) dtip/dq_A.
+        first_moment: (N, 3) first moment of all masses, s = sum m c, about the origin [kg m].
+        moment_jacobian: (N, 3, n) ds/dq_A.
+        total_mass: (N,) of the machine [kg].
+        passive_forces: (N, n) gamma^T f, see `Dynamics.passive_forces`.
+        tip_positions: (N, 3) [m].
+        tip_jacobian: (N, 3, n) dtip/dq_A.
     """
 
-    moment: Array
-    slopes: Array
-    mass: Array
-    passive: Array
-    tip: Array
-    ways: Array
+    first_moment: Array
+    moment_jacobian: Array
+    total_mass: Array
+    passive_forces: Array
+    tip_positions: Array
+    tip_jacobian: Array
 
-    def held(self, gravity: Array) -> Array:
+    def holding_forces(self, gravity: Array) -> Array:
         """Active forces (N, n) that hold the machine: -(ds/dq_A)^T g - gamma^T f."""
-        return -np.asarray(gravity @ self.slopes) - self.passive
+        return -np.asarray(gravity @ self.moment_jacobian) - self.passive_forces
 
-    def under(self, force: Array) -> Array:
+    def tip_load_forces(self, force: Array) -> Array:
         """Active forces (N, n) against a force (3,) or (N, 3) at the tip: -(dtip/dq_A)^T F."""
-        return -np.asarray(np.einsum("...i,...in->...n", force, self.ways))
+        return -np.asarray(np.einsum("...i,...in->...n", force, self.tip_jacobian))
 
-    def some(self, which: NDArray[Any]) -> "AtRest":
+    def select(self, index: NDArray[Any]) -> "StaticQuantities":
         """Some of the postures, by index or mask."""
-        return AtRest(*(x[which] for x in self))
+        return StaticQuantities(*(x[index] for x in self))
 
 
-class Statics:
+class StaticsEvaluator:
     """A machine at rest, as machine code.
 
     With gravity g, a force F at the tip and forces tau_A of the active joints it is at rest where
@@ -72,12 +72,14 @@ class Statics:
         n = self._n
         self.layout = Layout(moment=3, slopes=3 * n, mass=1, passive=n, tip=3, ways=3 * n)
 
-    def at(self, q: Array) -> AtRest:
+    def evaluate(self, q: Array) -> StaticQuantities:
         """At closed postures (N, nq), which are not checked."""
         still = np.zeros((len(q), self._n))
-        return self._parts(self.dynamics.at("statics", np.ascontiguousarray(q), still, still))
+        return self._split_quantities(
+            self.dynamics.evaluate_closed("statics", np.ascontiguousarray(q), still, still)
+        )
 
-    def closed(self, q: Array) -> tuple[Array, Array]:
+    def close_loops(self, q: Array) -> tuple[Array, Array]:
         """Close the loops at the active coordinates of postures (N, nq) that are nearly closed.
 
         Returns:
@@ -85,34 +87,34 @@ class Statics:
         """
         closure = self.machine.closure
         q = np.array(q, order="C")
-        done, good = 0, np.zeros(len(q), dtype=bool)
+        done, is_closed = 0, np.zeros(len(q), dtype=bool)
         while done < len(q):
-            if closure.compiled:
-                count = closure.fast.settle(q[done:])
-                good[done : done + count] = True
+            if closure.is_compiled:
+                count = closure.compiled_closure.close_in_place(q[done:])
+                is_closed[done : done + count] = True
                 done += count + 1
                 continue
             try:
-                q[done] = closure.solve(q[done, closure.active], guess=q[done])
-                good[done] = True
+                q[done] = closure.solve(q[done, closure.active], initial_guess=q[done])
+                is_closed[done] = True
             except ClosureError:
                 pass
             done += 1
-        return q, good
+        return q, is_closed
 
-    def derivatives(self, q: Array) -> AtRest:
+    def coordinate_derivatives(self, q: Array) -> StaticQuantities:
         """By q_A, of all at closed postures (N, nq): each with one more axis (n,) at the end."""
         q_a = np.ascontiguousarray(q[:, self.machine.closure.active])
         found = self.dynamics.derivatives("statics", q_a, by=["q_a"])["q_a"]
-        return self._parts(found)
+        return self._split_quantities(found)
 
-    def by_numbers(self, q: Array, names: Sequence[str]) -> AtRest:
+    def parameter_derivatives(self, q: Array, names: Sequence[str]) -> StaticQuantities:
         """The same by named numbers of the machine, at the same q_A."""
         q_a = np.ascontiguousarray(q[:, self.machine.closure.active])
         found = self.dynamics.derivatives("statics", q_a, by=names)
-        return self._parts(np.stack([found[name] for name in names], axis=-1))
+        return self._split_quantities(np.stack([found[name] for name in names], axis=-1))
 
-    def _parts(self, rows: Array) -> AtRest:
+    def _split_quantities(self, rows: Array) -> StaticQuantities:
         """Of rows (N, size, ...)."""
         parts, (count, _, *more) = self.layout, rows.shape
 
@@ -120,7 +122,7 @@ class Statics:
             return rows[:, parts[name]].reshape(count, *shape, *more)
 
         n = self._n
-        return AtRest(
+        return StaticQuantities(
             part("moment", 3), part("slopes", 3, n), part("mass"), part("passive", n),
             part("tip", 3), part("ways", 3, n),
         )  # fmt: skip

@@ -1,14 +1,20 @@
 """Machines from files and into them: machine file, URDF, MJCF, parallel robots, meshes."""
 
-from crane.formats.in_place import write_home
-from crane.formats.loading import load, recalled
-from crane.formats.machine_file.read import read
-from crane.formats.machine_file.write import write_machine
-from crane.formats.mjcf.write import write_mjcf
-from crane.formats.urdf.description import robot_description
-from crane.formats.urdf.write import write_urdf_plus
+from crane.formats.home_writer import write_home
+from crane.formats.machine_file.machine_reader import read_machine_spec
+from crane.formats.machine_file.machine_writer import write_machine
+from crane.formats.machine_loading import load, load_from_expression
+from crane.formats.mjcf.mjcf_writer import write_mjcf
+from crane.formats.urdf.robot_description import robot_description
+from crane.formats.urdf.urdf_writer import write_urdf_plus
 
 __all__ = [
-    "load", "read", "recalled", "robot_description", "write_home", "write_machine", "write_mjcf",
+    "load",
+    "read_machine_spec",
+    "load_from_expression",
+    "robot_description",
+    "write_home",
+    "write_machine",
+    "write_mjcf",
     "write_urdf_plus",
-]  # fmt: skip
+]

@@ -4,36 +4,38 @@ import dataclasses
 import re
 from pathlib import Path
 
-from crane.common.errors import DescriptionError, known
-from crane.common.inputs import content
-from crane.description.spec import Chain, Drive, LoopSpec, MachineSpec, places
-from crane.description.tree import Joint, Link, Tree
-from crane.formats.machine_file.posture import read_home
-from crane.formats.machine_file.section import LARGEST, Section
+from crane.common.errors import DescriptionError, suggest_names
+from crane.common.file_contents import read_plain_file
+from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
+from crane.formats.joint_series import joint_series
+from crane.formats.machine_file.home_section import read_home
 from crane.formats.machine_file.tree_builder import TreeBuilder
-from crane.formats.series import series
-from crane.formats.urdf.graph import MOVING
-from crane.formats.urdf.read import Urdf, read_urdf
-from crane.formats.xml import XmlFile
+from crane.formats.machine_file.yaml_section import MAX_FILE_SIZE, YamlSection
+from crane.formats.urdf.joint_graph import MOVABLE_TYPES
+from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+from crane.formats.xml_file import XmlFile
 
-URDF, YAML = "robot.urdf", "robot.yaml"
+URDF_FILE, YAML_FILE = "robot.urdf", "robot.yaml"
 
 _KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type", "home")
-_OWN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
-_MACHINE = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
-_LOOPS = {"3d": "spherical", "6d": "fixed"}
+_CONVENTION_PATTERN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
+_MACHINE_FILE_PATTERN = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
+_LOOP_TYPES = {"3d": "spherical", "6d": "fixed"}
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-_TYPES = ("SPHERICAL", "FIXED", "UJOINT_XY", "UJOINT_YZ", "UJOINT_ZX", "CARDAN")
-_UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
+_JOINT_TYPES = ("SPHERICAL", "FIXED", "UJOINT_XY", "UJOINT_YZ", "UJOINT_ZX", "CARDAN")
+_UNIVERSAL_PATTERN = re.compile(r"UJOINT_([XYZ])([XYZ])")
 
 
 def is_parallel_robot(file: Path) -> bool:
     """Whether a YAML file is of this convention and no machine file."""
     try:
-        text = content(file, LARGEST).decode("utf-8")
+        text = read_plain_file(file, MAX_FILE_SIZE).decode("utf-8")
     except (OSError, UnicodeDecodeError):
         return False  # which the reader of machine files says better
-    return _OWN.search(text) is not None and _MACHINE.search(text) is None
+    return (
+        _CONVENTION_PATTERN.search(text) is not None and _MACHINE_FILE_PATTERN.search(text) is None
+    )
 
 
 def read_parallel_robot(path: Path) -> MachineSpec:
@@ -42,40 +44,50 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     Raises:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
-    top = Section.read(path, _KEYS)
-    file = next((f for f in (path.with_suffix(".urdf"), path.parent / URDF) if f.is_file()), None)
+    top = YamlSection.read(path, _KEYS)
+    file = next(
+        (f for f in (path.with_suffix(".urdf"), path.parent / URDF_FILE) if f.is_file()), None
+    )
     if file is None:
-        raise DescriptionError(f"{path}: there is no {URDF} beside it, add it")
-    replaced = _replaced(top)
-    urdf = read_urdf(file, lambda xml: _replace(xml, replaced, top))
-    for joint, (kind, _) in replaced.items():
+        raise DescriptionError(f"{path}: there is no {URDF_FILE} beside it, add it")
+    replaced_types = _replaced_joint_types(top)
+    urdf = read_urdf(file, lambda xml: _replace_joint_types(xml, replaced_types, top))
+    for joint, (kind, _) in replaced_types.items():
         if kind not in ("SPHERICAL", "FIXED"):
-            pair = _UNIVERSAL.fullmatch(kind)
-            urdf = _split(urdf, joint, (pair[1], pair[2]) if pair else ("X", "Y"))
+            universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
+            urdf = _split_universal_joint(
+                urdf,
+                joint,
+                (universal_axes[1], universal_axes[2]) if universal_axes else ("X", "Y"),
+            )
     if urdf.loops:
         raise DescriptionError(
-            f"{urdf.loops[0].where}: the loops stand in {path.name}, keep <loop> or closed_loop"
+            f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
+            f"closed_loop"
         )
     name = urdf.name
-    chain = Chain(name, file, None, path.name, urdf.moving)
+    chain = Chain(name, file, None, path.name, urdf.moving_joints)
     tree = TreeBuilder()
-    tree.add(chain, urdf)
+    tree.add_chain(chain, urdf)
     if not tree.joints:
         raise DescriptionError(f"{file.name}: no joint moves in this file, add one")
-    loops = _loops(top, urdf, tree)
+    loops = _read_loops(top, urdf, tree)
     motors = top.names("name_mot") if "name_mot" in top else ()
     for joint in motors:
-        if joint not in tree.joints and joint in replaced:
-            raise top.fail(
+        if joint not in tree.joints and joint in replaced_types:
+            raise top.error_at(
                 "name_mot",
-                f"the motor '{joint}' is {replaced[joint][0]}, drive a joint with one freedom",
+                f"the motor '{joint}' is {replaced_types[joint][0]}, drive a joint with one "
+                f"freedom",
             )
-        tree.check_joint(joint, top.where("name_mot"))
+        tree.check_joint(joint, top.source_location("name_mot"))
     home, home_lines = read_home(top, tree)
-    where = {"active": top.where("name_mot")} | places(loops, urdf.couplings)
-    where |= {f"home {joint}": place for joint, place in home_lines.items()}
+    locations = {"active": top.source_location("name_mot")} | source_locations(
+        loops, urdf.couplings
+    )
+    locations |= {f"home {joint}": place for joint, place in home_lines.items()}
     if "home" in top:
-        where["home"] = top.where("home")
+        locations["home"] = top.source_location("home")
     return MachineSpec(
         name=name,
         source=path.name,
@@ -87,94 +99,113 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         home=home,
         drives=tuple(Drive(joint, {joint: 1.0}) for joint in motors),
         friction=urdf.friction,
-        tip=tree.only_leaf(),
+        tip=tree.single_leaf_link(),
         couplings=urdf.couplings,
-        where=where,
+        source_locations=locations,
     )
 
 
-def _replaced(top: Section) -> dict[str, tuple[str, str]]:
+def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
     """Types that joints of the URDF are replaced by, and where that was written."""
     if "joint_name" not in top:
         return {}
     names = top.names("joint_name")
     types = top.texts("joint_type")
     if len(names) != len(types):
-        raise top.fail(
+        raise top.error_at(
             "joint_type", f"{len(types)} joint types for {len(names)} joints, give one of each"
         )
     for kind in types:
-        pair = _UNIVERSAL.fullmatch(kind)
-        if kind not in _TYPES and (pair is None or pair[1] == pair[2]):
-            raise top.fail("joint_type", f"joint type '{kind}' is unknown, {known(_TYPES, kind)}")
-    where = top.where("joint_type")
+        universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
+        if kind not in _JOINT_TYPES and (
+            universal_axes is None or universal_axes[1] == universal_axes[2]
+        ):
+            raise top.error_at(
+                "joint_type",
+                f"joint type '{kind}' is unknown, {suggest_names(_JOINT_TYPES, kind)}",
+            )
+    where = top.source_location("joint_type")
     return {name: (kind, where) for name, kind in zip(names, types, strict=True)}
 
 
-def _replace(xml: XmlFile, replaced: dict[str, tuple[str, str]], top: Section) -> None:
+def _replace_joint_types(
+    xml: XmlFile, replaced_types: dict[str, tuple[str, str]], top: YamlSection
+) -> None:
     """Write the other types into a URDF."""
     joints = {joint.get("name", "").strip(): joint for joint in xml.root.iterfind("joint")}
-    for name, (kind, _) in replaced.items():
+    for name, (kind, _) in replaced_types.items():
         if name not in joints:
-            raise top.fail("joint_name", f"joint '{name}' is unknown, {known(joints, name)}")
+            raise top.error_at(
+                "joint_name", f"joint '{name}' is unknown, {suggest_names(joints, name)}"
+            )
         joint = joints[name]
-        if joint.get("type") not in MOVING:
-            raise top.fail("joint_name", f"joint '{name}' is {joint.get('type')}, leave it out")
-        of_before = [x for x in joint if x.tag in ("limit", "dynamics", "mimic")]
-        for element in of_before:
+        if joint.get("type") not in MOVABLE_TYPES:
+            raise top.error_at(
+                "joint_name", f"joint '{name}' is {joint.get('type')}, leave it out"
+            )
+        old_elements = [x for x in joint if x.tag in ("limit", "dynamics", "mimic")]
+        for element in old_elements:
             joint.remove(element)
         joint.set("type", kind.lower() if kind in ("SPHERICAL", "FIXED") else "continuous")
         joint.attrib.pop("independent", None)
 
 
-def _split(urdf: Urdf, name: str, axes: tuple[str, str]) -> Urdf:
+def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) -> UrdfModel:
     """A universal joint as two about axes of the joint's frame, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
         if isinstance(part, Joint) and part.name == name:
-            parts += _universal(part, axes, urdf.tree)
+            parts += _universal_joint_parts(part, axes, urdf.tree)
         else:
             parts.append(part)
-    return dataclasses.replace(urdf, tree=Tree({}, {}).replacing(*parts))
+    return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
 
 
-def _universal(joint: Joint, axes: tuple[str, str], tree: Tree) -> list[Link | Joint]:
+def _universal_joint_parts(joint: Joint, axes: tuple[str, str], tree: Tree) -> list[Link | Joint]:
     """What a joint becomes as a universal one, under names that the tree does not have."""
     freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
-    place, ends = (joint.xyz, joint.rpy), (joint.parent, joint.child)
-    parts = series(joint.name, freedoms, place, ends, joint.where)
+    place, end_links = (joint.xyz, joint.rpy), (joint.parent, joint.child)
+    parts = joint_series(joint.name, freedoms, place, end_links, joint.source_location)
     for made in parts:
         if made.name in (tree.links if isinstance(made, Link) else tree.joints):
             raise DescriptionError(
-                f"{joint.where}: joint '{joint.name}' makes '{made.name}', which is there "
+                f"{joint.source_location}: joint '{joint.name}' makes '{made.name}', which is "
+                f"there "
                 "already, rename one"
             )
     return parts
 
 
-def _loops(top: Section, urdf: Urdf, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
+def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Loops between the frames of `closed_loop`: points that coincide, or frames."""
     pairs = top.pairs("closed_loop") if "closed_loop" in top else []
     kinds = top.texts("type") if "type" in top else ("6d",) * len(pairs)
     if len(kinds) != len(pairs):
-        raise top.fail("type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one")
-    below = {joint.name: joint.child for joint in urdf.tree.joints.values()}
+        raise top.error_at(
+            "type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one"
+        )
+    child_links = {joint.name: joint.child for joint in urdf.tree.joints.values()}
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
-        if kind.lower() not in _LOOPS:
-            raise top.fail("type", f"a closed loop has the type '{kind}', write 3d or 6d")
-        links = [name if name in tree.links else below.get(name, "") for name in pair]
-        lost = [name for name, link in zip(pair, links, strict=True) if not link]
-        if lost:
-            problem = f"the frame '{lost[0]}' is unknown, {known(tree.links, lost[0])}"
-            raise top.fail("closed_loop", problem)
+        if kind.lower() not in _LOOP_TYPES:
+            raise top.error_at("type", f"a closed loop has the type '{kind}', write 3d or 6d")
+        links = [name if name in tree.links else child_links.get(name, "") for name in pair]
+        unknown_frames = [name for name, link in zip(pair, links, strict=True) if not link]
+        if unknown_frames:
+            problem = (
+                f"the frame '{unknown_frames[0]}' is unknown, "
+                f"{suggest_names(tree.links, unknown_frames[0])}"
+            )
+            raise top.error_at("closed_loop", problem)
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
-            raise top.fail(
+            raise top.error_at(
                 "closed_loop", f"{pair[0]} and {pair[1]} are closed twice, once will do"
             )
-        where = top.where("closed_loop")
-        loop = LoopSpec(name, _LOOPS[kind.lower()], links[0], links[1], (0.0, 0.0, 1.0), where)
+        where = top.source_location("closed_loop")
+        loop = LoopSpec(
+            name, _LOOP_TYPES[kind.lower()], links[0], links[1], (0.0, 0.0, 1.0), where
+        )
         tree.check_loop(loop)
         loops[name] = loop
     return tuple(loops.values())

@@ -1,8 +1,9 @@
 """The hydraulic circuit: its parts, the laws of their flows, the equations of the whole."""
 
-from crane.hydraulics.circuit import Circuit
+from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
+from crane.hydraulics.circuit_equations import CircuitEquations
 from crane.hydraulics.components import (
-    Counterbalance,
+    CounterbalanceValve,
     Cylinder,
     Hydraulics,
     Oil,
@@ -10,11 +11,22 @@ from crane.hydraulics.components import (
     Spool,
     Valve,
 )
-from crane.hydraulics.curve import Curve
-from crane.hydraulics.elements import Accumulator, Element, Line
-from crane.hydraulics.sources import Engine, Supply
+from crane.hydraulics.opening_curve import OpeningCurve
+from crane.hydraulics.supply_and_engine import Engine, Supply
 
 __all__ = [
-    "Accumulator", "Circuit", "Counterbalance", "Curve", "Cylinder", "Element", "Engine",
-    "Hydraulics", "Line", "Oil", "PDGains", "Spool", "Supply", "Valve",
-]  # fmt: skip
+    "Accumulator",
+    "CircuitEquations",
+    "CounterbalanceValve",
+    "OpeningCurve",
+    "Cylinder",
+    "CircuitElement",
+    "Engine",
+    "Hydraulics",
+    "CircuitLine",
+    "Oil",
+    "PDGains",
+    "Spool",
+    "Supply",
+    "Valve",
+]

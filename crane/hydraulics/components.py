@@ -4,14 +4,31 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from crane.common.errors import known
-from crane.common.magnitudes import meant
-from crane.hydraulics.curve import Curve
-from crane.hydraulics.elements import Accumulator, Element, Line
-from crane.hydraulics.numbers import PartError, PlacedError, above, check_numbers, positive, signed
-from crane.hydraulics.sources import MAIN, TANK, Engine, Supply, check_summed, check_tanks
+from crane.common.errors import suggest_names
+from crane.common.plausible_ranges import suggested_units_text
+from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
+from crane.hydraulics.opening_curve import OpeningCurve
+from crane.hydraulics.parameter_checks import (
+    CircuitPathError,
+    ComponentParameterError,
+    check_parameters,
+    positive_field,
+    positive_field_with_default,
+    signed_field,
+)
+from crane.hydraulics.supply_and_engine import (
+    MAIN_PUMP,
+    TANK_NODE,
+    Engine,
+    Supply,
+    check_pump_pressures,
+    check_summed_pumps,
+)
 
-HOLDING = ("counterbalance_a", "counterbalance_b")  # valves of a cylinder that hold its load
+COUNTERBALANCE_KEYS = (
+    "counterbalance_a",
+    "counterbalance_b",
+)  # valves of a cylinder that hold its load
 
 
 @dataclass(frozen=True)
@@ -27,19 +44,19 @@ class Oil:
         air: Share of a volume that free air in the oil has at 1e5 Pa.
     """
 
-    bulk_modulus: float = above(1.65e9)
+    bulk_modulus: float = positive_field_with_default(1.65e9)
     hose_modulus: float = 0.0
     steel_modulus: float = 0.0
     vapour_pressure: float = 1.0e3
-    gas_exponent: float = above(1.4)
+    gas_exponent: float = positive_field_with_default(1.4)
     air: float = 0.0
 
     def __post_init__(self) -> None:
-        check_numbers(self, "the oil")
+        check_parameters(self, "the oil")
 
 
 @dataclass(frozen=True)
-class Counterbalance:
+class CounterbalanceValve:
     """A load-holding valve at one chamber: free inflow, outflow only when piloted open.
 
     Opening = (p + pilot_ratio p_other - pressure) / range, from 0 to 1.
@@ -51,13 +68,13 @@ class Counterbalance:
         coefficient: Flow per root of pressure, fully open [m3/(s Pa^0.5)].
     """
 
-    pressure: float = positive()
-    pilot_ratio: float = positive()
-    range: float = positive()
-    coefficient: float = positive()
+    pressure: float = positive_field()
+    pilot_ratio: float = positive_field()
+    range: float = positive_field()
+    coefficient: float = positive_field()
 
     def __post_init__(self) -> None:
-        check_numbers(self, "the counterbalance valve")
+        check_parameters(self, "the counterbalance valve")
 
 
 @dataclass(frozen=True)
@@ -90,7 +107,7 @@ class Cylinder:
             [N m/rad]; 0 for none.
         damping: Of a damper beside that spring [N s/m] or [N m s/rad].
         seal_friction: By how much the pressures of both chambers raise the joint's Coulomb
-            friction [N/Pa] or [N m/Pa], see `DrivenCylinder.grip`.
+            friction [N/Pa] or [N m/Pa], see `ValveCylinderEquations.circuit_friction`.
         brake: What a spring-applied brake holds while the spool is within its dead band [N] or
             [N m]; 0 for none.
         brake_release: Spool travel beyond the dead band over which it lets go.
@@ -107,27 +124,27 @@ class Cylinder:
     """
 
     joint: str
-    area_a: float = positive()
-    area_b: float = positive()
-    hose_a: float = positive()
-    hose_b: float = positive()
+    area_a: float = positive_field()
+    area_b: float = positive_field()
+    hose_a: float = positive_field()
+    hose_b: float = positive_field()
     gas_a: float = 0.0
     gas_b: float = 0.0
     leakage: float = 0.0
     leakage_a: float = 0.0
     leakage_b: float = 0.0
     relief: float = 0.0
-    relief_gain: float = above(1.0e-9)
+    relief_gain: float = positive_field_with_default(1.0e-9)
     refill: float = 0.0
     cushion: float = 0.0
-    cushion_coefficient: float = above(1.0e-7)
+    cushion_coefficient: float = positive_field_with_default(1.0e-7)
     stiffness: float = 0.0
-    damping: float = above(1.0e5)
+    damping: float = positive_field_with_default(1.0e5)
     seal_friction: float = 0.0
     brake: float = 0.0
-    brake_release: float = above(0.05)
-    counterbalance_a: Counterbalance | None = None
-    counterbalance_b: Counterbalance | None = None
+    brake_release: float = positive_field_with_default(0.05)
+    counterbalance_a: CounterbalanceValve | None = None
+    counterbalance_b: CounterbalanceValve | None = None
     cross_relief: float = 0.0
     rupture_a: float = 0.0
     rupture_b: float = 0.0
@@ -136,14 +153,16 @@ class Cylinder:
     count: int = 1
 
     def __post_init__(self) -> None:
-        what = f"the cylinder of '{self.joint}'"
-        check_numbers(self, what)
+        label = f"the cylinder of '{self.joint}'"
+        check_parameters(self, label)
         if not isinstance(self.count, int) or self.count < 1:
-            raise PartError("count", f"count of {what} is {self.count}, give a whole number")
+            raise ComponentParameterError(
+                "count", f"count of {label} is {self.count}, give a whole number"
+            )
         if self.tube and not self.tube > self.bore:
-            raise PartError(
+            raise ComponentParameterError(
                 "tube",
-                f"tube of {what} is {self.tube:g} m, it must be more than the bore of "
+                f"tube of {label} is {self.tube:g} m, it must be more than the bore of "
                 f"{self.bore:.4g} m",
             )
 
@@ -158,7 +177,7 @@ class Cylinder:
         return math.sqrt(4 / math.pi * abs(self.area_a - self.area_b) / self.count)
 
     @property
-    def grips(self) -> bool:
+    def adds_friction(self) -> bool:
         """Whether it adds to the joint's Coulomb friction."""
         return self.seal_friction > 0 or self.brake > 0
 
@@ -180,19 +199,19 @@ class Spool:
     """
 
     joint: str
-    neutral: float = signed(0.0)
-    full: float = signed(1.0)
+    neutral: float = signed_field(0.0)
+    full: float = signed_field(1.0)
     dead_band: float = 0.0
     bandwidth: float = 0.0
-    damping: float = above(1.0)
+    damping: float = positive_field_with_default(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        what = f"the second spool of '{self.joint}'"
-        check_numbers(self, what)
-        _check_spool(self, what)
+        label = f"the second spool of '{self.joint}'"
+        check_parameters(self, label)
+        _check_spool(self, label)
 
 
 @dataclass(frozen=True)
@@ -255,16 +274,16 @@ class Valve:
     """
 
     joint: str
-    c1: float = positive()
-    c2: float = positive()
-    c3: float = positive()
-    c4: float = positive()
+    c1: float = positive_field()
+    c2: float = positive_field()
+    c3: float = positive_field()
+    c4: float = positive_field()
     margin: float = 0.0
-    neutral: float = signed(0.0)
-    full: float = signed(1.0)
+    neutral: float = signed_field(0.0)
+    full: float = signed_field(1.0)
     dead_band: float = 0.0
     bandwidth: float = 0.0
-    damping: float = above(1.0)
+    damping: float = positive_field_with_default(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
     delay: float = 0.0
@@ -275,37 +294,41 @@ class Valve:
     demand: float = 1.0
     sharing: bool = False
     priority: bool = False
-    supply: str = MAIN
-    return_a: str = TANK
-    return_b: str = TANK
-    curves: Mapping[str, Curve] = field(default_factory=dict)
+    supply: str = MAIN_PUMP
+    return_a: str = TANK_NODE
+    return_b: str = TANK_NODE
+    curves: Mapping[str, OpeningCurve] = field(default_factory=dict)
     spool_b: Spool | None = None
 
     def __post_init__(self) -> None:
-        what = f"the valve of '{self.joint}'"
-        check_numbers(self, what)
+        label = f"the valve of '{self.joint}'"
+        check_parameters(self, label)
         if self.priority and not self.margin:
-            raise PartError("priority", f"{what} has priority and no margin to keep, give it one")
+            raise ComponentParameterError(
+                "priority", f"{label} has priority and no margin to keep, give it one"
+            )
         if self.sharing and self.margin:
-            raise PartError("margin", f"{what} shares its flow, leave 'margin' to the pump")
+            raise ComponentParameterError(
+                "margin", f"{label} shares its flow, leave 'margin' to the pump"
+            )
         if (self.float_from > 0) != (self.float_coefficient > 0) or self.float_from >= 1:
-            raise PartError(
+            raise ComponentParameterError(
                 "float_from",
-                f"{what} floats from {self.float_from:g} with the coefficient "
+                f"{label} floats from {self.float_from:g} with the coefficient "
                 f"{self.float_coefficient:g}, give both, from below 1",
             )
-        _check_spool(self, what)
+        _check_spool(self, label)
         for key in ("centre", "regeneration", "float_from") if self.spool_b else ():
             if getattr(self, key):
-                raise PartError(
-                    key, f"{what} has two spools and '{key}', which goes with one, remove it"
+                raise ComponentParameterError(
+                    key, f"{label} has two spools and '{key}', which goes with one, remove it"
                 )
 
     @property
     def spools(self) -> "dict[str, Valve | Spool]":
         """What moves its spools, by the names of their signals."""
-        own: dict[str, Valve | Spool] = {self.joint: self}
-        return own | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
+        main_spool: dict[str, Valve | Spool] = {self.joint: self}
+        return main_spool | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
 
     def opening(self, u: float) -> float:
         """Opening y of a spool position u."""
@@ -313,25 +336,28 @@ class Valve:
         return math.copysign(size, u)
 
 
-def _check_spool(spool: Spool | Valve, what: str) -> None:
+def _check_spool(spool: Spool | Valve, label: str) -> None:
     """Raise for what no spool can have.
 
     Raises:
         PartError: Of the number.
     """
     if spool.hysteresis >= 0.5:
-        raise PartError("hysteresis", f"hysteresis of {what} is {spool.hysteresis:g}, give a "
-                        "share of the stroke, below 0.5")  # fmt: skip
+        raise ComponentParameterError(
+            "hysteresis",
+            f"hysteresis of {label} is {spool.hysteresis:g}, give a "
+            "share of the stroke, below 0.5",
+        )
     if spool.full == spool.neutral:
-        text = f"full and neutral of {what} are both {spool.full:g}, give two"
-        raise PartError("full", text)
+        text = f"full and neutral of {label} are both {spool.full:g}, give two"
+        raise ComponentParameterError("full", text)
     if spool.dead_band >= 1:
-        text = f"dead_band of {what} is {spool.dead_band:g}, it must be below 1"
+        text = f"dead_band of {label} is {spool.dead_band:g}, it must be below 1"
         if spool.dead_band < 100:
             text += f": looks like percent, write {spool.dead_band / 100:g}"
-        raise PartError("dead_band", text)
+        raise ComponentParameterError("dead_band", text)
     if spool.rate and not spool.bandwidth:
-        raise PartError("rate", f"{what} has a rate but no bandwidth, give both")
+        raise ComponentParameterError("rate", f"{label} has a rate but no bandwidth, give both")
 
 
 @dataclass(frozen=True)
@@ -347,7 +373,7 @@ class PDGains:
     kd: float
 
     def __post_init__(self) -> None:
-        check_numbers(self, "PD gains")
+        check_parameters(self, "PD gains")
 
 
 @dataclass(frozen=True)
@@ -377,68 +403,71 @@ class Hydraulics:
     control: Mapping[str, PDGains] = field(default_factory=dict)
     supplies: Mapping[str, Supply] = field(default_factory=dict)
     engine: Engine | None = None
-    lines: Mapping[str, Line] = field(default_factory=dict)
+    lines: Mapping[str, CircuitLine] = field(default_factory=dict)
     accumulators: Mapping[str, Accumulator] = field(default_factory=dict)
-    elements: Mapping[str, Element] = field(default_factory=dict)
+    elements: Mapping[str, CircuitElement] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_tank(self.supply, self.oil)
+        check_tank_pressure(self.supply, self.oil)
         for cylinder in self.cylinders.values():
-            check_relief(self.supply, cylinder)
-        check_tanks(self.sources)
-        check_summed(self.sources)
-        nodes, chambers = self.nodes, self._chambers
+            check_relief_pressure(self.supply, cylinder)
+        check_pump_pressures(self.pumps)
+        check_summed_pumps(self.pumps)
+        nodes, chambers = self.node_names, self._chamber_nodes
         channels = [name.replace(".", "_") for name in nodes]  # as pressures are recorded
-        for field_name, own in self._own_nodes.items():
+        for field_name, own in self._named_nodes.items():
             for name in own:
                 if channels.count(name) > 1:
-                    raise PlacedError(
+                    raise CircuitPathError(
                         (field_name, name), f"two nodes are called '{name}', give them names"
                     )
         for joint, valve in self.valves.items():
-            at, what = ("valves", joint), f"valve of '{joint}'"
-            if valve.supply not in self.sources:
-                raise PlacedError(
-                    (*at, "supply"),
-                    f"{what} is fed by '{valve.supply}', {known(self.sources, valve.supply)}",
+            path, label = ("valves", joint), f"valve of '{joint}'"
+            if valve.supply not in self.pumps:
+                raise CircuitPathError(
+                    (*path, "supply"),
+                    f"{label} is fed by '{valve.supply}', "
+                    f"{suggest_names(self.pumps, valve.supply)}",
                 )
             if valve.spool_b and f"{joint}_b" in self.valves:
-                raise PlacedError(
-                    (*at, "spool_b"),
+                raise CircuitPathError(
+                    (*path, "spool_b"),
                     f"the second spool of '{joint}' is called as the joint '{joint}_b', give that "
                     "another name",
                 )
             for key in ("return_a", "return_b"):
-                back = getattr(valve, key)
-                _known_node([x for x in nodes if x not in chambers], what, back, (*at, key))
+                return_node = getattr(valve, key)
+                _check_node(
+                    [x for x in nodes if x not in chambers], label, return_node, (*path, key)
+                )
         for name, element in self.elements.items():
-            at, what = ("elements", name), f"element '{name}'"
-            _known_node(nodes, what, element.source, (*at, "from"))
-            _known_node(nodes, what, element.target, (*at, "to"))
+            path, label = ("elements", name), f"element '{name}'"
+            _check_node(nodes, label, element.source, (*path, "from"))
+            _check_node(nodes, label, element.target, (*path, "to"))
             for joint in element.joints:
                 if joint not in self.valves:
-                    raise PlacedError(
-                        (*at, "joints"),
-                        f"{what} is opened by '{joint}', {known(self.valves, joint)}",
+                    raise CircuitPathError(
+                        (*path, "joints"),
+                        f"{label} is opened by '{joint}', {suggest_names(self.valves, joint)}",
                     )
 
     @property
-    def sources(self) -> dict[str, Supply]:
+    def pumps(self) -> dict[str, Supply]:
         """All pumps by their nodes' names."""
-        return {MAIN: self.supply, **self.supplies}
+        return {MAIN_PUMP: self.supply, **self.supplies}
 
     @property
-    def nodes(self) -> list[str]:
+    def node_names(self) -> list[str]:
         """Names of all nodes: tank, pumps, lines, accumulators, chambers JOINT.a and JOINT.b."""
-        own = [*self.sources, *self.lines, *self.accumulators]
-        return [TANK, *own, *self._chambers]
+        own = [*self.pumps, *self.lines, *self.accumulators]
+        return [TANK_NODE, *own, *self._chamber_nodes]
 
     @property
-    def _chambers(self) -> list[str]:
+    def _chamber_nodes(self) -> list[str]:
         return [f"{joint}.{side}" for joint in self.cylinders for side in "ab"]
 
     @property
-    def _own_nodes(self) -> dict[str, Iterable[str]]:
+    def _named_nodes(self) -> dict[str, Iterable[str]]:
         """Nodes that are named freely, by the field that they are in."""
         return {name: getattr(self, name) for name in ("supplies", "lines", "accumulators")}
 
@@ -453,11 +482,11 @@ class Hydraulics:
         return {name: x for valve in self.valves.values() for name, x in valve.spools.items()}
 
     @property
-    def gripped(self) -> tuple[str, ...]:
+    def circuit_friction_joints(self) -> tuple[str, ...]:
         """The joints whose Coulomb friction it adds to."""
-        return tuple(joint for joint, cylinder in self.cylinders.items() if cylinder.grips)
+        return tuple(joint for joint, cylinder in self.cylinders.items() if cylinder.adds_friction)
 
-    def only(self, joints: Iterable[str]) -> "Hydraulics | None":
+    def select_joints(self, joints: Iterable[str]) -> "Hydraulics | None":
         """The circuit of some joints, in their order; None if it drives none of them.
 
         Elements at chambers that are gone go, too, and lines that nothing leads to any more.
@@ -465,40 +494,42 @@ class Hydraulics:
         kept = [joint for joint in joints if joint in self.cylinders]
         if not kept:
             return None
-        gone = {
+        removed_nodes = {
             f"{joint}.{side}" for joint in self.cylinders if joint not in kept for side in "ab"
         }
         valves = {joint: self.valves[joint] for joint in kept}
         elements = {
             name: replace(x, joints=tuple(joint for joint in x.joints if joint in kept))
             for name, x in self.elements.items()
-            if not gone & {x.source, x.target}
+            if not removed_nodes & {x.source, x.target}
             and (not x.joints or any(joint in kept for joint in x.joints))
         }
-        met = _met(elements.values(), valves.values())
+        connected_nodes = _connected_nodes(elements.values(), valves.values())
         return replace(
             self,
             cylinders={joint: self.cylinders[joint] for joint in kept},
             valves=valves,
             control={joint: self.control[joint] for joint in kept if self.control},
             elements=elements,
-            lines={name: x for name, x in self.lines.items() if name in met},
-            accumulators={name: x for name, x in self.accumulators.items() if name in met},
+            lines={name: x for name, x in self.lines.items() if name in connected_nodes},
+            accumulators={
+                name: x for name, x in self.accumulators.items() if name in connected_nodes
+            },
         )
 
 
-def _known_node(nodes: list[str], what: str, name: str, path: tuple[str, ...]) -> None:
+def _check_node(nodes: list[str], label: str, name: str, path: tuple[str, ...]) -> None:
     if name not in nodes:
-        raise PlacedError(path, f"{what} leads to '{name}', {known(nodes, name)}")
+        raise CircuitPathError(path, f"{label} leads to '{name}', {suggest_names(nodes, name)}")
 
 
-def _met(elements: Iterable[Element], valves: Iterable[Valve]) -> set[str]:
+def _connected_nodes(elements: Iterable[CircuitElement], valves: Iterable[Valve]) -> set[str]:
     """Nodes that elements and returns of valves lead to."""
-    met = {x for item in elements for x in (item.source, item.target)}
-    return met | {x for valve in valves for x in (valve.return_a, valve.return_b)}
+    connected = {x for item in elements for x in (item.source, item.target)}
+    return connected | {x for valve in valves for x in (valve.return_a, valve.return_b)}
 
 
-def check_tank(supply: Supply, oil: Oil) -> None:
+def check_tank_pressure(supply: Supply, oil: Oil) -> None:
     """Raise where the oil boils in the tank.
 
     Raises:
@@ -506,23 +537,23 @@ def check_tank(supply: Supply, oil: Oil) -> None:
     """
     if supply.tank <= oil.vapour_pressure:
         hint = ": pressures count from a vacuum, write 1e5 for an open tank"
-        raise PartError(
+        raise ComponentParameterError(
             "tank",
             f"pressure of the tank is {supply.tank:g} Pa, the oil boils at "
-            f"{oil.vapour_pressure:g} Pa{meant('tank', supply.tank) or hint}",
+            f"{oil.vapour_pressure:g} Pa{suggested_units_text('tank', supply.tank) or hint}",
         )
 
 
-def check_relief(supply: Supply, cylinder: Cylinder) -> None:
+def check_relief_pressure(supply: Supply, cylinder: Cylinder) -> None:
     """Raise where a relief valve would never close.
 
     Raises:
         PartError: Of the relief pressure.
     """
     if 0 < cylinder.relief <= supply.tank:
-        raise PartError(
+        raise ComponentParameterError(
             "relief",
             f"relief of the cylinder of '{cylinder.joint}' is {cylinder.relief:g} Pa, not above "
             f"the tank's {supply.tank:g} Pa, so that it would never close"
-            f"{meant('relief', cylinder.relief) or ', give a higher one'}",
+            f"{suggested_units_text('relief', cylinder.relief) or ', give a higher one'}",
         )

@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from crane.closure import Closure, frame_id
 from crane.closure.coordinates import Coordinates
-from crane.common.errors import InputError, LimitError, known
-from crane.common.packages import Given
+from crane.common.errors import InputError, LimitError, suggest_names
+from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_number, as_sample, as_samples
-from crane.common.shown import Brief, counted
 from crane.description import (
+    AnyForceElement,
     Chain,
     Drive,
-    Element,
     EndStop,
     ForceElement,
     Friction,
@@ -30,23 +30,23 @@ from crane.description import (
     Rope,
     Sensor,
     Task,
-    bundled,
-    examples,
+    bundled_machines,
+    example_robots,
     inertia_problem,
 )
-from crane.description.estimation import Estimation
-from crane.description.external import ExternalForce, PhasedWrench
-from crane.description.rigid import loaded
-from crane.description.sources import WITH, command_words
-from crane.description.tree import Tree
+from crane.description.estimation_settings import EstimationSettings
+from crane.description.external_forces import ExternalForce, PhasedWrench
+from crane.description.kinematic_tree import Tree
+from crane.description.machine_lookup import CHANGES_SEPARATOR, command_line_arguments
+from crane.description.pinocchio_conversion import add_rigid_load
 from crane.hydraulics import Hydraulics
-from crane.machine.between import misplaced
+from crane.machine.frame_element_checks import frame_element_problems
 
-_LIMIT_SLACK = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
+_LIMIT_TOLERANCE = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
 
 
 @dataclass(frozen=True, repr=False)
-class Payload(Brief):
+class Payload(OneLineRepr):
     """A rigid load put on a frame at run time.
 
     Attributes:
@@ -64,7 +64,7 @@ class Payload(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Machine(Brief):
+class Machine(OneLineRepr):
     """A machine with closed kinematic chains, ready to be computed with.
 
     Attributes:
@@ -91,16 +91,17 @@ class Machine(Brief):
         estimation: What `identify` estimates, and knows before.
         sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
         free: Active joints that nothing drives: no force but friction, springs and stops.
-        external: Forces from outside.
+        external_forces: Forces from outside.
         supports: Links that it stands on; none where those are its contacts.
-        pins: The largest force that pins bear, by joint or loop [N].
-        motors: What the file says that motors act on (actuators of a MJCF), or all drives where
-            there are more than freedoms; empty where `drives` are the active joints.
-        changes: Numbers that are not those of its files, by name.
-        locks: Where joints are held that its files let move, by name [m], [rad].
-        chosen: Active and free joints that are not those of its file, under "active" and "free".
-        floats: Whether its root was made to float, which its file lets stand on the ground, or by
-            which freedoms.
+        pin_capacities: The largest force that pins bear, by joint or loop [N].
+        explicit_drives: What the file says that motors act on (actuators of a MJCF), or all drives
+            where there are more than freedoms; empty where `drives` are the active joints.
+        parameter_changes: Numbers that are not those of its files, by name.
+        locked_joints: Where joints are held that its files let move, by name [m], [rad].
+        chosen_joints: Active and free joints that are not those of its file, under "active" and
+            "free".
+        floating_base: Whether its root was made to float, which its file lets stand on the ground,
+            or by which freedoms.
         packages: Folders in which its files' packages were sought.
         arguments: Values of its file's arguments.
     """
@@ -124,27 +125,27 @@ class Machine(Brief):
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
     hydraulics: Hydraulics | None
-    estimation: Estimation
+    estimation: EstimationSettings
     sensors: Mapping[str, Sensor]
     free: tuple[str, ...]
-    external: tuple[ExternalForce, ...]
+    external_forces: tuple[ExternalForce, ...]
     supports: tuple[str, ...]
-    pins: Mapping[str, float]
-    motors: tuple[Drive, ...]
-    changes: Mapping[str, float]
-    locks: Mapping[str, float]
-    chosen: Mapping[str, tuple[str, ...]]
-    floats: bool | tuple[str, ...]
+    pin_capacities: Mapping[str, float]
+    explicit_drives: tuple[Drive, ...]
+    parameter_changes: Mapping[str, float]
+    locked_joints: Mapping[str, float]
+    chosen_joints: Mapping[str, tuple[str, ...]]
+    floating_base: bool | tuple[str, ...]
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
 
-    def _line(self) -> str:
+    def _one_line(self) -> str:
         """Name, degrees of freedom, joints, loops, and what is special about what drives it."""
         words = [
             repr(self.name),
-            counted(len(self.active), "degree of freedom", "degrees of freedom"),
-            counted(len(self.joints), "joint"),
-            counted(len(self.closure.equations.loops), "loop"),
+            format_count(len(self.active), "degree of freedom", "degrees of freedom"),
+            format_count(len(self.joints), "joint"),
+            format_count(len(self.closure.equations.loops), "loop"),
             *(["hydraulic"] if self.hydraulics is not None else []),
             *([f"{len(self.free)} free"] if self.free else []),
         ]
@@ -156,17 +157,17 @@ class Machine(Brief):
         return self.closure.home
 
     @property
-    def traced(self) -> bool:
+    def has_traceable_forces(self) -> bool:
         """Whether all that acts on it from outside can become machine code."""
-        return all(force.traced for force in self.external)
+        return all(force.is_traceable for force in self.external_forces)
 
     @property
-    def elements(self) -> tuple[Element, ...]:
+    def force_elements(self) -> tuple[AnyForceElement, ...]:
         """Its force elements, gas springs and ropes, along joints and between frames."""
         return (*self.forces, *self.gas_springs, *self.ropes)
 
     @property
-    def undriven(self) -> tuple[str, ...]:
+    def undriven_joints(self) -> tuple[str, ...]:
         """Active joints that are not free, and that nothing is said to drive either.
 
         A joint is driven that has an `effort` above 0 in the `<limit>` of its URDF, a cylinder,
@@ -175,11 +176,11 @@ class Machine(Brief):
         """
         driven = {
             *self.free,
-            *self.chosen.get("active", ()),
+            *self.chosen_joints.get("active", ()),
             *self.control,
             *(self.hydraulics.joints if self.hydraulics else ()),
         }
-        driven |= {joint for motor in self.motors for joint in motor.factors}
+        driven |= {joint for motor in self.explicit_drives for joint in motor.factors}
         efforts = self.model.effortLimit[self.closure.active]
         return tuple(
             joint
@@ -190,7 +191,9 @@ class Machine(Brief):
     @cached_property
     def drives(self) -> tuple[Drive, ...]:
         """What acts on the machine: its motors, or one drive along each driven active joint."""
-        return self.motors or tuple(Drive(joint, {joint: 1.0}) for joint in self.driven_joints)
+        return self.explicit_drives or tuple(
+            Drive(joint, {joint: 1.0}) for joint in self.driven_joints
+        )
 
     @property
     def driven_joints(self) -> tuple[str, ...]:
@@ -198,48 +201,55 @@ class Machine(Brief):
         return tuple(joint for joint in self.active if joint not in self.free)
 
     @cached_property
-    def driven(self) -> NDArray[np.bool_]:
+    def is_driven(self) -> NDArray[np.bool_]:
         """(n,) whether each active joint is driven, which free ones are not."""
         return np.array([joint not in self.free for joint in self.active])
 
-    def spread(self, x: ArrayLike, what: str) -> Array:
+    def expand_driven(self, x: ArrayLike, label: str) -> Array:
         """Something of the k driven joints, (k,) or (N, k), with zeros of the free ones: (., n).
 
         Raises:
             InputError: Wrong shape or not finite.
         """
-        given = as_samples(x, len(self.driven_joints), what, self.driven_joints)
+        given = as_samples(x, len(self.driven_joints), label, self.driven_joints)
         out = np.zeros((*given.shape[:-1], len(self.active)))
-        out[..., self.driven] = given
+        out[..., self.is_driven] = given
         return out
 
     @cached_property
-    def reference(self) -> str:
+    def load_name(self) -> str:
         """What `load` takes to load it again: the bundled name, or the path."""
         known_as = self.path.stem
-        bundle = bundled()
-        named = bundle if known_as in bundle else examples()
+        bundle = bundled_machines()
+        named = bundle if known_as in bundle else example_robots()
         return known_as if named.get(known_as) == self.path else str(self.path)
 
     @property
-    def call(self) -> str:
+    def load_expression(self) -> str:
         """What `recalled` takes to load it again, changes and locks included.
 
         Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
         given = {
-            "changes": dict(self.changes), "lock": dict(self.locks), "floating": self.floats,
-            "packages": self.packages, "arguments": dict(self.arguments),
-        }  # fmt: skip
-        given = {name: what for name, what in (given | dict(self.chosen)).items() if what}
-        return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
+            "changes": dict(self.parameter_changes),
+            "lock": dict(self.locked_joints),
+            "floating": self.floating_base,
+            "packages": self.packages,
+            "arguments": dict(self.arguments),
+        }
+        given = {name: what for name, what in (given | dict(self.chosen_joints)).items() if what}
+        return (
+            f"{self.load_name}{CHANGES_SEPARATOR}{json.dumps(given)}" if given else self.load_name
+        )
 
     @property
-    def command(self) -> str:
-        """What commands take to load it again, as words of a shell, see `command_words`."""
-        beside = Given(self.packages, self.arguments, bool(self.floats))
-        active, free = self.chosen.get("active"), self.chosen.get("free")
-        return command_words(self.reference, active, free, self.changes, self.locks, beside)
+    def command_line_arguments(self) -> str:
+        """Arguments of commands that load it again, quoted for a shell."""
+        load_options = LoadOptions(self.packages, self.arguments, bool(self.floating_base))
+        active, free = self.chosen_joints.get("active"), self.chosen_joints.get("free")
+        return command_line_arguments(
+            self.load_name, active, free, self.parameter_changes, self.locked_joints, load_options
+        )
 
     @property
     def coordinates(self) -> Coordinates:
@@ -272,27 +282,27 @@ class Machine(Brief):
         """
         if not self.model.existFrame(link, pin.FrameType.BODY):
             links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
-            raise InputError(f"frame '{link}' is unknown, {known(links, link)}")
+            raise InputError(f"frame '{link}' is unknown, {suggest_names(links, link)}")
         return frame_id(self.model, link)
 
-    def check_limits(self, q_a: ArrayLike, what: str = "q_a") -> Array:
+    def check_limits(self, q_a: ArrayLike, label: str = "q_a") -> Array:
         """Active coordinates (n,) or (N, n) that lie within the limits.
 
         Raises:
             InputError: Wrong shape or not finite.
             LimitError: A coordinate lies outside of its limits.
         """
-        q_a = as_samples(q_a, len(self.active), what, self.active)
-        slack = _LIMIT_SLACK * self.closure.units[self.closure.active]
+        q_a = as_samples(q_a, len(self.active), label, self.active)
+        slack = _LIMIT_TOLERANCE * self.closure.units[self.closure.active]
         outside = (q_a < self.lower - slack) | (q_a > self.upper + slack)
         if outside.any():
             index = tuple(int(i) for i in np.argwhere(outside)[0])
             joint = index[-1]
             sample = f" in sample {index[0]}" if q_a.ndim == 2 else ""
             name = self.active[joint]
-            place = self.tree.joints[name].limits.where
+            place = self.tree.joints[name].limits.source_location
             raise LimitError(
-                f"{what}: {name} = {q_a[index]:.6g}{sample} is outside of its limits "
+                f"{label}: {name} = {q_a[index]:.6g}{sample} is outside of its limits "
                 f"{self.lower[joint]:.6g} to {self.upper[joint]:.6g} {self.unit(name)}"
                 f"{f' ({place})' if place else ''}, choose one within them"
             )
@@ -308,7 +318,7 @@ class Machine(Brief):
         end_stops: tuple[EndStop, ...] | None = None,
         hydraulics: Hydraulics | None = None,
         sensors: Mapping[str, Sensor] | None = None,
-        estimation: Estimation | None = None,
+        estimation: EstimationSettings | None = None,
     ) -> "Machine":
         """The same machine with other friction, springs, ropes, stops, hydraulics or sensors.
 
@@ -319,14 +329,14 @@ class Machine(Brief):
         """
         for joint in friction or {}:
             self.column(joint)
-        elements: list[Element] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
+        elements: list[AnyForceElement] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
         for item in elements:
             if item.between is None:
                 self.column(item.joint)
             else:
                 for link in item.between:
                     self.frame(link)
-        for problem in misplaced(self.closure, elements):
+        for problem in frame_element_problems(self.closure, elements):
             raise InputError(problem)
         for spring in gas_springs or ():
             if [other.joint for other in gas_springs or ()].count(spring.joint) > 1:
@@ -339,7 +349,8 @@ class Machine(Brief):
         for joint in hydraulics.joints if hydraulics else ():
             if joint not in self.active:
                 raise InputError(
-                    f"'{joint}' has a cylinder and is not active, {known(self.active, joint)}"
+                    f"'{joint}' has a cylinder and is not active, "
+                    f"{suggest_names(self.active, joint)}"
                 )
             i = self.active.index(joint)
             if not np.isfinite([self.lower[i], self.upper[i]]).all():
@@ -358,7 +369,7 @@ class Machine(Brief):
             estimation=self.estimation if estimation is None else estimation,
         )
 
-    def driven_by(self, names: Sequence[str]) -> "Machine":
+    def with_active_joints(self, names: Sequence[str]) -> "Machine":
         """The same machine with other active joints: the angles of its booms, say.
 
         Home posture and assembly branch stay. With q_B the new active coordinates and q_A those
@@ -370,8 +381,9 @@ class Machine(Brief):
         tau_i = F_i dx_i/dq_i, for any choice of joints.
 
         The circuit keeps the cylinders whose joints are still active. Gains and tasks of active
-        joints are dropped unless they belong to the same joints. `reference` and `changes` stay:
-        what loads the machine again gives it with the active joints of its file.
+        joints are dropped unless they belong to the same joints. `load_name` and
+        `parameter_changes` stay: what loads the machine again gives it with the active joints of
+        its file.
 
         Args:
             names: As many joints as there are degrees of freedom, in the order of q_B.
@@ -387,50 +399,61 @@ class Machine(Brief):
                 raise InputError(
                     f"joint '{name}' is named twice among the active ones, once will do"
                 )
-        return self._seen_by(names, self._closure(names, self.home))
+        return self._with_closure(names, self._create_closure(names, self.home))
 
-    def seen_from(self, q: Array, names: tuple[str, ...]) -> "Machine":
-        """`driven_by` with another home posture, whose assembly branch need not be this one's.
+    def with_home_configuration(self, q: Array, names: tuple[str, ...]) -> "Machine":
+        """`with_active_joints` at another home, whose assembly branch may differ.
 
         Args:
             q: (nq,) closed posture, whose whole turns stay.
             names: Active joints.
 
         Raises:
-            MechanismError: See `driven_by`.
+            MechanismError: See `with_active_joints`.
         """
-        known = self.closure.around(q) if names == self.active else None
-        return self._seen_by(names, known or self._closure(names, q, wound=True))
+        known = self.closure.with_home_configuration(q) if names == self.active else None
+        return self._with_closure(
+            names, known or self._create_closure(names, q, keep_revolutions=True)
+        )
 
-    def _closure(self, names: tuple[str, ...], home: Array, wound: bool = False) -> Closure:
+    def _create_closure(
+        self, names: tuple[str, ...], home: Array, keep_revolutions: bool = False
+    ) -> Closure:
         equations = self.closure.equations
-        return Closure(self.model, equations.loops, names, home, equations.couplings, wound=wound)
+        return Closure(
+            self.model,
+            equations.loops,
+            names,
+            home,
+            equations.couplings,
+            keep_revolutions=keep_revolutions,
+        )
 
-    def _seen_by(self, names: tuple[str, ...], closure: Closure) -> "Machine":
+    def _with_closure(self, names: tuple[str, ...], closure: Closure) -> "Machine":
         same = set(names) == set(self.active)
         return dataclasses.replace(
             self,
             closure=closure,
             active=names,
-            lower=fixed(self.coordinates.lower[closure.active]),
-            upper=fixed(self.coordinates.upper[closure.active]),
+            lower=read_only_copy(self.coordinates.lower[closure.active]),
+            upper=read_only_copy(self.coordinates.upper[closure.active]),
             tasks=MappingProxyType(
                 {key: task for key, task in self.tasks.items() if same or task.space == "tip"}
             ),
             control=self.control if same else MappingProxyType({}),
-            hydraulics=self.hydraulics and self.hydraulics.only(names),
+            hydraulics=self.hydraulics and self.hydraulics.select_joints(names),
             free=tuple(name for name in names if name in self.free),
-            motors=(),
+            explicit_drives=(),
         )
 
-    def under(self, *forces: ExternalForce) -> "Machine":
+    def with_external_forces(self, *forces: ExternalForce) -> "Machine":
         """The same machine under more forces from outside.
 
         Raises:
             InputError: What is no such force, a frame that is unknown or does not move, or a name
                 that is taken.
         """
-        every = (*self.external, *forces)
+        every = (*self.external_forces, *forces)
         for force in forces:
             if not isinstance(force, ExternalForce):
                 raise InputError(f"{force!r} is no force from outside, give a crane.Wrench")
@@ -438,9 +461,9 @@ class Machine(Brief):
                 raise InputError(f"'{force.frame}' does not move, a load on it does nothing")
             if [other.name for other in every].count(force.name) > 1:
                 raise InputError(f"two loads are called '{force.name}', give them names")
-        return dataclasses.replace(self, external=every)
+        return dataclasses.replace(self, external_forces=every)
 
-    def timed(self, clock: Callable[[Array], Array] | None) -> "Machine":
+    def with_clock(self, clock: Callable[[Array], Array] | None) -> "Machine":
         """The same machine, with the forces that count phases by the clock of a run.
 
         Args:
@@ -449,16 +472,19 @@ class Machine(Brief):
         Raises:
             InputError: There is no clock for them.
         """
-        phased = [force for force in self.external if isinstance(force, PhasedWrench)]
-        if not phased:
+        phased_forces = [
+            force for force in self.external_forces if isinstance(force, PhasedWrench)
+        ]
+        if not phased_forces:
             return self
         if clock is None:
             raise InputError(
-                f"the load '{phased[0].name}' counts phases, simulate it with the task of levers "
+                f"the load '{phased_forces[0].name}' counts phases, simulate it with the task "
+                f"of levers "
                 "that has them"
             )
-        every = (x.ticking(clock) if x in phased else x for x in self.external)
-        return dataclasses.replace(self, external=tuple(every))
+        every = (x.with_clock(clock) if x in phased_forces else x for x in self.external_forces)
+        return dataclasses.replace(self, external_forces=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":
         """The same machine carrying a payload.
@@ -483,11 +509,11 @@ class Machine(Brief):
         load = pin.Inertia(mass, com, tensor)
         model = pin.Model(self.model)
         model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
-        tree = loaded(self.tree, payload.frame, load)
+        tree = add_rigid_load(self.tree, payload.frame, load)
         return dataclasses.replace(self, model=model, tree=tree)
 
 
-def fixed(array: Array) -> Array:
+def read_only_copy(array: Array) -> Array:
     """A copy that cannot be changed."""
     out = array.copy()
     out.flags.writeable = False

@@ -20,14 +20,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from crane.closure.equations import LoopEquations
-from crane.closure.exactness import DIGITS
-from crane.closure.structure import Indices
+from crane.closure.constraint_structure import Indices
+from crane.closure.constraint_tolerances import FILE_PRECISION
+from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec
-from crane.description.changes import number_at, tree_numbers
-from crane.machine.assemble import assemble
-from crane.machine.drives import active_joints
+from crane.description.parameter_changes import parameter_value, tree_parameters
+from crane.machine.drive_selection import specified_active_joints
+from crane.machine.machine_assembly import assemble_tree
 
 _LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not say
 _ITERATIONS, _CHANGES, _EVALUATIONS = 25, 6, 30
@@ -96,17 +96,22 @@ def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
     """
     equations = LoopEquations(model, spec.loops, spec.couplings)
     names = equations.coordinates.names
-    active = [names.index(name) for name in active_joints(spec, model)]
+    active = [names.index(name) for name in specified_active_joints(spec, model)]
     passive = np.setdiff1d(np.arange(model.nv), active)
     in_loops = (equations.sign != 0).any(axis=0)[passive]
     said = np.isin(names, list(spec.home))[passive]
     guess = _nearest(
-        equations, guess, passive[in_loops & ~said], lambda q, _: (*equations.scaled(q), guess)
+        equations,
+        guess,
+        passive[in_loops & ~said],
+        lambda q, _: (*equations.evaluate_scaled(q), guess),
     )
-    gaps, size = _gaps(equations, guess), equations.size
-    if not len(gaps) or gaps.max() <= DIGITS * size:
+    gaps, size = _gaps(equations, guess), equations.characteristic_length
+    if not len(gaps) or gaps.max() <= FILE_PRECISION * size:
         return None
-    open_loops = [loop for loop, gap in zip(spec.loops, gaps, strict=True) if gap > DIGITS * size]
+    open_loops = [
+        loop for loop, gap in zip(spec.loops, gaps, strict=True) if gap > FILE_PRECISION * size
+    ]
     tried = []
     for name, now, unit, turns, changed in _numbers(spec, equations, open_loops, guess, active):
         if (in_loops & said).any():
@@ -137,13 +142,17 @@ def _numbers(
 ) -> Iterator[tuple[str, float, float, bool, Changed]]:
     """Lengths that loops go through, and driven joints: name, value, unit, whether it turns."""
     joints = {joint for loop in loops for joint in _joints(spec, loop)}
-    size = equations.size
+    size = equations.characteristic_length
 
     def length(other: LoopEquations) -> Changed:
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
             (phi, slopes), (there, others) = equations.evaluate(q), other.evaluate(q)
-            shares = equations.row_units
-            slopes = (slopes + change * (others - slopes)) / shares[:, None] * equations.units
+            shares = equations.residual_units
+            slopes = (
+                (slopes + change * (others - slopes))
+                / shares[:, None]
+                * equations.coordinate_units
+            )
             return (phi + change * (there - phi)) / shares, slopes, (there - phi) / shares
 
         return changed
@@ -151,24 +160,27 @@ def _numbers(
     def drive(column: int) -> Changed:
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
             there = q.copy()
-            there[column] += change * equations.units[column]
-            phi, slopes = equations.scaled(there)
+            there[column] += change * equations.coordinate_units[column]
+            phi, slopes = equations.evaluate_scaled(there)
             return phi, slopes, slopes[:, column]
 
         return changed
 
-    for name, part, way in tree_numbers(spec.tree, spec.chains):
-        if way[0] != "xyz" or part.name not in joints or not (now := number_at(part, way)):
+    for name, part, way in tree_parameters(spec.tree, spec.chains):
+        if way[0] != "xyz" or part.name not in joints or not (now := parameter_value(part, way)):
             continue
         joint = spec.tree.joints[part.name]
         x, y, z = (value + size * (i == way[1]) for i, value in enumerate(joint.xyz))
         joint = dataclasses.replace(joint, xyz=(x, y, z))
-        moved = assemble(dataclasses.replace(spec, tree=spec.tree.replacing(joint)))
+        moved = assemble_tree(dataclasses.replace(spec, tree=spec.tree.with_parts(joint)))
         yield name, now, size, False, length(LoopEquations(moved, spec.loops, spec.couplings))
     for column in active:
         name = equations.coordinates.names[column]
         if name in joints and name in spec.home:
-            unit, turns = float(equations.units[column]), not equations.coordinates.slides[column]
+            unit, turns = (
+                float(equations.coordinate_units[column]),
+                not equations.coordinates.is_translation[column],
+            )
             yield f"home {name}", float(guess[column]), unit, bool(turns), drive(column)
 
 
@@ -202,7 +214,7 @@ def _change(
     changed: Changed,
 ) -> tuple[float, float] | None:
     """The change of a number in its unit that turns joints least that are said, by how much."""
-    x, units = np.zeros(len(passive) + 1), equations.units[passive]
+    x, units = np.zeros(len(passive) + 1), equations.coordinate_units[passive]
     weights = np.append(np.where(said, 1.0, _LOOSE), _LOOSE)
     for _ in range(_ITERATIONS):
         q = guess.copy()
@@ -216,7 +228,7 @@ def _change(
         x = wanted
         if step < 1e-9:
             break
-    if not np.abs(gap).max() < DIGITS:
+    if not np.abs(gap).max() < FILE_PRECISION:
         return None
     return float(x[-1]), float(np.abs(x[:-1][said]).max(initial=0.0))
 
@@ -232,7 +244,7 @@ def _least(
     for _ in range(_CHANGES):
         q = _nearest(equations, q, passive, changed, change)
         phi, _, slope = changed(q, change)
-        if np.abs(phi).max() < DIGITS:
+        if np.abs(phi).max() < FILE_PRECISION:
             return change, abs(change)
         lever = float(phi @ slope)
         if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(slope)):
@@ -249,7 +261,7 @@ def _nearest(
 
     def there(x: Array) -> Array:
         out = q.copy()
-        out[free] += x * equations.units[free]
+        out[free] += x * equations.coordinate_units[free]
         return out
 
     if not len(free):

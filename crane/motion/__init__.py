@@ -1,11 +1,11 @@
 """Where a machine's parts are for given strokes: kinematics, trajectories, workspaces."""
 
-from crane.motion.attitude import Turning, via_attitudes
-from crane.motion.curves import Trajectory, point_to_point, polynomial, via_points
+from crane.motion.attitude import AttitudeTrajectory, via_attitudes
 from crane.motion.kinematics import Kinematics
-from crane.motion.paths import read_path
-from crane.motion.sway import Sway, retimed, without_sway
-from crane.motion.trajectories import task_trajectory, tip_trajectory
+from crane.motion.path_reader import read_path
+from crane.motion.sway import Sway, retime, suppress_sway
+from crane.motion.task_trajectories import task_trajectory, tip_trajectory
+from crane.motion.trajectory import Trajectory, point_to_point, polynomial, via_points
 from crane.motion.transmission import JointState, Transmission
 
 __all__ = [
@@ -14,14 +14,14 @@ __all__ = [
     "Sway",
     "Trajectory",
     "Transmission",
-    "Turning",
+    "AttitudeTrajectory",
     "point_to_point",
     "polynomial",
     "read_path",
-    "retimed",
+    "retime",
     "task_trajectory",
     "tip_trajectory",
     "via_attitudes",
     "via_points",
-    "without_sway",
+    "suppress_sway",
 ]

@@ -15,29 +15,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import ClosureError, InputError, LimitError, known
+from crane.common.errors import ClosureError, InputError, LimitError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
-from crane.common.shown import Brief
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.motion.curves import Trajectory
 from crane.motion.kinematics import Kinematics
-from crane.motion.limits import beyond_limits
-from crane.motion.splines import quintics
-from crane.motion.trajectories import with_free
+from crane.motion.limit_violations import limit_violation_message
+from crane.motion.quintic_splines import quintic_polynomials
+from crane.motion.task_trajectories import add_free_joints
+from crane.motion.trajectory import Trajectory
 
 _KNOTS_PER_SECOND = 100
-_STILL = 1e-12  # of the free joints' weight times lever, what hangs still
-_ACCURACY = 1e-9  # [rad], [m] by which the last correction of a flat reference moves what sways
-_ENOUGH = 1e-4  # likewise, where it hardly becomes less: what the splines of the sway cannot hold
-_ROUNDS = 30
-_SMOOTHING = 0.1  # of a task's duration, over which a flat reference is smoothed
+_EQUILIBRIUM_TOLERANCE = 1e-12  # of the free joints' weight times lever, what hangs still
+_CONVERGENCE_TOLERANCE = (
+    1e-9  # [rad], [m] by which the last correction of a flat reference moves what sways
+)
+_STAGNATION_TOLERANCE = (
+    1e-4  # likewise, where it hardly becomes less: what the splines of the sway cannot hold
+)
+_MAX_ITERATIONS = 30
+_SMOOTHING_SHARE = 0.1  # of a task's duration, over which a flat reference is smoothed
 _SPLINES_PER_SECOND = 12.0  # of the sway along a flat reference
-_DIFFERENCE = 1e-6  # step of difference quotients [rad], [machine's size]
-_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_DIFFERENCE_STEP = 1e-6  # step of difference quotients [rad], [machine's size]
+_GAUSS_POINTS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-class Sway(Brief):
+class Sway(OneLineRepr):
     """What hangs on the free joints of a machine: where it hangs, how it sways, what moves it.
 
     Args:
@@ -51,11 +55,11 @@ class Sway(Brief):
         if not machine.free:
             raise InputError(f"nothing sways on '{machine.name}': it has no free joints")
         self.machine = machine
-        self._driven = machine.driven
+        self._driven = machine.is_driven
         self._dynamics = Dynamics(machine)
-        self._step = _DIFFERENCE * machine.closure.units[machine.closure.active]
+        self._difference_steps = _DIFFERENCE_STEP * machine.closure.units[machine.closure.active]
 
-    def hanging(self, q_a: ArrayLike) -> Array:
+    def hanging_equilibrium(self, q_a: ArrayLike) -> Array:
         """The same postures with all that is free hanging still.
 
         Newton's method on g_f(q_d, q_f) = 0, from where the free joints are said to be.
@@ -71,15 +75,15 @@ class Sway(Brief):
         """
         q_a = np.array(q_a, dtype=np.float64)
         free = ~self._driven
-        for _ in range(_ROUNDS):
-            weight = self._dynamics.gravity(q_a)[..., free]
+        for _ in range(_MAX_ITERATIONS):
+            gravity_force = self._dynamics.gravity(q_a)[..., free]
             stiffness = self.stiffness(q_a)[..., free]
-            size = np.abs(np.linalg.det(stiffness))
-            if not np.isfinite(size).all() or not (size > 0).all():
+            determinants = np.abs(np.linalg.det(stiffness))
+            if not np.isfinite(determinants).all() or not (determinants > 0).all():
                 break
-            move = np.linalg.solve(stiffness, weight[..., None])[..., 0]
-            q_a[..., free] -= np.clip(move, -0.5, 0.5)
-            if np.abs(move).max() < _STILL**0.5 * 1e-3:
+            newton_step = np.linalg.solve(stiffness, gravity_force[..., None])[..., 0]
+            q_a[..., free] -= np.clip(newton_step, -0.5, 0.5)
+            if np.abs(newton_step).max() < _EQUILIBRIUM_TOLERANCE**0.5 * 1e-3:
                 return q_a
         names = ", ".join(self.machine.free)
         raise InputError(f"what {names} carry hangs nowhere still: weight has to pull them back")
@@ -94,13 +98,15 @@ class Sway(Brief):
             (f, n) or (N, f, n), of the f free joints.
         """
         columns = []
-        for i, step in enumerate(self._step):
-            beside = np.zeros(len(self._step))
-            beside[i] = step
+        for i, step in enumerate(self._difference_steps):
+            perturbation = np.zeros(len(self._difference_steps))
+            perturbation[i] = step
             gravity = self._dynamics.gravity
-            columns.append((gravity(q_a + beside) - gravity(q_a - beside)) / (2.0 * step))
-        found: Array = np.stack(columns, axis=-1)[..., ~self._driven, :]
-        return found
+            columns.append(
+                (gravity(q_a + perturbation) - gravity(q_a - perturbation)) / (2.0 * step)
+            )
+        stiffness: Array = np.stack(columns, axis=-1)[..., ~self._driven, :]
+        return stiffness
 
     def modes(self, q_a: ArrayLike) -> tuple[Array, Array]:
         """How it sways with the drives held: (G - omega^2 M_ff) phi = 0.
@@ -112,16 +118,18 @@ class Sway(Brief):
             Angular frequencies (f,) omega [rad/s], the slowest first, and damping ratios (f,) of
             viscous friction, phi^T C phi / (2 omega phi^T M_ff phi).
         """
-        omega, shapes, _ = self._modes(np.asarray(q_a, dtype=np.float64))
-        damped: Array = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes) / (2.0 * omega)
-        return omega, damped
+        omega, shapes, _ = self._modal_analysis(np.asarray(q_a, dtype=np.float64))
+        damping_ratios: Array = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes) / (
+            2.0 * omega
+        )
+        return omega, damping_ratios
 
-    def root(self, q_a: Array) -> Array:
+    def frequency_matrix(self, q_a: Array) -> Array:
         """Omega (f, f) [rad/s] with Omega^2 = M_ff^-1 G, at a posture (n,) where it hangs."""
-        omega, shapes, mass = self._modes(q_a)
+        omega, shapes, mass = self._modal_analysis(q_a)
         return shapes @ (omega[:, None] * (shapes.T @ mass))
 
-    def _modes(self, q_a: Array) -> tuple[Array, Array, Array]:
+    def _modal_analysis(self, q_a: Array) -> tuple[Array, Array, Array]:
         """Frequencies (f,), shapes (f, f) of unit modal mass, and M_ff."""
         free = ~self._driven
         mass = self._dynamics.mass_matrix(q_a)[np.ix_(free, free)]
@@ -133,7 +141,7 @@ class Sway(Brief):
             raise InputError(f"what {', '.join(self.machine.free)} carry does not hang")
         return np.sqrt(squares), shapes, mass
 
-    def shifts(self, q_a: Array) -> Array:
+    def pivoting_motions(self, q_a: Array) -> Array:
         """Motions of the drives that leave the load where it is while it turns about itself.
 
         B solves (M_fd + M_ff E) B = -M_ff: what the free joints' own acceleration theta'' does
@@ -153,32 +161,37 @@ class Sway(Brief):
         d, f = np.flatnonzero(self._driven), np.flatnonzero(~self._driven)
         mass = self._dynamics.mass_matrix(q_a)[:, f]
         stiffness = self.stiffness(q_a)
-        follow = -np.linalg.solve(stiffness[:, :, f], stiffness[:, :, d])
-        moved = mass[:, :, d] + mass[:, :, f] @ follow
+        hanging_derivatives = -np.linalg.solve(stiffness[:, :, f], stiffness[:, :, d])
+        coupled_mass = mass[:, :, d] + mass[:, :, f] @ hanging_derivatives
         # in shares of what the free joints themselves weigh
-        own = np.einsum("ijj->ij", mass[:, :, f])[:, :, None]
-        rows, wanted = [moved / own], [-mass[:, :, f] / own]
+        free_mass_diagonal = np.einsum("ijj->ij", mass[:, :, f])[:, :, None]
+        equations, right_sides = (
+            [coupled_mass / free_mass_diagonal],
+            [-mass[:, :, f] / free_mass_diagonal],
+        )
         if len(d) > len(f):
-            rise = self._hook.jacobian(q_a)[:, 2:3, d]
-            rows.append(rise)
-            wanted.append(np.zeros((len(q_a), 1, len(f))))
-        weight = self._strokes[d]
-        matrix = np.concatenate(rows, axis=1) * weight
+            height_jacobian = self._suspension_kinematics.jacobian(q_a)[:, 2:3, d]
+            equations.append(height_jacobian)
+            right_sides.append(np.zeros((len(q_a), 1, len(f))))
+        stroke_lengths = self._stroke_lengths[d]
+        matrix = np.concatenate(equations, axis=1) * stroke_lengths
         if (np.linalg.svd(matrix[:, : len(f)], compute_uv=False)[:, -1] < 1e-3).any():
             raise InputError(
                 f"the drives of '{self.machine.name}' do not move what hangs on "
                 f"{', '.join(self.machine.free)} in each direction that it sways in"
             )
-        found: Array = weight[:, None] * (np.linalg.pinv(matrix) @ np.concatenate(wanted, axis=1))
-        return found
+        motions: Array = stroke_lengths[:, None] * (
+            np.linalg.pinv(matrix) @ np.concatenate(right_sides, axis=1)
+        )
+        return motions
 
-    def excess(self, q_a: Array, v_a: Array, a_a: Array) -> Array:
+    def free_joint_forces(self, q_a: Array, v_a: Array, a_a: Array) -> Array:
         """Forces (N, f) that the free joints would need for a motion, but for dry friction."""
         free = ~self._driven
-        found: Array = (
+        forces: Array = (
             self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
         )
-        return found
+        return forces
 
     @cached_property
     def _viscous(self) -> Array:
@@ -187,48 +200,50 @@ class Sway(Brief):
         return np.array([0.0 if law is None else law.viscous for law in laws])
 
     @cached_property
-    def _strokes(self) -> Array:
+    def _stroke_lengths(self) -> Array:
         """(n,) lengths of the joints' strokes."""
         span = self.machine.upper - self.machine.lower
         units = self.machine.closure.units[self.machine.closure.active]
         return np.where(np.isfinite(span), span, units)
 
     @cached_property
-    def _hook(self) -> Kinematics:
+    def _suspension_kinematics(self) -> Kinematics:
         """Where it hangs: the frame that the first free joint turns in."""
         joint = self.machine.tree.joints[self.machine.free[0]]
         return Kinematics(self.machine, joint.parent)
 
 
-class _Retimed(Trajectory):
+class _RetimedTrajectory(Trajectory):
     """A reference in another time, from its start to its end."""
 
     def __init__(self, reference: Trajectory, duration: float):
         self.duration = duration
-        self._reference, self._rate_of_time = reference, reference.duration / duration
+        self._reference, self._time_scale = reference, reference.duration / duration
 
     def position(self, time: ArrayLike) -> Array:
         """See `Trajectory`."""
-        return self._reference.position(np.asarray(time) * self._rate_of_time)
+        return self._reference.position(np.asarray(time) * self._time_scale)
 
-    def _rate(self, order: int, time: ArrayLike) -> Array:
-        pace = self._rate_of_time
-        return pace**order * self._reference._rate(order, np.asarray(time) * pace)
+    def _derivative(self, order: int, time: ArrayLike) -> Array:
+        time_scale = self._time_scale
+        return time_scale**order * self._reference._derivative(
+            order, np.asarray(time) * time_scale
+        )
 
     def bounds(self) -> tuple[Array, Array]:
         """See `Trajectory`."""
         return self._reference.bounds()
 
-    def turns(self) -> Array:
+    def extremum_times(self) -> Array:
         """See `Trajectory`."""
-        return self._reference.turns() / self._rate_of_time
+        return self._reference.extremum_times() / self._time_scale
 
     def breaks(self) -> Array:
         """See `Trajectory`."""
-        return self._reference.breaks() / self._rate_of_time
+        return self._reference.breaks() / self._time_scale
 
 
-def retimed(reference: Trajectory, duration: float) -> Trajectory:
+def retime(reference: Trajectory, duration: float) -> Trajectory:
     """The same path in another time: q(t T / duration).
 
     Args:
@@ -238,47 +253,51 @@ def retimed(reference: Trajectory, duration: float) -> Trajectory:
     Raises:
         InputError: No duration.
     """
-    return _Retimed(reference, as_number(duration, "the duration", "s", above=0))
+    return _RetimedTrajectory(reference, as_number(duration, "the duration", "s", greater_than=0))
 
 
-def _sampled(machine: Machine, duration: float, motion: Callable[[Array], Array]) -> Trajectory:
+def _sample_motion(
+    machine: Machine, duration: float, motion: Callable[[Array], Array]
+) -> Trajectory:
     """Quintics between knots of a motion from rest to rest; motion is (N,) to (N, n)."""
     count = max(12, int(np.ceil(duration * _KNOTS_PER_SECOND)) + 1)
     time = np.linspace(0.0, duration, count)
-    return _through(time, motion(time))
+    return _interpolating_trajectory(time, motion(time))
 
 
-def _derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
+def _spline_derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
     """Velocities and accelerations of the quintic spline from rest to rest."""
     from scipy.interpolate import make_interp_spline  # slow to import
 
-    rest = np.zeros(q_a.shape[1])
-    ends: Any = [(1, rest), (2, rest)]  # of which scipy's types know less than scipy
+    zero_values = np.zeros(q_a.shape[1])
+    ends: Any = [(1, zero_values), (2, zero_values)]  # of which scipy's types know less than scipy
     spline = make_interp_spline(time, q_a, k=5, bc_type=(ends, ends))
     return spline(time, 1), spline(time, 2)
 
 
-def _through(time: Array, q_a: Array) -> Trajectory:
-    return Trajectory(quintics(time, q_a, *_derivatives(time, q_a)))
+def _interpolating_trajectory(time: Array, q_a: Array) -> Trajectory:
+    return Trajectory(quintic_polynomials(time, q_a, *_spline_derivatives(time, q_a)))
 
 
-def _hangs(machine: Machine, reference: Trajectory) -> Trajectory:
+def _with_hanging_joints(machine: Machine, reference: Trajectory) -> Trajectory:
     """The reference, its free joints hanging still all along."""
-    sway = Sway(machine)
-    return _sampled(
-        machine, reference.duration, lambda time: sway.hanging(reference.position(time))
+    sway_model = Sway(machine)
+    return _sample_motion(
+        machine,
+        reference.duration,
+        lambda time: sway_model.hanging_equilibrium(reference.position(time)),
     )
 
 
-def _impulses(omega: float, zeta: float, derivative: bool) -> tuple[Array, Array]:
+def _shaper_impulses(omega: float, zeta: float, robust: bool) -> tuple[Array, Array]:
     """Delays [s] and shares of a ZV or ZVD shaper."""
-    share = np.exp(-zeta * np.pi / np.sqrt(1.0 - zeta**2))
-    half = np.pi / (omega * np.sqrt(1.0 - zeta**2))
-    sizes = np.array([1.0, 2.0 * share, share**2] if derivative else [1.0, share])
-    return half * np.arange(len(sizes)), sizes / sizes.sum()
+    decay = np.exp(-zeta * np.pi / np.sqrt(1.0 - zeta**2))
+    half_period = np.pi / (omega * np.sqrt(1.0 - zeta**2))
+    amplitudes = np.array([1.0, 2.0 * decay, decay**2] if robust else [1.0, decay])
+    return half_period * np.arange(len(amplitudes)), amplitudes / amplitudes.sum()
 
 
-def impulses(machine: Machine, q_a: ArrayLike, derivative: bool = False) -> tuple[Array, Array]:
+def input_shaper(machine: Machine, q_a: ArrayLike, robust: bool = False) -> tuple[Array, Array]:
     """The input shaper of all that sways: Singer and Seering's, of each mode, one after the other.
 
     With K = exp(-zeta pi / sqrt(1 - zeta^2)) and the damped half period h, a mode's impulses are
@@ -289,41 +308,44 @@ def impulses(machine: Machine, q_a: ArrayLike, derivative: bool = False) -> tupl
     Args:
         machine: The machine, with free joints.
         q_a: (n,) posture that the modes are taken at [m], [rad].
-        derivative: ZVD in place of ZV.
+        robust: ZVD in place of ZV.
 
     Returns:
         Delays (j,) [s] from 0 on, and shares (j,) that sum to 1.
     """
-    sway = Sway(machine)
+    sway_model = Sway(machine)
     delays, shares = np.zeros(1), np.ones(1)
-    for omega, zeta in zip(*sway.modes(sway.hanging(q_a)), strict=True):
-        more, sizes = _impulses(float(omega), float(zeta), derivative)
-        delays = (delays[:, None] + more).ravel()
-        shares = (shares[:, None] * sizes).ravel()
+    for omega, zeta in zip(*sway_model.modes(sway_model.hanging_equilibrium(q_a)), strict=True):
+        mode_delays, mode_shares = _shaper_impulses(float(omega), float(zeta), robust)
+        delays = (delays[:, None] + mode_delays).ravel()
+        shares = (shares[:, None] * mode_shares).ravel()
     order = np.argsort(delays)
     return delays[order], shares[order]
 
 
-def _shaped(machine: Machine, reference: Trajectory, derivative: bool) -> Trajectory:
+def _apply_input_shaper(machine: Machine, reference: Trajectory, robust: bool) -> Trajectory:
     """The reference in as much less time as the shaper takes, through the shaper."""
     middle = reference.position(0.5 * reference.duration)
-    delays, shares = impulses(machine, middle, derivative)
-    left = reference.duration - delays[-1]
-    if left <= 0:
+    delays, shares = input_shaper(machine, middle, robust)
+    remaining_duration = reference.duration - delays[-1]
+    if remaining_duration <= 0:
         raise InputError(
             f"the shaper takes {delays[-1]:.3g} s, the motion {reference.duration:.3g} s: give it "
             "more time"
         )
-    base, sway = retimed(reference, left), Sway(machine)
+    shortened_reference, sway_model = retime(reference, remaining_duration), Sway(machine)
 
     def motion(time: Array) -> Array:
-        parts = [size * base.position(time - at) for at, size in zip(delays, shares, strict=True)]
-        return sway.hanging(np.sum(parts, axis=0))
+        delayed_references = [
+            size * shortened_reference.position(time - at)
+            for at, size in zip(delays, shares, strict=True)
+        ]
+        return sway_model.hanging_equilibrium(np.sum(delayed_references, axis=0))
 
-    return _sampled(machine, reference.duration, motion)
+    return _sample_motion(machine, reference.duration, motion)
 
 
-def _smoothed(reference: Trajectory, time: Array, width: float) -> Array:
+def _smooth_reference(reference: Trajectory, time: Array, width: float) -> Array:
     """Means (N, n) of a reference before a time, weighted by a cubic B-spline of a width [s]."""
     from scipy.interpolate import BSpline  # slow to import
 
@@ -331,67 +353,83 @@ def _smoothed(reference: Trajectory, time: Array, width: float) -> Array:
     quarter = width / 4.0
     out: Array = np.zeros(())
     for piece in range(4):
-        for x, weight in zip(quarter * (piece + 0.5 * (_POINTS + 1.0)), _WEIGHTS, strict=True):
-            share = 0.5 * weight * float(kernel(x))  # of an integral of `quarter`
-            out = out + share * reference.position(time - x)
+        for x, weight in zip(
+            quarter * (piece + 0.5 * (_GAUSS_POINTS + 1.0)), _GAUSS_WEIGHTS, strict=True
+        ):
+            quadrature_weight = 0.5 * weight * float(kernel(x))  # of an integral of `quarter`
+            out = out + quadrature_weight * reference.position(time - x)
     return out
 
 
-def _from_rest(time: Array) -> Array:
+def _rest_to_rest_splines(time: Array) -> Array:
     """Quintic splines (N, s) that begin and end at rest at zero, wide enough to hold no noise."""
     from scipy.interpolate import BSpline  # slow to import
 
     count = max(10, int(np.ceil(_SPLINES_PER_SECOND * time[-1])))
     knots = np.linspace(0.0, time[-1], count + 1)
     knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, time[-1])])
-    every: Array = BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
-    return every
+    splines: Array = BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
+    return splines
 
 
-def _flat(machine: Machine, reference: Trajectory) -> Trajectory:
+def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Trajectory:
     """The reference as the load's, and the motion of the drives that moves the load so."""
-    duration, smoothing = reference.duration, _SMOOTHING * reference.duration
-    base, sway, driven = retimed(reference, duration - smoothing), Sway(machine), machine.driven
+    duration, smoothing = reference.duration, _SMOOTHING_SHARE * reference.duration
+    shortened_reference, sway_model, driven = (
+        retime(reference, duration - smoothing),
+        Sway(machine),
+        machine.is_driven,
+    )
     count = max(12, int(np.ceil(duration * _KNOTS_PER_SECOND)) + 1)
     time = np.linspace(0.0, duration, count)
-    rest = sway.hanging(_smoothed(base, time, smoothing))
-    shifts, splines = sway.shifts(rest), _from_rest(time)
-    back = sway.stiffness(rest)[:, :, ~driven]
-    onto = splines @ np.linalg.pinv(splines)
+    hanging_configurations = sway_model.hanging_equilibrium(
+        _smooth_reference(shortened_reference, time, smoothing)
+    )
+    pivoting_motions, splines = (
+        sway_model.pivoting_motions(hanging_configurations),
+        _rest_to_rest_splines(time),
+    )
+    free_stiffness = sway_model.stiffness(hanging_configurations)[:, :, ~driven]
+    spline_projection = splines @ np.linalg.pinv(splines)
     theta = np.zeros((count, len(machine.free)))
-    before = np.inf
-    for _ in range(_ROUNDS):
-        q_a = rest.copy()
-        q_a[:, driven] += np.einsum("nkf,nf->nk", shifts, theta)
+    previous_correction = np.inf
+    for _ in range(_MAX_ITERATIONS):
+        q_a = hanging_configurations.copy()
+        q_a[:, driven] += np.einsum("nkf,nf->nk", pivoting_motions, theta)
         try:
-            q_a = sway.hanging(q_a)
+            q_a = sway_model.hanging_equilibrium(q_a)
             q_a[:, ~driven] += theta
-            excess = sway.excess(q_a, *_derivatives(time, q_a))
+            free_joint_forces = sway_model.free_joint_forces(q_a, *_spline_derivatives(time, q_a))
         except ClosureError:  # farther off than the machine reaches
             break
-        move = onto @ np.linalg.solve(back, excess[:, :, None])[:, :, 0]
-        moved = float(np.abs(move).max())
-        if moved < _ACCURACY or (moved < _ENOUGH and moved > 0.5 * before):
-            return _through(time, q_a)
-        if moved > before:
+        correction = (
+            spline_projection
+            @ np.linalg.solve(free_stiffness, free_joint_forces[:, :, None])[:, :, 0]
+        )
+        correction_size = float(np.abs(correction).max())
+        if correction_size < _CONVERGENCE_TOLERANCE or (
+            correction_size < _STAGNATION_TOLERANCE and correction_size > 0.5 * previous_correction
+        ):
+            return _interpolating_trajectory(time, q_a)
+        if correction_size > previous_correction:
             break
-        theta, before = theta - move, moved
+        theta, previous_correction = theta - correction, correction_size
     raise InputError(
         f"no motion of {duration:.3g} s was found that leaves what hangs without sway, the last "
-        f"correction is {before:.2g} rad: give it more time"
+        f"correction is {previous_correction:.2g} rad: give it more time"
     )
 
 
-_METHODS: dict[str, Callable[[Machine, Trajectory], Trajectory]] = {
-    "none": _hangs,
-    "zv": lambda machine, reference: _shaped(machine, reference, derivative=False),
-    "zvd": lambda machine, reference: _shaped(machine, reference, derivative=True),
-    "flat": _flat,
+_SWAY_METHOD_FUNCTIONS: dict[str, Callable[[Machine, Trajectory], Trajectory]] = {
+    "none": _with_hanging_joints,
+    "zv": lambda machine, reference: _apply_input_shaper(machine, reference, robust=False),
+    "zvd": lambda machine, reference: _apply_input_shaper(machine, reference, robust=True),
+    "flat": _flatness_based_trajectory,
 }
-METHODS = tuple(_METHODS)
+SWAY_METHODS = tuple(_SWAY_METHOD_FUNCTIONS)
 
 
-def without_sway(machine: Machine, reference: Trajectory, method: str = "flat") -> Trajectory:
+def suppress_sway(machine: Machine, reference: Trajectory, method: str = "flat") -> Trajectory:
     """A reference from rest to rest, changed so that what hangs does not sway after it.
 
     It begins and ends where the given one does, in the same time, and has the free joints as they
@@ -401,9 +439,10 @@ def without_sway(machine: Machine, reference: Trajectory, method: str = "flat") 
       moves so that the load follows it, as flatness of the pendulum has it: of a point mass on
       a string p_tip = p + L (p'' - g) / |p'' - g| (Fliess, Levine, Martin and Rouchon, Int. J.
       Control 61 (1995) 1327-1361). Here of rigid bodies on any free joints, by iteration: drives
-      q_d = s + B theta with s the reference and B of `Sway.shifts`, and theta corrected by
+      q_d = s + B theta with s the reference and B of `Sway.pivoting_motions`, and theta corrected by
       -G^-1 times what inverse dynamics ask of the free joints, until they are asked for nothing.
-    - "zv", "zvd": the reference is squeezed and sent through the shaper of `impulses`, whose modes
+    - "zv", "zvd": the reference is squeezed and sent through the shaper of `input_shaper`, whose
+    modes
       are those in its middle.
     - "none": the same reference, beside free joints that hang still.
 
@@ -421,11 +460,11 @@ def without_sway(machine: Machine, reference: Trajectory, method: str = "flat") 
         InputError: Unknown method, no free joints, or too little time.
         LimitError: What the drives have to do is beyond their limits.
     """
-    if method not in _METHODS:
-        raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
+    if method not in _SWAY_METHOD_FUNCTIONS:
+        raise InputError(f"method '{method}' is unknown, {suggest_names(SWAY_METHODS, method)}")
     if not machine.free:
         raise InputError(f"nothing sways on '{machine.name}': it has no free joints")
-    found = _METHODS[method](machine, with_free(machine, reference))
-    if text := beyond_limits(machine, found):
+    trajectory = _SWAY_METHOD_FUNCTIONS[method](machine, add_free_joints(machine, reference))
+    if text := limit_violation_message(machine, trajectory):
         raise LimitError(f"method '{method}': {text}")
-    return found
+    return trajectory

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, known
+from crane.common.errors import InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
-from crane.common.shown import Brief
-from crane.description.external import PARTS
-from crane.dynamics.frames import FrameJacobians
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine import Machine
 
-_FIELDS = ("position", "velocity", "effort")
-_SINGULAR = 1e-9  # least singular value of what joints move actuators by, per the largest
+_FIELD_NAMES = ("position", "velocity", "effort")
+_SINGULARITY_TOLERANCE = (
+    1e-9  # least singular value of what joints move actuators by, per the largest
+)
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class JointState:
     effort: Array
 
 
-class Transmission(Brief):
+class Transmission(OneLineRepr):
     """Positions, velocities and forces between the actuators and the joints of the tree.
 
     What ros2_control calls a transmission, with ratios that the loops determine. With q_A the
@@ -61,25 +63,35 @@ class Transmission(Brief):
     def __init__(self, machine: Machine):
         self.machine = machine
         self.state: JointState | None = None
-        flown = {x for i in machine.coordinates.floating for x in machine.joints[i : i + 6]}
-        self.actuators = tuple(joint for joint in machine.active if joint not in flown)
-        self.joints = tuple(joint for joint in machine.joints if joint not in flown)
-        self._at = {joint: i for i, joint in enumerate(self.actuators)}
-        self._columns = np.array([machine.column(joint) for joint in self.joints], dtype=np.intp)
-        self._own = np.array([machine.active.index(x) for x in self.actuators], dtype=np.intp)
-        self._heard = np.full((3, len(self.actuators)), np.nan)  # a row per field
+        floating_joints = {
+            x for i in machine.coordinates.floating_base_columns for x in machine.joints[i : i + 6]
+        }
+        self.actuators = tuple(joint for joint in machine.active if joint not in floating_joints)
+        self.joints = tuple(joint for joint in machine.joints if joint not in floating_joints)
+        self._actuator_indices = {joint: i for i, joint in enumerate(self.actuators)}
+        self._joint_columns = np.array(
+            [machine.column(joint) for joint in self.joints], dtype=np.intp
+        )
+        self._actuator_columns = np.array(
+            [machine.active.index(x) for x in self.actuators], dtype=np.intp
+        )
+        self._received_values = np.full((3, len(self.actuators)), np.nan)  # a row per field
         self._gamma: Array | None = None
         self._jacobians = FrameJacobians(machine)
 
-    def _line(self) -> str:
+    def _one_line(self) -> str:
         """From where to where, of what."""
         actuators = ", ".join(self.actuators)
         return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
 
     @property
-    def unheard(self) -> tuple[str, ...]:
+    def unknown_actuators(self) -> tuple[str, ...]:
         """Active joints whose position no message has had yet."""
-        return tuple(joint for joint, i in self._at.items() if np.isnan(self._heard[0, i]))
+        return tuple(
+            joint
+            for joint, i in self._actuator_indices.items()
+            if np.isnan(self._received_values[0, i])
+        )
 
     def update(
         self,
@@ -110,31 +122,40 @@ class Transmission(Brief):
             ClosureError: No posture closes the loops there, or none on the branch. The state
                 stays as it was before the message.
         """
-        fields = zip((position, velocity, effort), _FIELDS, strict=True)
-        given = [_field(values, len(name), what) for values, what in fields]
-        places = [(self._at[joint], i) for i, joint in enumerate(name) if joint in self._at]
-        if not places:
+        fields = zip((position, velocity, effort), _FIELD_NAMES, strict=True)
+        field_arrays = [_field_array(values, len(name), what) for values, what in fields]
+        index_pairs = [
+            (self._actuator_indices[joint], i)
+            for i, joint in enumerate(name)
+            if joint in self._actuator_indices
+        ]
+        if not index_pairs:
             return None
-        columns, found = np.array(places).T
-        heard, new = self._heard.copy(), np.array(given)[:, found]
-        heard[1:, columns] = new[1:]
-        measured = ~np.isnan(new[0])
-        heard[0, columns[measured]] = new[0, measured]
-        state = None if np.isnan(heard[0]).any() else self._closed(*heard)
-        self._heard = heard
+        columns, message_indices = np.array(index_pairs).T
+        received_values, message_values = (
+            self._received_values.copy(),
+            np.array(field_arrays)[:, message_indices],
+        )
+        received_values[1:, columns] = message_values[1:]
+        is_measured = ~np.isnan(message_values[0])
+        received_values[0, columns[is_measured]] = message_values[0, is_measured]
+        state = None if np.isnan(received_values[0]).any() else self._close_loops(*received_values)
+        self._received_values = received_values
         return state
 
-    def _closed(self, q_a: Array, v_a: Array, f_a: Array) -> JointState:
+    def _close_loops(self, q_a: Array, v_a: Array, f_a: Array) -> JointState:
         closure = self.machine.closure
-        stroke = closure.home[closure.active]
-        stroke[self._own] = q_a
-        q = closure.solve(stroke)
-        gamma = closure.gamma(q)[np.ix_(self._columns, self._own)]
+        active_coordinates = closure.home[closure.active]
+        active_coordinates[self._actuator_columns] = q_a
+        q = closure.solve(active_coordinates)
+        gamma = closure.gamma(q)[np.ix_(self._joint_columns, self._actuator_columns)]
         effort = np.zeros(len(q))
-        effort[closure.active[self._own]] = f_a
-        position, effort = q[self._columns], effort[self._columns]
-        self._gamma, self._posture = gamma, q
-        self.state = JointState(self.joints, position, _whole(gamma @ v_a), _whole(effort))
+        effort[closure.active[self._actuator_columns]] = f_a
+        position, effort = q[self._joint_columns], effort[self._joint_columns]
+        self._gamma, self._configuration = gamma, q
+        self.state = JointState(
+            self.joints, position, _known_or_empty(gamma @ v_a), _known_or_empty(effort)
+        )
         return self.state
 
     def joint_to_actuator(self, effort: Mapping[str, float]) -> dict[str, float]:
@@ -151,10 +172,10 @@ class Transmission(Brief):
         Raises:
             InputError: There is no such joint, or no state yet.
         """
-        gamma, tau = self._ratios(), np.zeros(len(self.joints))
+        gamma, tau = self._known_gamma(), np.zeros(len(self.joints))
         for joint, value in effort.items():
-            tau[self._row(joint)] = as_number(value, f"effort of {joint}", "")
-        return self._named(gamma.T @ tau)
+            tau[self._joint_index(joint)] = as_number(value, f"effort of {joint}", "")
+        return self._forces_by_actuator(gamma.T @ tau)
 
     def actuator_to_joint(
         self, effort: Mapping[str, float], joints: Sequence[str]
@@ -175,22 +196,30 @@ class Transmission(Brief):
             InputError: Names are unknown, there is no state yet, or the joints do not determine
                 the machine's motion in its posture.
         """
-        gamma, f_a = self._ratios(), np.zeros(len(self._at))
+        gamma, f_a = self._known_gamma(), np.zeros(len(self._actuator_indices))
         for joint, value in effort.items():
-            if joint not in self._at:
-                raise InputError(f"'{joint}' is not active, {known(self._at, joint)}")
-            f_a[self._at[joint]] = as_number(value, f"effort of {joint}", "")
-        found = [self._row(joint) for joint in joints]
-        units, active = self.machine.closure.units, self.machine.closure.active[self._own]
-        own, active = units[self._columns[found]], units[active]
-        rows = gamma[found] / own[:, None] * active
-        sizes = np.linalg.svd(rows, compute_uv=False)
-        if len(found) != len(f_a) or not sizes[-1] > _SINGULAR * sizes[0]:
+            if joint not in self._actuator_indices:
+                raise InputError(
+                    f"'{joint}' is not active, {suggest_names(self._actuator_indices, joint)}"
+                )
+            f_a[self._actuator_indices[joint]] = as_number(value, f"effort of {joint}", "")
+        joint_indices = [self._joint_index(joint) for joint in joints]
+        units, active_units = (
+            self.machine.closure.units,
+            self.machine.closure.active[self._actuator_columns],
+        )
+        joint_units, active_units = units[self._joint_columns[joint_indices]], units[active_units]
+        scaled_gamma = gamma[joint_indices] / joint_units[:, None] * active_units
+        singular_values = np.linalg.svd(scaled_gamma, compute_uv=False)
+        if (
+            len(joint_indices) != len(f_a)
+            or not singular_values[-1] > _SINGULARITY_TOLERANCE * singular_values[0]
+        ):
             raise InputError(
                 f"{', '.join(joints) or 'no joint'} do not determine how the machine moves here, "
                 f"give {len(f_a)} independent joints"
             )
-        tau = np.linalg.solve(rows.T, f_a * active) / own
+        tau = np.linalg.solve(scaled_gamma.T, f_a * active_units) / joint_units
         return dict(zip(joints, tau.tolist(), strict=True))
 
     def wrench_to_actuator(self, wrench: ArrayLike, link: str | None = None) -> dict[str, float]:
@@ -209,43 +238,45 @@ class Transmission(Brief):
         Raises:
             InputError: There is no such link, no tip, or no state yet.
         """
-        gamma = self._ratios()
+        gamma = self._known_gamma()
         if (frame := link or self.machine.tip) is None:
             raise InputError(f"machine '{self.machine.name}' has no tip, name a link")
         self.machine.frame(frame)
-        given = as_sample(wrench, 6, f"the wrench on '{frame}'", PARTS)
-        self._jacobians.place(self._posture)
-        return self._named(gamma.T @ (self._jacobians.of(frame).T @ given)[self._columns])
+        wrench_array = as_sample(wrench, 6, f"the wrench on '{frame}'", WRENCH_COMPONENTS)
+        self._jacobians.set_configuration(self._configuration)
+        return self._forces_by_actuator(
+            gamma.T @ (self._jacobians.jacobian(frame).T @ wrench_array)[self._joint_columns]
+        )
 
-    def _ratios(self) -> Array:
+    def _known_gamma(self) -> Array:
         if self._gamma is None:
-            unheard = ", ".join(self.unheard)
-            raise InputError(f"the posture is not known yet, update it with {unheard}")
+            unknown_names = ", ".join(self.unknown_actuators)
+            raise InputError(f"the posture is not known yet, update it with {unknown_names}")
         return self._gamma
 
-    def _row(self, joint: str) -> int:
+    def _joint_index(self, joint: str) -> int:
         if joint not in self.joints:
-            raise InputError(f"joint '{joint}' is unknown, {known(self.joints, joint)}")
+            raise InputError(f"joint '{joint}' is unknown, {suggest_names(self.joints, joint)}")
         return self.joints.index(joint)
 
-    def _named(self, f_a: Array) -> dict[str, float]:
-        return dict(zip(self._at, f_a.tolist(), strict=True))
+    def _forces_by_actuator(self, f_a: Array) -> dict[str, float]:
+        return dict(zip(self._actuator_indices, f_a.tolist(), strict=True))
 
 
-def _field(values: Sequence[float], count: int, what: str) -> Array:
+def _field_array(values: Sequence[float], count: int, label: str) -> Array:
     """(count,) of a field, NaN where it is empty."""
     if not len(values):
         return np.full(count, np.nan)
     array = np.asarray(values, dtype=float)
     if array.shape != (count,):
         raise InputError(
-            f"{what} has {len(values)} values for {count} names, give one each or none"
+            f"{label} has {len(values)} values for {count} names, give one each or none"
         )
     if np.isinf(array).any():
-        raise InputError(f"{what} has an infinite value, give NaN for what is not measured")
+        raise InputError(f"{label} has an infinite value, give NaN for what is not measured")
     return array
 
 
-def _whole(values: Array) -> Array:
+def _known_or_empty(values: Array) -> Array:
     """All values, or none where one is not known."""
     return np.empty(0) if np.isnan(values).any() else values

@@ -1,11 +1,11 @@
 """What a machine lifts, how hard it digs, and how far it works."""
 
-from crane.ratings.digging import Breakout, breakout
-from crane.ratings.lifting import Capacity, capacity
-from crane.ratings.moments import Torques, torques
-from crane.ratings.ranges import WorkingRange, working_range
-from crane.ratings.rules import RULES, Rule
-from crane.ratings.tool import ToolForce, tool_force
+from crane.ratings.breakout_forces import Breakout, breakout
+from crane.ratings.lifting_capacity import Capacity, capacity
+from crane.ratings.lifting_torques import Torques, torques
+from crane.ratings.rating_rules import RULES, Rule
+from crane.ratings.tool_forces import ToolForce, tool_force
+from crane.ratings.working_ranges import WorkingRange, working_range
 
 __all__ = [
     "RULES", "Breakout", "Capacity", "Rule", "ToolForce", "Torques", "WorkingRange", "breakout",

@@ -3,12 +3,12 @@
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.dynamics.statics import Statics
+from crane.dynamics.statics import StaticsEvaluator
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.workspaces.explore import limits_of, strokes_of
-from crane.motion.workspaces.patch import last_closed
-from crane.motion.workspaces.section import section_of, slewing
+from crane.motion.workspaces.workspace_mapping import moving_strokes, stroke_limits
+from crane.motion.workspaces.workspace_patch import last_closed_configuration
+from crane.motion.workspaces.workspace_section import find_slewing_joint, workspace_section
 
 _DRAWN = 200  # postures from which it is seen how the frame moves
 _STILL = 1e-6  # of what the other strokes move the frame
@@ -36,31 +36,35 @@ class Strokes:
         InputError: A joint is free.
     """
 
-    def __init__(self, statics: Statics):
+    def __init__(self, statics: StaticsEvaluator):
         machine = self.machine = statics.machine
         self.statics = statics
         frame, active = statics.frame, machine.closure.active
-        self.low, self.high = limits_of(machine)
+        self.low, self.high = stroke_limits(machine)
         self.span = np.where(self.high > self.low, self.high - self.low, 1.0)
-        slew, random = slewing(machine, frame), np.random.default_rng(0)
+        slew, random = find_slewing_joint(machine, frame), np.random.default_rng(0)
         if machine.free:
             raise InputError(
                 f"'{machine.free[0]}' of '{machine.name}' is free, hold it: "
                 f"--lock {machine.free[0]}=0"
             )
         kinematics = Kinematics(machine, frame)
-        strokes = strokes_of(
+        strokes = moving_strokes(
             machine, kinematics, self.low, self.high, None if slew is None else slew[0], random
         )
         drawn = np.repeat(machine.home[None], _DRAWN, axis=0)
         for k in strokes:
             drawn[:, active[k]] = random.uniform(self.low[k], self.high[k], _DRAWN)
-        closed, good = statics.closed(drawn)
+        closed, good = statics.close_loops(drawn)
         for i in np.flatnonzero(np.logical_not(good)).tolist():  # far from home, step by step
-            closed[i] = last_closed(machine, machine.home, drawn[i, active])[0]
-        at = statics.at(closed)
-        self.section = section_of(machine, frame, at.tip, kinematics.position_at(machine.home))
-        moves = np.linalg.norm(self.section.slopes(at.tip, at.ways), axis=1).mean(axis=0)
+            closed[i] = last_closed_configuration(machine, machine.home, drawn[i, active])[0]
+        at = statics.evaluate(closed)
+        self.section = workspace_section(
+            machine, frame, at.tip_positions, kinematics.position_at_configuration(machine.home)
+        )
+        moves = np.linalg.norm(
+            self.section.section_jacobian(at.tip_positions, at.tip_jacobian), axis=1
+        ).mean(axis=0)
         far = moves * self.span
         strokes = [i for i in strokes if far[i] > _STILL * far[strokes].max()]
         order = sorted(strokes, key=lambda i: -far[i])
@@ -73,8 +77,9 @@ def check_drives(machine: Machine) -> Machine:
     Raises:
         InputError: They are others.
     """
-    if machine.motors and any(
-        drive.name not in machine.active or len(drive.factors) > 1 for drive in machine.motors
+    if machine.explicit_drives and any(
+        drive.name not in machine.active or len(drive.factors) > 1
+        for drive in machine.explicit_drives
     ):
         raise InputError(
             f"the drives of '{machine.name}' are not its active joints, choose them: --active"

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.samples import Array
-from crane.common.scratch import release
-from crane.description.sensors import VELOCITY
-from crane.recordings.recording import REFERENCE, Recording
+from crane.common.scratch_arrays import release_pages
+from crane.description.sensors import VELOCITY_SUFFIX
+from crane.recordings.recording import REFERENCE_PREFIX, Recording
 
 _CYCLES = 8  # periods that an oscillation lasts at least
 _KEPT = 0.85  # of its swing over these: a damping ratio of less than 0.003
@@ -88,12 +88,12 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
     spacing = np.diff(recording.time)
     if not names or not len(spacing) or np.ptp(spacing) > 0.01 * spacing.mean():
         return []
-    told = [x for x in seen if x.startswith(REFERENCE) and not x.endswith(VELOCITY)]
+    told = [x for x in seen if x.startswith(REFERENCE_PREFIX) and not x.endswith(VELOCITY_SUFFIX)]
     heads = _COMMANDS[:1] if told else _COMMANDS
     told += [x for x in seen if x.startswith(heads)]
     found = []
     for name in names:
-        release()
+        release_pages()
         cycle = sustained(recording.time, seen[name], _LEAST, [seen[x] for x in told], name)
         found += [cycle] if cycle is not None else []
     return sorted(found, key=lambda one: -one.amplitude)

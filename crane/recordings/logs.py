@@ -23,30 +23,30 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import RecordingError, known
-from crane.common.inputs import content
+from crane.common.errors import RecordingError, suggest_names
+from crane.common.file_contents import read_plain_file
 from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table
 
-_LARGEST = 2_000_000  # bytes of a file of columns
-_LONGEST = 1000  # characters of an expression
-_LINE = re.compile(r"\s*([^=\[\]]+?\s*(?:\[[^\]]*\])?)\s*=\s*(.+?)\s*")
+_MAX_BYTES = 2_000_000  # bytes of a file of columns
+_MAX_EXPRESSION_LENGTH = 1000  # characters of an expression
+_LINE_PATTERN = re.compile(r"\s*([^=\[\]]+?\s*(?:\[[^\]]*\])?)\s*=\s*(.+?)\s*")
 _OPERATORS = {
     ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Line:
+class LogColumn:
     """A column of a recording that is computed from those of a log.
 
     Attributes:
-        where: It is written, for errors.
+        source_location: It is written, for errors.
         heading: Its name and unit, as in 'q2 [deg]'.
         expression: Over the columns of the log.
     """
 
-    where: str
+    source_location: str
     heading: str
     expression: str
 
@@ -65,21 +65,21 @@ def read_log(path: str | Path, columns: str | Path) -> Table:
         RecordingError: A file is missing or malformed, or columns cannot be computed; the
             message names file and lines, of all that the log does not have.
     """
-    notes, lines = lines_of(Path(columns))
-    arrays = timeseries.arrays(Path(path))
-    missing = [(line, name) for line in lines for name in absent(line.expression, arrays)]
+    notes, lines = read_log_columns(Path(columns))
+    arrays = timeseries.read_log_arrays(Path(path))
+    missing = [(line, name) for line in lines for name in missing_names(line.expression, arrays)]
     if missing:
-        told = [f"{line.where}: the log has no '{name}'" for line, name in missing]
-        hint = known(arrays, missing[0][1] if len(missing) == 1 else None)
-        raise RecordingError(f"{'; '.join(told)}, {hint}")
-    return assembled(Path(path), Path(columns), arrays, lines, notes)
+        messages = [f"{line.source_location}: the log has no '{name}'" for line, name in missing]
+        hint = suggest_names(arrays, missing[0][1] if len(missing) == 1 else None)
+        raise RecordingError(f"{'; '.join(messages)}, {hint}")
+    return assemble_table(Path(path), Path(columns), arrays, lines, notes)
 
 
-def assembled(
+def assemble_table(
     path: Path,
     columns: Path,
     arrays: Mapping[str, np.ndarray],
-    lines: Sequence[Line],
+    lines: Sequence[LogColumn],
     notes: dict[str, str],
 ) -> Table:
     """The table that lines make of the arrays of a log.
@@ -94,27 +94,31 @@ def assembled(
     Raises:
         RecordingError: A column cannot be computed, or holds what no recording does.
     """
-    if all(timeseries.heading_of(line.heading)[0] != TIME for line in lines):
+    if all(timeseries.parse_heading(line.heading)[0] != TIME for line in lines):
         raise RecordingError(
-            f"{columns}: does not say which column of {path.name} is '{TIME}', {known(arrays)}"
+            f"{columns}: does not say which column of {path.name} is '{TIME}', "
+            f"{suggest_names(arrays)}"
         )
     found: dict[str, np.ndarray] = {}
     for line in lines:
         try:
             if line.heading in found:
                 raise RecordingError(f"column '{line.heading}' is there twice, remove one")
-            found[line.heading] = _evaluated(line.expression, arrays)
+            found[line.heading] = _evaluate_expression(line.expression, arrays)
         except RecordingError as error:
-            raise RecordingError(f"{line.where}: {error}") from None
+            raise RecordingError(f"{line.source_location}: {error}") from None
     count = max((len(x) for x in found.values() if x.ndim), default=1)
     for line in lines:
         if found[line.heading].shape not in ((), (count,)):
             raise RecordingError(
-                f"{line.where}: '{line.heading}' has {len(found[line.heading])} samples, others "
+                f"{line.source_location}: '{line.heading}' has {len(found[line.heading])} "
+                f"samples, others "
                 f"have {count}, choose a column of a table by its number, as in a[0]"
             )
-    whole = {name: np.broadcast_to(values, (count,)) for name, values in found.items()}
-    table = timeseries.from_columns(columns, whole, notes)
+    columns_by_heading = {
+        name: np.broadcast_to(values, (count,)) for name, values in found.items()
+    }
+    table = timeseries.table_from_columns(columns, columns_by_heading, notes)
     for name, values in zip(table.units, table.values.T, strict=True):
         bad = ~np.isfinite(values)
         if name == TIME:
@@ -126,12 +130,12 @@ def assembled(
     return table
 
 
-def absent(expression: str, arrays: Container[str]) -> list[str]:
+def missing_names(expression: str, arrays: Container[str]) -> list[str]:
     """Names of an expression that a log does not have."""
-    return [name for name in names_in(expression) if name not in arrays and name != "pi"]
+    return [name for name in expression_names(expression) if name not in arrays and name != "pi"]
 
 
-def names_in(expression: str) -> list[str]:
+def expression_names(expression: str) -> list[str]:
     """Columns of a log in an expression; none of one that cannot be read."""
     try:
         nodes = list(ast.walk(ast.parse(expression, mode="eval")))
@@ -148,14 +152,14 @@ def names_in(expression: str) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def lines_of(path: Path) -> tuple[dict[str, str], list[Line]]:
+def read_log_columns(path: Path) -> tuple[dict[str, str], list[LogColumn]]:
     """Notes and columns of a file of columns.
 
     Raises:
         RecordingError: It is missing or malformed.
     """
     try:
-        text = content(path, _LARGEST).decode("utf-8-sig")
+        text = read_plain_file(path, _MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not text, save it as UTF-8") from None
     except OSError as error:
@@ -167,24 +171,24 @@ def lines_of(path: Path) -> tuple[dict[str, str], list[Line]]:
             key, _, value = line.strip().removeprefix("#").partition(":")
             notes[key.strip()] = value.strip()
         elif line.strip():
-            match = _LINE.fullmatch(line)
-            if match is None or len(line) > _LONGEST:
+            match = _LINE_PATTERN.fullmatch(line)
+            if match is None or len(line) > _MAX_EXPRESSION_LENGTH:
                 raise RecordingError(
                     f"{path}:{number}: is no column, write 'name [unit] = expression', as in "
                     "'q1 [deg] = angle[0] - 90'"
                 )
-            found.append(Line(f"{path}:{number}", match[1], match[2]))
+            found.append(LogColumn(f"{path}:{number}", match[1], match[2]))
     if not found:
         raise RecordingError(f"{path}: names no columns, write 'name [unit] = expression'")
     return notes, found
 
 
-def _evaluated(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+def _evaluate_expression(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     """A number () or samples (N,)."""
     try:
         tree = ast.parse(expression, mode="eval")
         with np.errstate(all="ignore"):  # what is not finite is refused with its name
-            value = np.asarray(_value(tree.body, arrays), dtype=np.float64)
+            value = np.asarray(_evaluate_node(tree.body, arrays), dtype=np.float64)
     except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError):
         raise RecordingError(
             f"'{expression}' cannot be computed, combine columns by + - * / and numbers"
@@ -196,15 +200,17 @@ def _evaluated(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     return value
 
 
-def _value(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+def _evaluate_node(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
-        return _OPERATORS[type(node.op)](_value(node.left, arrays), _value(node.right, arrays))
+        return _OPERATORS[type(node.op)](
+            _evaluate_node(node.left, arrays), _evaluate_node(node.right, arrays)
+        )
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        return -_value(node.operand, arrays)
+        return -_evaluate_node(node.operand, arrays)
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         return np.asarray(node.value, dtype=np.float64)
     if isinstance(node, ast.Subscript):
-        whole, at = _value(node.value, arrays), node.slice
+        whole, at = _evaluate_node(node.value, arrays), node.slice
         if not (isinstance(at, ast.Constant) and type(at.value) is int) or not whole.ndim:
             raise ValueError
         if at.value >= whole.shape[-1]:
@@ -220,5 +226,5 @@ def _value(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
             return arrays[name].astype(np.float64, copy=False)
         if name == "pi":
             return np.asarray(math.pi)
-        raise RecordingError(f"the log has no '{name}', {known(arrays, name)}")
+        raise RecordingError(f"the log has no '{name}', {suggest_names(arrays, name)}")
     raise ValueError

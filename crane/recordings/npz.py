@@ -14,17 +14,17 @@ from typing import IO, TypeVar
 
 import numpy as np
 
-from crane.common import scratch
+from crane.common import scratch_arrays
 from crane.common.errors import RecordingError
 from crane.common.samples import Array
 
-MOST = 1 << 29  # numbers in a file: 4 GiB, in scratch files
-MOST_COLUMNS = 4096
-NUMBERS = "biuf"  # kinds of numpy's types
-_AT_ONCE = 1 << 20  # numbers
-_COMMENT = 65535  # bytes that a zip has for it
+MAX_NUMBERS = 1 << 29  # numbers in a file: 4 GiB, in scratch files
+MAX_COLUMNS = 4096
+NUMERIC_KINDS = "biuf"  # kinds of numpy's types
+_BLOCK_NUMBERS = 1 << 20  # numbers
+_MAX_COMMENT_BYTES = 65535  # bytes that a zip has for it
 T = TypeVar("T")
-_DAMAGED = (
+_DAMAGE_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError,
 )  # fmt: skip
 
@@ -38,14 +38,16 @@ def write_columns(
         OSError: The file cannot be written.
     """
     with zipfile.ZipFile(path, "w") as archive:
-        archive.comment = comment.encode()[:_COMMENT]
+        archive.comment = comment.encode()[:_MAX_COMMENT_BYTES]
         for name, column in zip(names, columns, strict=True):
             header = {"descr": "<f8", "fortran_order": False, "shape": column.shape}
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array_header_1_0(file, header)
-                for start in range(0, len(column), scratch.AT_ONCE):
-                    file.write(column[start : start + scratch.AT_ONCE].astype("<f8").tobytes())
-            scratch.release()
+                for start in range(0, len(column), scratch_arrays.BLOCK_SIZE):
+                    file.write(
+                        column[start : start + scratch_arrays.BLOCK_SIZE].astype("<f8").tobytes()
+                    )
+            scratch_arrays.release_pages()
 
 
 def read_columns(path: Path) -> tuple[list[str], Array, str]:
@@ -56,7 +58,7 @@ def read_columns(path: Path) -> tuple[list[str], Array, str]:
         RecordingError: It is no npz file, is damaged or encrypted, or holds other than columns of
             equal length, or too many numbers. The message does not name the file.
     """
-    return _opened(path, _columns)
+    return _read_archive(path, _archive_columns)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -67,74 +69,74 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         RecordingError: It is no npz file, is damaged or encrypted, or holds too many numbers. The
             message does not name the file.
     """
-    return _opened(path, _arrays)
+    return _read_archive(path, _archive_arrays)
 
 
-def _opened(path: Path, read: Callable[[zipfile.ZipFile], T]) -> T:
+def _read_archive(path: Path, read: Callable[[zipfile.ZipFile], T]) -> T:
     try:
         with zipfile.ZipFile(path) as archive:
             return read(archive)
-    except _DAMAGED as error:
+    except _DAMAGE_ERRORS as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:80]
         raise RecordingError(
             f"is no npz file of arrays ({reason}), give one as numpy.savez writes it"
         ) from None
 
 
-def _declared(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+def _declared_types(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Shape and type of each array."""
     entries = archive.infolist()
-    if len(entries) > MOST_COLUMNS:
-        raise RecordingError(f"holds {len(entries)} arrays, give at most {MOST_COLUMNS}")
+    if len(entries) > MAX_COLUMNS:
+        raise RecordingError(f"holds {len(entries)} arrays, give at most {MAX_COLUMNS}")
     types: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     for entry in entries:
-        name = _name(entry)
+        name = _entry_name(entry)
         if name in types:
             raise RecordingError(f"column '{name}' is there twice, rename or remove one")
         if entry.flag_bits & 1:
             raise RecordingError(f"'{name}' is encrypted, save the file without a password")
         with archive.open(entry) as file:
-            types[name] = _header(name, file)
+            types[name] = _read_header(name, file)
     return types
 
 
-def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array, str]:
-    types = _declared(archive)
+def _archive_columns(archive: zipfile.ZipFile) -> tuple[list[str], Array, str]:
+    types = _declared_types(archive)
     count = max((shape[0] for shape, _ in types.values() if len(shape) == 1), default=0)
     for name, (shape, dtype) in types.items():
-        if shape != (count,) or dtype.kind not in NUMBERS:
+        if shape != (count,) or dtype.kind not in NUMERIC_KINDS:
             raise RecordingError(
                 f"'{name}' has the shape {shape} of {str(dtype)[:40]}, give ({count},) numbers "
                 "per column"
             )
     if not count:
         raise RecordingError("holds no samples, give an array per column")
-    if count * len(types) > MOST:
+    if count * len(types) > MAX_NUMBERS:
         raise RecordingError(
-            f"declares {count} samples of {len(types)} columns, give at most {MOST} numbers"
+            f"declares {count} samples of {len(types)} columns, give at most {MAX_NUMBERS} numbers"
         )
     _check_sizes(archive, types)
-    values = scratch.empty(count, len(types))
+    values = scratch_arrays.empty_array(count, len(types))
     for column, entry in enumerate(archive.infolist()):
-        _fill(archive, entry, types, values[:, column])
-        scratch.release()
+        _read_array(archive, entry, types, values[:, column])
+        scratch_arrays.release_pages()
     return list(types), values, archive.comment.decode(errors="replace")
 
 
-def _arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
-    types = _declared(archive)
-    numbers = {name for name, (_, dtype) in types.items() if dtype.kind in NUMBERS}
-    if (count := sum(math.prod(types[name][0]) for name in numbers)) > MOST:
-        raise RecordingError(f"declares {count} numbers, give at most {MOST}")
+def _archive_arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
+    types = _declared_types(archive)
+    numbers = {name for name, (_, dtype) in types.items() if dtype.kind in NUMERIC_KINDS}
+    if (count := sum(math.prod(types[name][0]) for name in numbers)) > MAX_NUMBERS:
+        raise RecordingError(f"declares {count} numbers, give at most {MAX_NUMBERS}")
     _check_sizes(archive, {name: types[name] for name in numbers})
     found: dict[str, np.ndarray] = {}
     for entry in archive.infolist():
-        name = _name(entry)
+        name = _entry_name(entry)
         shape, dtype = types[name]
         found[name] = np.empty(0, dtype)
         if name in numbers:
-            values = scratch.empty(math.prod(shape), 1)[:, 0]
-            fortran = _fill(archive, entry, types, values)
+            values = scratch_arrays.empty_array(math.prod(shape), 1)[:, 0]
+            fortran = _read_array(archive, entry, types, values)
             found[name] = values.reshape(shape, order="F" if fortran else "C")
     return found
 
@@ -144,12 +146,12 @@ def _check_sizes(
 ) -> None:
     """Compare what the headers declare with what is there."""
     for entry in archive.infolist():
-        shape, dtype = types.get(_name(entry), ((0,), np.dtype(float)))
+        shape, dtype = types.get(_entry_name(entry), ((0,), np.dtype(float)))
         if entry.file_size < math.prod(shape) * dtype.itemsize:
-            raise RecordingError(f"'{_name(entry)}' is cut short, save the file again")
+            raise RecordingError(f"'{_entry_name(entry)}' is cut short, save the file again")
 
 
-def _fill(
+def _read_array(
     archive: zipfile.ZipFile,
     entry: zipfile.ZipInfo,
     types: Mapping[str, tuple[tuple[int, ...], np.dtype]],
@@ -159,21 +161,21 @@ def _fill(
     with archive.open(entry) as file:
         np.lib.format.read_magic(file)
         _, fortran, _ = np.lib.format.read_array_header_1_0(file)
-        _read(_name(entry), file, types[_name(entry)][1], values)
+        _read_column(_entry_name(entry), file, types[_entry_name(entry)][1], values)
     return bool(fortran)
 
 
-def _name(entry: zipfile.ZipInfo) -> str:
+def _entry_name(entry: zipfile.ZipInfo) -> str:
     return entry.filename.removesuffix(".npy")
 
 
-def _header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+def _read_header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     """Shape and type of an array, of which the data are left to be read."""
     try:
         if np.lib.format.read_magic(file) != (1, 0):  # others are of long headers
             raise ValueError("not of numbers alone")
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    except (*_DAMAGED, OSError):
+    except (*_DAMAGE_ERRORS, OSError):
         raise
     except Exception as error:  # whatever becomes of a text that is evaluated as Python's literals
         raise ValueError(type(error).__name__) from None
@@ -182,10 +184,10 @@ def _header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _read(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> None:
+def _read_column(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> None:
     """Fill a column (N,)."""
-    for start in range(0, len(column), _AT_ONCE):
-        part = column[start : start + _AT_ONCE]
+    for start in range(0, len(column), _BLOCK_NUMBERS):
+        part = column[start : start + _BLOCK_NUMBERS]
         data = file.read(len(part) * dtype.itemsize)
         if len(data) != len(part) * dtype.itemsize:
             raise RecordingError(f"'{name}' is cut short, save the file again")

@@ -17,8 +17,8 @@ lines may be left out where no joint is free; `machine name` is there where the 
 itself something else than its file, `stopped` where a run ended before its time. Other units are
 converted where crane.recordings.timeseries knows them. An npz file serves, too: one array per
 column, named like those of the CSV, and the comment lines as the comment of the archive. What a
-crane's sensors tell instead of displacements and forces, crane.recordings.measured turns into
-them.
+crane's sensors tell instead of displacements and forces, crane.recordings.measured_recordings
+turns into them.
 """
 
 from collections import Counter
@@ -30,30 +30,30 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common import scratch
-from crane.common.errors import InputError, RecordingError, at, known
+from crane.common import scratch_arrays
+from crane.common.errors import InputError, RecordingError, prefix_location, suggest_names
+from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.samples import Array, as_number, as_seed
-from crane.common.shown import Brief, counted
-from crane.description.sensors import FORCE as FORCE
+from crane.description.machine_lookup import without_changes
+from crane.description.sensors import FORCE_SUFFIX as FORCE_SUFFIX
 from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
-from crane.description.sensors import VELOCITY as VELOCITY
+from crane.description.sensors import VELOCITY_SUFFIX as VELOCITY_SUFFIX
 from crane.description.sensors import VELOCITY_UNITS as VELOCITY_UNITS
-from crane.description.sources import unchanged
 from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table, check_unit
 
-REFERENCE = "reference_"  # before the name of what a channel is the reference of
-SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
-FREE = "free"  # a note of joints that nothing drives
-NAME = "machine name"  # a note where the machine's own is not that of its file
+REFERENCE_PREFIX = "reference_"  # before the name of what a channel is the reference of
+SENSORS_NOTE, IDEAL_SENSORS = "sensors", "ideal"  # a note of quantities themselves
+FREE_JOINTS_NOTE = "free"  # a note of joints that nothing drives
+MACHINE_NAME_NOTE = "machine name"  # a note where the machine's own is not that of its file
 START = "start"  # a note of a run that starts elsewhere than its machine's file says
 STOPPED = "stopped"  # a note of a run that ended before its time
-_ACCELERATION = "_acceleration"
-_LISTED = 40  # names in a message
+_ACCELERATION_SUFFIX = "_acceleration"
+_MAX_LISTED = 40  # names in a message
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recording(Brief):
+class Recording(OneLineRepr):
     """Samples of N instants of a machine with n active joints.
 
     The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time
@@ -104,22 +104,28 @@ class Recording(Brief):
         shape = (count, len(joints))
         for name in self.channel_units:
             if name not in self.channels:
-                raise RecordingError(f"unit of the channel '{name}', {known(self.channels, name)}")
+                raise RecordingError(
+                    f"unit of the channel '{name}', {suggest_names(self.channels, name)}"
+                )
         if set(self.units) != set(joints):
-            raise RecordingError(f"units are for {_listed(self.units)}, give {_listed(joints)}")
+            raise RecordingError(
+                f"units are for {_quoted_list(self.units)}, give {_quoted_list(joints)}"
+            )
         for name in self.free:
             if name not in joints:
-                raise RecordingError(f"free joint '{name}' is not recorded, {known(joints, name)}")
+                raise RecordingError(
+                    f"free joint '{name}' is not recorded, {suggest_names(joints, name)}"
+                )
         checked = {
             "joints": joints,
             "free": tuple(x for x in joints if x in self.free),
             "units": {x: self.units[x] for x in joints},
-            "time": _array(TIME, self.time, (count,), copy),
-            "q": _array("q", self.q, shape, copy, joints),
-            "v": _array("v", self.v, shape, copy, joints),
-            "tau": _array("tau", self.tau, shape, copy, joints),
+            "time": _checked_array(TIME, self.time, (count,), copy),
+            "q": _checked_array("q", self.q, shape, copy, joints),
+            "v": _checked_array("v", self.v, shape, copy, joints),
+            "tau": _checked_array("tau", self.tau, shape, copy, joints),
             "channels": {
-                name: _array(f"channel '{name}'", values, (count,), copy)
+                name: _checked_array(f"channel '{name}'", values, (count,), copy)
                 for name, values in self.channels.items()
             },
             "channel_units": {name: self.channel_units.get(name, "") for name in self.channels},
@@ -130,18 +136,18 @@ class Recording(Brief):
         self._check_values()
 
     def _check_names(self) -> None:
-        names = self._names()
+        names = self._column_names()
         for name, count in Counter(names).items():
             if count > 1:
                 raise RecordingError(f"column '{name}' is there twice, rename or remove one")
-        if _some_joints(names, self.free) != self.joints:
+        if _require_active_joints(names, self.free) != self.joints:
             raise RecordingError(
-                f"channels {_listed(self.channels)} hold an active joint, "
-                f"rename those that end in {VELOCITY} and {FORCE}"
+                f"channels {_quoted_list(self.channels)} hold an active joint, "
+                f"rename those that end in {VELOCITY_SUFFIX} and {FORCE_SUFFIX}"
             )
-        units = self._units()
+        units = self._column_units()
         for name, unit in units.items():
-            timeseries.check_column(name, unit)
+            timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
             if text != text.strip() or not text.isprintable():
@@ -152,10 +158,10 @@ class Recording(Brief):
             raise RecordingError("no samples, give at least one")
         for i, joint in enumerate(self.joints):
             if joint in self.free and self.tau[:, i].any():
-                raise RecordingError(driven_all_the_same(joint, self.tau[:, i]))
+                raise RecordingError(free_force_message(joint, self.tau[:, i]))
         arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
         for values in arrays:
-            scratch.release()
+            scratch_arrays.release_pages()
             if not np.isfinite(values).all():
                 check_finite(self.columns())
         if (back := np.diff(self.time) <= 0).any():
@@ -166,26 +172,27 @@ class Recording(Brief):
                 f"give strictly increasing times"
             )
 
-    def _line(self) -> str:
+    def _one_line(self) -> str:
         """What it is of, how long, how many samples, and its columns."""
         what = ": ".join(word for word in (self.machine, self.task) if word)
         joints = ", ".join(f"{joint} [{self.units[joint]}]" for joint in self.joints)
         return (
             f"Recording of {what or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s in "
-            f"{counted(len(self.time), 'sample')}: {counted(len(self.channels), 'channel')} "
+            f"{format_count(len(self.time), 'sample')}: "
+            f"{format_count(len(self.channels), 'channel')} "
             f"beside {joints or 'no joints'}{'; stopped ' * bool(self.stopped)}{self.stopped}"
         )
 
-    def _names(self) -> list[str]:
+    def _column_names(self) -> list[str]:
         """Names of all columns, in the order in which they are written."""
-        joints = [x + suffix for suffix in ("", VELOCITY) for x in self.joints]
-        return [TIME, *joints, *(x + FORCE for x in self._driven), *self.channels]
+        joints = [x + suffix for suffix in ("", VELOCITY_SUFFIX) for x in self.joints]
+        return [TIME, *joints, *(x + FORCE_SUFFIX for x in self._driven_joints), *self.channels]
 
     @property
-    def _driven(self) -> list[str]:
+    def _driven_joints(self) -> list[str]:
         return [x for x in self.joints if x not in self.free]
 
-    def _units(self) -> dict[str, str]:
+    def _column_units(self) -> dict[str, str]:
         """Units of all columns.
 
         Raises:
@@ -196,8 +203,8 @@ class Recording(Brief):
         return (
             {TIME: "s"}
             | self.units
-            | {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
-            | {x + FORCE: FORCE_UNITS[self.units[x]] for x in self._driven}
+            | {x + VELOCITY_SUFFIX: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
+            | {x + FORCE_SUFFIX: FORCE_UNITS[self.units[x]] for x in self._driven_joints}
             | self.channel_units
         )
 
@@ -214,20 +221,24 @@ class Recording(Brief):
                 "chosen by 'between' and 'at'"
             )
         if name not in columns:
-            raise InputError(f"column '{name}' is not in the recording, {known(columns, name)}")
+            raise InputError(
+                f"column '{name}' is not in the recording, {suggest_names(columns, name)}"
+            )
         return columns[name]
 
     def __iter__(self) -> Iterator[str]:
         """Names of all columns, in the order in which they are written."""
-        return iter(self._names())
+        return iter(self._column_names())
 
     def columns(self) -> dict[str, Array]:
         """All columns (N,) by name, as they are written; views, not copies."""
         forces = (
-            x for x, joint in zip(self.tau.T, self.joints, strict=True) if joint in self._driven
+            x
+            for x, joint in zip(self.tau.T, self.joints, strict=True)
+            if joint in self._driven_joints
         )
         columns = [self.time, *self.q.T, *self.v.T, *forces, *self.channels.values()]
-        return dict(zip(self._names(), columns, strict=True))
+        return dict(zip(self._column_names(), columns, strict=True))
 
     def between(self, start: float, end: float) -> "Recording":
         """What was recorded from `start` to `end` [s], both included.
@@ -235,19 +246,19 @@ class Recording(Brief):
         Raises:
             RecordingError: Nothing was.
         """
-        kept = (self.time >= start) & (self.time <= end)
-        if not kept.any():
+        mask = (self.time >= start) & (self.time <= end)
+        if not mask.any():
             raise RecordingError(
                 f"nothing lies between {start:g} and {end:g} s, the recording goes from "
                 f"{self.time[0]:g} to {self.time[-1]:g} s"
             )
-        return self.at(kept)
+        return self.at(mask)
 
-    def at(self, kept: np.ndarray) -> "Recording":
+    def at(self, mask: np.ndarray) -> "Recording":
         """Only the samples of a mask (N,)."""
         return replace(
-            self, time=self.time[kept], q=self.q[kept], v=self.v[kept], tau=self.tau[kept],
-            channels={name: values[kept] for name, values in self.channels.items()},
+            self, time=self.time[mask], q=self.q[mask], v=self.v[mask], tau=self.tau[mask],
+            channels={name: values[mask] for name, values in self.channels.items()},
         )  # fmt: skip
 
     def with_noise(self, deviations: Mapping[str, float], seed: int = 0) -> "Recording":
@@ -269,7 +280,7 @@ class Recording(Brief):
         del columns[TIME]
         for name, deviation in deviations.items():
             if name not in columns:
-                raise InputError(f"noise of the column '{name}', {known(columns, name)}")
+                raise InputError(f"noise of the column '{name}', {suggest_names(columns, name)}")
             if as_number(deviation, f"the noise of '{name}'", "") < 0:
                 raise InputError(
                     f"the noise of '{name}' is {deviation:g}, it must not be negative"
@@ -277,17 +288,17 @@ class Recording(Brief):
         for name in [name for name in columns if name in deviations]:  # whatever order is given
             columns[name] = columns[name] + deviations[name] * rng.normal(size=len(self.time))
         for joint in self.joints:
-            if joint + VELOCITY not in deviations:
-                columns[joint + VELOCITY] = derivative(columns[joint], self.time)
+            if joint + VELOCITY_SUFFIX not in deviations:
+                columns[joint + VELOCITY_SUFFIX] = time_derivative(columns[joint], self.time)
         none = np.zeros_like(self.time)
         q, v, tau = (
             np.column_stack([columns.get(x + suffix, none) for x in self.joints])
-            for suffix in ("", VELOCITY, FORCE)
+            for suffix in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)
         )
         channels = {
             name: columns[name]
             for name in self.channels
-            if name in deviations or not name.endswith((VELOCITY, _ACCELERATION))
+            if name in deviations or not name.endswith((VELOCITY_SUFFIX, _ACCELERATION_SUFFIX))
         }
         units = {name: self.channel_units[name] for name in channels}
         return replace(self, q=q, v=v, tau=tau, channels=channels, channel_units=units)
@@ -302,13 +313,15 @@ class Recording(Brief):
             RecordingError: It has no reference, or is not recorded.
         """
         columns = {**self.channels, **dict(zip(self.joints, self.q.T, strict=True))}
-        followed = [x for x in columns if REFERENCE + x in self.channels]
-        if joint not in followed:
-            text = known(followed, joint) if followed else "the run followed none"
+        with_reference = [x for x in columns if REFERENCE_PREFIX + x in self.channels]
+        if joint not in with_reference:
+            text = (
+                suggest_names(with_reference, joint) if with_reference else "the run followed none"
+            )
             raise RecordingError(f"'{joint}' has no reference in this recording, {text}")
-        wanted, there = self.channels[REFERENCE + joint], columns[joint]
-        return scratch.in_blocks(
-            lambda part: (wanted[part] - there[part])[:, None], len(self.time)
+        reference, actual = self.channels[REFERENCE_PREFIX + joint], columns[joint]
+        return scratch_arrays.compute_in_blocks(
+            lambda part: (reference[part] - actual[part])[:, None], len(self.time)
         )[:, 0]
 
     def to_csv(self, path: str | Path) -> None:
@@ -318,7 +331,7 @@ class Recording(Brief):
             OutputError: It cannot be written there.
         """
         columns = list(self.columns().values())
-        timeseries.write_columns(path, self._units(), columns, self._notes())
+        timeseries.write_columns(path, self._column_units(), columns, self._notes())
 
     def to_npz(self, path: str | Path) -> None:
         """Write the recording as npz, whole or not at all: smaller than a CSV, and read faster.
@@ -327,18 +340,18 @@ class Recording(Brief):
             OutputError: It cannot be written there.
         """
         columns = list(self.columns().values())
-        timeseries.write_npz(path, self._units(), columns, self._notes())
+        timeseries.write_npz(path, self._column_units(), columns, self._notes())
 
     def _notes(self) -> dict[str, str]:
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
-        if self.machine_name not in ("", Path(unchanged(self.machine)).stem):
-            notes[NAME] = self.machine_name
+        if self.machine_name not in ("", Path(without_changes(self.machine)).stem):
+            notes[MACHINE_NAME_NOTE] = self.machine_name
         if self.controller:
             notes["controller"] = self.controller
         if self.ideal:
-            notes[SENSORS] = IDEAL
+            notes[SENSORS_NOTE] = IDEAL_SENSORS
         if self.free:
-            notes[FREE] = ", ".join(self.free)
+            notes[FREE_JOINTS_NOTE] = ", ".join(self.free)
         if self.stopped:
             notes[STOPPED] = self.stopped
         if self.start:
@@ -362,7 +375,7 @@ class Recording(Brief):
         Raises:
             RecordingError: As `from_csv`, or the suffix is another one.
         """
-        return cls.from_table(timeseries.read(path), path)
+        return cls.from_table(timeseries.read_table(path), path)
 
     @classmethod
     def from_table(cls, table: Table, path: str | Path) -> "Recording":
@@ -374,34 +387,40 @@ class Recording(Brief):
         try:
             return cls._from_table(table)
         except RecordingError as error:
-            raise RecordingError(at(str(path), error)) from None
+            raise RecordingError(prefix_location(str(path), error)) from None
 
     @classmethod
     def _from_table(cls, table: Table) -> "Recording":
         units, column = table.units, dict(zip(table.units, table.values.T, strict=True))
-        free = tuple(filter(None, (x.strip() for x in table.notes.get(FREE, "").split(","))))
-        joints = _some_joints(list(units), free)
+        free = tuple(
+            filter(None, (x.strip() for x in table.notes.get(FREE_JOINTS_NOTE, "").split(",")))
+        )
+        joints = _require_active_joints(list(units), free)
         for joint in joints:
             unit = units[joint]
             if unit not in VELOCITY_UNITS:
-                check_unit(joint, unit, _fitting(joint, units) or VELOCITY_UNITS)
-            if joint + VELOCITY in units:
-                check_unit(joint + VELOCITY, units[joint + VELOCITY], [VELOCITY_UNITS[unit]])
+                check_unit(joint, unit, _matching_units(joint, units) or VELOCITY_UNITS)
+            if joint + VELOCITY_SUFFIX in units:
+                check_unit(
+                    joint + VELOCITY_SUFFIX, units[joint + VELOCITY_SUFFIX], [VELOCITY_UNITS[unit]]
+                )
             else:
-                column[joint + VELOCITY] = derivative(column[joint], column[TIME])
-            if joint + FORCE in units:
-                check_unit(joint + FORCE, units[joint + FORCE], [FORCE_UNITS[unit]])
+                column[joint + VELOCITY_SUFFIX] = time_derivative(column[joint], column[TIME])
+            if joint + FORCE_SUFFIX in units:
+                check_unit(joint + FORCE_SUFFIX, units[joint + FORCE_SUFFIX], [FORCE_UNITS[unit]])
             elif joint in free:
-                column[joint + FORCE] = np.zeros_like(column[TIME])
+                column[joint + FORCE_SUFFIX] = np.zeros_like(column[TIME])
 
         def stacked(suffix: str) -> Array:
             columns = [column[x + suffix] for x in joints]
-            return scratch.in_blocks(
+            return scratch_arrays.compute_in_blocks(
                 lambda part: np.column_stack([x[part] for x in columns]), len(column[TIME])
             )
 
-        q, v, tau = (stacked(suffix) for suffix in ("", VELOCITY, FORCE))
-        used = {TIME} | {x + suffix for x in joints for suffix in ("", VELOCITY, FORCE)}
+        q, v, tau = (stacked(suffix) for suffix in ("", VELOCITY_SUFFIX, FORCE_SUFFIX))
+        used = {TIME} | {
+            x + suffix for x in joints for suffix in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)
+        }
         channels = {x: values for x, values in column.items() if x not in used}
         return cls(
             time=column[TIME],
@@ -415,16 +434,16 @@ class Recording(Brief):
             machine=table.notes.get("machine", ""),
             task=table.notes.get("task", ""),
             controller=table.notes.get("controller", ""),
-            ideal=table.notes.get(SENSORS) == IDEAL,
+            ideal=table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS,
             free=free,
-            machine_name=table.notes.get(NAME, ""),
+            machine_name=table.notes.get(MACHINE_NAME_NOTE, ""),
             stopped=table.notes.get(STOPPED, ""),
             start=table.notes.get(START, ""),
             copy=False,
         )
 
 
-def derivative(x: Array, time: Array) -> Array:
+def time_derivative(x: Array, time: Array) -> Array:
     """Central differences (N,) of x (N,); zero where time does not tell (it is refused later)."""
     if len(x) < 2 or not (np.diff(time) > 0).all():
         return np.zeros_like(x)
@@ -445,7 +464,7 @@ def check_finite(columns: Mapping[str, Array]) -> None:
             )
 
 
-def _array(
+def _checked_array(
     what: str, value: ArrayLike, shape: tuple[int, ...], copy: bool, names: Sequence[str] = ()
 ) -> Array:
     """A float64 array of that shape: a contiguous copy, or as it lies where none is asked for."""
@@ -455,18 +474,18 @@ def _array(
     except (TypeError, ValueError):
         raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
     if array.shape != shape:
-        columns = f", a column each for {_listed(names)}" if names else ""
+        columns = f", a column each for {_quoted_list(names)}" if names else ""
         raise RecordingError(f"{what} has the shape {array.shape}, give {shape}{columns}")
     return array
 
 
-def _listed(names: Iterable[str]) -> str:
+def _quoted_list(names: Iterable[str]) -> str:
     names = list(names)
-    more = [f"{len(names) - _LISTED} more"] if len(names) > _LISTED else []
-    return ", ".join([f"'{name}'" for name in names[:_LISTED]] + more) or "none"
+    more = [f"{len(names) - _MAX_LISTED} more"] if len(names) > _MAX_LISTED else []
+    return ", ".join([f"'{name}'" for name in names[:_MAX_LISTED]] + more) or "none"
 
 
-def driven_all_the_same(joint: str, tau: Array) -> str:
+def free_force_message(joint: str, tau: Array) -> str:
     """What to say of a free joint's force (N,) that is not zero."""
     sample = int(np.argmax(tau != 0))
     return (
@@ -475,40 +494,44 @@ def driven_all_the_same(joint: str, tau: Array) -> str:
     )
 
 
-def find_joints(names: Sequence[str], free: Sequence[str] = ()) -> tuple[str, ...]:
+def find_active_joints(names: Sequence[str], free: Sequence[str] = ()) -> tuple[str, ...]:
     """The active joints among columns, by the rule in the module's docstring.
 
     Raises:
         RecordingError: There are velocity and force of a joint without its displacement.
     """
-    there = set(names)
-    for stem in (x.removesuffix(FORCE) for x in names if x.endswith(FORCE)):
-        if stem not in there and stem + VELOCITY in there:
+    available = set(names)
+    for stem in (x.removesuffix(FORCE_SUFFIX) for x in names if x.endswith(FORCE_SUFFIX)):
+        if stem not in available and stem + VELOCITY_SUFFIX in available:
             raise RecordingError(
-                f"column '{stem}' is missing beside '{stem}{VELOCITY}', '{stem}{FORCE}', "
+                f"column '{stem}' is missing beside '{stem}{VELOCITY_SUFFIX}', "
+                f"'{stem}{FORCE_SUFFIX}', "
                 f"add it, or rename those if '{stem}' is not an active joint"
             )
     for x in free:
-        if x not in there:
-            raise RecordingError(f"column '{x}' of a free joint is missing, {known(names, x)}")
-    return tuple(x for x in names if x + FORCE in there or x in free)
+        if x not in available:
+            raise RecordingError(
+                f"column '{x}' of a free joint is missing, {suggest_names(names, x)}"
+            )
+    return tuple(x for x in names if x + FORCE_SUFFIX in available or x in free)
 
 
-def _fitting(joint: str, units: Mapping[str, str]) -> list[str]:
+def _matching_units(joint: str, units: Mapping[str, str]) -> list[str]:
     """Units of a joint that fit its velocity and force, as far as these have columns."""
     return [
         unit
         for unit, rate in VELOCITY_UNITS.items()
-        if units.get(joint + VELOCITY, rate) == rate
-        and units.get(joint + FORCE, FORCE_UNITS[unit]) == FORCE_UNITS[unit]
+        if units.get(joint + VELOCITY_SUFFIX, rate) == rate
+        and units.get(joint + FORCE_SUFFIX, FORCE_UNITS[unit]) == FORCE_UNITS[unit]
     ]
 
 
-def _some_joints(names: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:
-    joints = find_joints(names, free)
+def _require_active_joints(names: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:
+    joints = find_active_joints(names, free)
     if not joints:
         raise RecordingError(
-            f"no active joint among the columns {_listed(names)}, give for each joint "
-            f"its displacement, force and perhaps velocity, as in q1, q1{FORCE}, q1{VELOCITY}"
+            f"no active joint among the columns {_quoted_list(names)}, give for each joint "
+            f"its displacement, force and perhaps velocity, as in q1, q1{FORCE_SUFFIX}, "
+            f"q1{VELOCITY_SUFFIX}"
         )
     return joints

@@ -4,8 +4,8 @@ Comment lines `# key: value`, then one header row `time [s],name [unit],...`, th
 sample. A file that is written here says by `# crane samples: N` how many there are, so that one
 that is cut short is told. A unit may be left out, for all columns but time. What is read is in SI
 units: columns in
-bar, deg, mm and others of `crane.common.units.TO_SI` are converted, those in other units stay as
-they are. Numbers are written with the fewest digits that give the same float64 again.
+bar, deg, mm and others of `crane.common.units.SI_CONVERSIONS` are converted, those in other units
+stay as they are. Numbers are written with the fewest digits that give the same float64 again.
 """
 
 import codecs
@@ -23,31 +23,31 @@ from typing import TypeVar
 
 import numpy as np
 
-from crane.common import scratch
-from crane.common.errors import RecordingError, at
-from crane.common.output import replacing
+from crane.common import scratch_arrays
+from crane.common.atomic_output import replace_file
+from crane.common.errors import RecordingError, prefix_location
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.common.shown import Brief
-from crane.common.units import TO_SI
-from crane.common.units import spellings as spellings
+from crane.common.units import SI_CONVERSIONS
+from crane.common.units import accepted_units as accepted_units
 from crane.description.sensors import TIME as TIME
 from crane.recordings import npz
-from crane.recordings.npz import MOST, MOST_COLUMNS, read_arrays, read_columns
+from crane.recordings.npz import MAX_COLUMNS, MAX_NUMBERS, read_arrays, read_columns
 
 T = TypeVar("T")
 
-_WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
-SAMPLES = "crane samples"  # the comment that says how many there are
-_ROWS_AT_ONCE = 4096
-_UTF8 = "utf-8-sig"  # with a mark or without
-_BLOCK = 1 << 20  # bytes, and so many at most in a line
-_LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
-_AGAIN = f"copy it again, or remove '# {SAMPLES}' if that is meant"
-_LARGEST = 1e30  # in SI units; what is computed from larger ones overflows
+_NAME_PATTERN = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
+SAMPLE_COUNT_NOTE = "crane samples"  # the comment that says how many there are
+_BLOCK_ROWS = 4096
+_UTF8_ENCODING = "utf-8-sig"  # with a mark or without
+_BLOCK_BYTES = 1 << 20  # bytes, and so many at most in a line
+_MAX_HEADING_LENGTH, _MAX_NAME_LENGTH = 1 << 16, 200  # characters
+_TRUNCATION_HINT = f"copy it again, or remove '# {SAMPLE_COUNT_NOTE}' if that is meant"
+_MAX_VALUE = 1e30  # in SI units; what is computed from larger ones overflows
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Table(Brief):
+class Table(OneLineRepr):
     """Columns of a file.
 
     Attributes:
@@ -62,7 +62,7 @@ class Table(Brief):
     notes: dict[str, str]
 
 
-def check_column(name: str, unit: str) -> None:
+def check_column_name(name: str, unit: str) -> None:
     """See that a header can hold this name and unit.
 
     Raises:
@@ -70,25 +70,25 @@ def check_column(name: str, unit: str) -> None:
     """
     words = {"name": name, "unit": unit} if unit else {"name": name}
     for what, text in words.items():
-        if not _WORD.fullmatch(text) or not text.isprintable():
+        if not _NAME_PATTERN.fullmatch(text) or not text.isprintable():
             raise RecordingError(
                 f"column '{name}': {text!r} cannot be the {what} of a column, "
                 f"use no commas, brackets, quotes or outer blanks"
             )
 
 
-def column(table: Table, name: str, unit: str | None = None) -> Array:
+def table_column(table: Table, name: str, unit: str | None = None) -> Array:
     """A column (N,), in a unit.
 
     Raises:
         RecordingError: It is in another one.
     """
     if unit is not None:
-        check_unit(name, table.units[name], spellings(unit))
+        check_unit(name, table.units[name], accepted_units(unit))
     return table.values[:, list(table.units).index(name)]
 
 
-def write(path: str | Path, table: Table) -> None:
+def write_table(path: str | Path, table: Table) -> None:
     """Write a table, whole or not at all; what is NaN is an empty cell.
 
     Raises:
@@ -105,12 +105,15 @@ def write_columns(
     Raises:
         OutputError: It cannot be written there.
     """
-    head = [*_comments({**notes, SAMPLES: str(len(columns[0]))}), ",".join(_headings(units))]
-    with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+    head = [
+        *_comment_lines({**notes, SAMPLE_COUNT_NOTE: str(len(columns[0]))}),
+        ",".join(_column_headings(units)),
+    ]
+    with replace_file(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(head) + "\n")
-        for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
-            rows = np.column_stack([x[start : start + _ROWS_AT_ONCE] for x in columns])
-            scratch.release()
+        for start in range(0, len(columns[0]), _BLOCK_ROWS):
+            rows = np.column_stack([x[start : start + _BLOCK_ROWS] for x in columns])
+            scratch_arrays.release_pages()
             # digits take most of the time: what stays the same has them once
             bits = rows.view(np.int64)
             same = (bits == bits[0]).all(axis=0)
@@ -129,19 +132,19 @@ def write_npz(
     Raises:
         OutputError: It cannot be written there.
     """
-    with replacing(path) as part:
-        npz.write_columns(part, _headings(units), columns, "\n".join(_comments(notes)))
+    with replace_file(path) as part:
+        npz.write_columns(part, _column_headings(units), columns, "\n".join(_comment_lines(notes)))
 
 
-def _comments(notes: Mapping[str, str]) -> list[str]:
+def _comment_lines(notes: Mapping[str, str]) -> list[str]:
     return [f"# {key}: {value}" if value else f"# {key}" for key, value in notes.items()]
 
 
-def _headings(units: Mapping[str, str]) -> list[str]:
+def _column_headings(units: Mapping[str, str]) -> list[str]:
     return [f"{x} [{unit}]" if unit else x for x, unit in units.items()]
 
 
-def read(path: str | Path) -> Table:
+def read_table(path: str | Path) -> Table:
     """Read a table from a CSV or npz file, by its suffix.
 
     Raises:
@@ -165,20 +168,23 @@ def read_csv(path: str | Path) -> Table:
     """
     path = Path(path)
     try:
-        check_plain(path)
+        check_regular_file(path)
         lines = _count_lines(path)
-        notes, heading, line = _head(path)
-        units = _units(heading)
-        if (lines - line) * len(units) > MOST:
+        notes, heading, line = _read_header(path)
+        units = _parse_header(heading)
+        if (lines - line) * len(units) > MAX_NUMBERS:
             raise RecordingError(
-                f"holds {lines - line} lines of {len(units)} columns, give at most {MOST} numbers"
+                f"holds {lines - line} lines of {len(units)} columns, give at most "
+                f"{MAX_NUMBERS} numbers"
             )
-        _check_end(path, notes)
-        values = _values(path, line, lines, units)
-        _check_count(values, notes)
-        return _in_si(Table(units, values, {key: x for key, x in notes.items() if key != SAMPLES}))
+        _check_last_line(path, notes)
+        values = _read_values(path, line, lines, units)
+        _check_sample_count(values, notes)
+        return _convert_to_si(
+            Table(units, values, {key: x for key, x in notes.items() if key != SAMPLE_COUNT_NOTE})
+        )
     except RecordingError as error:
-        raise RecordingError(at(str(path), error)) from None
+        raise RecordingError(prefix_location(str(path), error)) from None
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
     except OSError as error:
@@ -192,12 +198,14 @@ def read_npz(path: Path) -> Table:
     Raises:
         RecordingError: The file does not exist, or as `crane.recordings.npz.read_columns`.
     """
-    names, values, comment = _npz(path, read_columns)
+    names, values, comment = _read_npz_file(path, read_columns)
     lines = (line.strip() for line in comment.splitlines())
-    return _table(path, names, values, dict(_note(x) for x in lines if x.startswith("#")))
+    return _build_table(
+        path, names, values, dict(_parse_note(x) for x in lines if x.startswith("#"))
+    )
 
 
-def arrays(path: Path) -> dict[str, np.ndarray]:
+def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
     """What an npz file or a CSV of another program holds, by name: nothing is converted.
 
     A CSV has one header row; it separates columns by commas, semicolons or tabs. Where it is not
@@ -208,17 +216,19 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
         RecordingError: The file does not exist or is none of these.
     """
     if path.suffix.lower() == ".npz":
-        return _npz(path, read_arrays)
+        return _read_npz_file(path, read_arrays)
     try:
-        check_plain(path)
+        check_regular_file(path)
         _count_lines(path)
-        encoding = _encoding(path)
-        notes, heading, line = _head(path, encoding)
-        _check_end(path, notes, encoding)
-        between = max(",;\t", key=heading.count)
-        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
-        values = _numbers(lambda: _rows(path, encoding, line, between), line, between, names)
-        _check_count(values, notes)
+        encoding = _detect_encoding(path)
+        notes, heading, line = _read_header(path, encoding)
+        _check_last_line(path, notes, encoding)
+        separator = max(",;\t", key=heading.count)
+        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
+        values = _read_log_values(
+            lambda: _log_rows(path, encoding, line, separator), line, separator, names
+        )
+        _check_sample_count(values, notes)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
     except OSError as error:
@@ -234,36 +244,38 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(names, values.T, strict=True))
 
 
-def _npz(path: Path, read: Callable[[Path], T]) -> T:
+def _read_npz_file(path: Path, read: Callable[[Path], T]) -> T:
     try:
-        check_plain(path)
+        check_regular_file(path)
         return read(path)
     except RecordingError as error:
-        raise RecordingError(at(str(path), error)) from None
+        raise RecordingError(prefix_location(str(path), error)) from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
 
 
-def from_columns(path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]) -> Table:
+def table_from_columns(
+    path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]
+) -> Table:
     """A table in SI units of arrays (N,) named 'name [unit]'; the path is for errors.
 
     Raises:
         RecordingError: They are not named like columns.
     """
-    return _table(path, list(columns), np.column_stack(list(columns.values())), notes)
+    return _build_table(path, list(columns), np.column_stack(list(columns.values())), notes)
 
 
-def _table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str]) -> Table:
+def _build_table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str]) -> Table:
     heading = io.StringIO()
     csv.writer(heading).writerow(names)
     try:
-        return _in_si(Table(_units(heading.getvalue().rstrip()), values, notes))
+        return _convert_to_si(Table(_parse_header(heading.getvalue().rstrip()), values, notes))
     except RecordingError as error:
-        raise RecordingError(at(str(path), error)) from None
+        raise RecordingError(prefix_location(str(path), error)) from None
 
 
-def check_plain(path: Path) -> None:
+def check_regular_file(path: Path) -> None:
     """See that a file ends, as devices and pipes need not.
 
     Raises:
@@ -280,60 +292,62 @@ def _count_lines(path: Path) -> int:
     Raises:
         RecordingError: One of them is none, by its length.
     """
-    ended, since = 0, 0  # lines, bytes of the one that has not ended
+    line_count, line_bytes = 0, 0  # lines, bytes of the one that has not ended
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(_BLOCK_BYTES):
             ends = block.replace(b"\r", b"\n")
             first, last = ends.find(b"\n"), ends.rfind(b"\n")
-            since += first if first >= 0 else len(block)
-            if since > _BLOCK:
-                what = f"line {ended + 1} has more than {_BLOCK} bytes"
+            line_bytes += first if first >= 0 else len(block)
+            if line_bytes > _BLOCK_BYTES:
+                what = f"line {line_count + 1} has more than {_BLOCK_BYTES} bytes"
                 raise RecordingError(f"{what}, write one line per sample")
-            ended += block.count(b"\n") or block.count(b"\r")
+            line_count += block.count(b"\n") or block.count(b"\r")
             if last >= 0:
-                since = len(block) - last - 1
-    return ended + (since > 0)
+                line_bytes = len(block) - last - 1
+    return line_count + (line_bytes > 0)
 
 
-def _check_end(path: Path, notes: Mapping[str, str], encoding: str = _UTF8) -> None:
+def _check_last_line(path: Path, notes: Mapping[str, str], encoding: str = _UTF8_ENCODING) -> None:
     """See that the last line of a file that says how many samples it has ends.
 
     Raises:
         RecordingError: It may be cut inside of a number.
     """
-    if SAMPLES not in notes:
+    if SAMPLE_COUNT_NOTE not in notes:
         return
     with path.open("rb") as file:
         file.seek(-2 if encoding == "utf-16" else -1, os.SEEK_END)
         if file.read().strip(b"\0") not in (b"\r", b"\n"):
-            raise RecordingError(f"is cut short in its last line, {_AGAIN}")
+            raise RecordingError(f"is cut short in its last line, {_TRUNCATION_HINT}")
 
 
-def _check_count(values: Array, notes: Mapping[str, str]) -> None:
+def _check_sample_count(values: Array, notes: Mapping[str, str]) -> None:
     """See that there are as many samples as a file says.
 
     Raises:
         RecordingError: There are not.
     """
-    if SAMPLES in notes and notes[SAMPLES] != str(len(values)):
-        said = notes[SAMPLES][:20]
-        raise RecordingError(f"has {len(values)} of the {said} samples that it says, {_AGAIN}")
+    if SAMPLE_COUNT_NOTE in notes and notes[SAMPLE_COUNT_NOTE] != str(len(values)):
+        said = notes[SAMPLE_COUNT_NOTE][:20]
+        raise RecordingError(
+            f"has {len(values)} of the {said} samples that it says, {_TRUNCATION_HINT}"
+        )
 
 
-def _in_si(table: Table) -> Table:
+def _convert_to_si(table: Table) -> Table:
     units, values = dict(table.units), table.values
     for i, (name, unit) in enumerate(table.units.items()):
-        scratch.release()
-        if unit in TO_SI:
-            units[name], a, b = TO_SI[unit]
+        scratch_arrays.release_pages()
+        if unit in SI_CONVERSIONS:
+            units[name], a, b = SI_CONVERSIONS[unit]
             with np.errstate(over="ignore"):  # infinite values are refused with their name
                 values[:, i] = values[:, i] * a / b
     for i, name in enumerate(table.units):
-        scratch.release()
+        scratch_arrays.release_pages()
         column = values[:, i]
-        beyond = np.isfinite(column) & (np.abs(column) > _LARGEST)
-        if beyond.any():
-            sample = int(np.argmax(beyond))
+        is_too_large = np.isfinite(column) & (np.abs(column) > _MAX_VALUE)
+        if is_too_large.any():
+            sample = int(np.argmax(is_too_large))
             raise RecordingError(
                 f"'{name}' is {column[sample]:.3g} at sample {sample}, beyond all that is "
                 "measured, correct it"
@@ -341,64 +355,64 @@ def _in_si(table: Table) -> Table:
     return Table(units, values, table.notes)
 
 
-def _encoding(path: Path) -> str:
+def _detect_encoding(path: Path) -> str:
     """How the text of a log is encoded."""
     with path.open("rb") as file:
         if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
             return "utf-16"
     try:
-        with path.open(encoding=_UTF8) as text:
+        with path.open(encoding=_UTF8_ENCODING) as text:
             for _ in text:
                 pass
     except UnicodeDecodeError:
         return "cp1252"
-    return _UTF8
+    return _UTF8_ENCODING
 
 
-def _rows(path: Path, encoding: str, header: int, between: str) -> Iterator[str]:
+def _log_rows(path: Path, encoding: str, header: int, separator: str) -> Iterator[str]:
     """Lines of a log below its header row, with decimals behind points."""
 
     def lines() -> Iterator[str]:
         with path.open(encoding=encoding) as file:
             yield from itertools.islice(file, header, None)
 
-    if between == "," or any("." in line for line in lines()):
+    if separator == "," or any("." in line for line in lines()):
         return lines()
     return (line.replace(",", ".") for line in lines())
 
 
-def _head(path: Path, encoding: str = _UTF8) -> tuple[dict[str, str], str, int]:
+def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, str], str, int]:
     """Notes, the header row, and its line number."""
     notes: dict[str, str] = {}
-    passed = 0  # characters
+    character_count = 0  # characters
     with path.open(encoding=encoding) as file:
         for line, text in enumerate(file, start=1):
-            passed += len(text)
+            character_count += len(text)
             text = text.strip()
             if text.startswith("#"):
-                key, value = _note(text)
+                key, value = _parse_note(text)
                 notes[key] = value
             elif text:
-                if len(text) > _LONG_HEADING:
+                if len(text) > _MAX_HEADING_LENGTH:
                     raise RecordingError(
                         f"line {line}, the header row, has {len(text)} characters, give at most "
-                        f"{_LONG_HEADING}"
+                        f"{_MAX_HEADING_LENGTH}"
                     )
                 return notes, text, line
-            if passed > _BLOCK:
+            if character_count > _BLOCK_BYTES:
                 raise RecordingError(
-                    f"has no header row within {_BLOCK} characters, name the columns before"
+                    f"has no header row within {_BLOCK_BYTES} characters, name the columns before"
                 )
     raise RecordingError("is empty, write a header row and one row per sample")
 
 
-def _note(text: str) -> tuple[str, str]:
+def _parse_note(text: str) -> tuple[str, str]:
     """Key and value of a line '# key: value'."""
     key, _, value = text.removeprefix("#").partition(":")
     return key.strip(), value.strip()
 
 
-def _units(heading: str) -> dict[str, str]:
+def _parse_header(heading: str) -> dict[str, str]:
     """Names and units of the columns from the header row."""
     for other in (";", "\t"):
         if other in heading and "," not in heading:
@@ -407,35 +421,35 @@ def _units(heading: str) -> dict[str, str]:
         cells = next(csv.reader([heading]))
     except csv.Error as error:
         raise RecordingError(f"has a header row that is none ({error}), correct it") from None
-    if len(cells) > MOST_COLUMNS:
-        raise RecordingError(f"has {len(cells)} columns, give at most {MOST_COLUMNS}")
-    if all(_number(cell) is not None for cell in cells):
+    if len(cells) > MAX_COLUMNS:
+        raise RecordingError(f"has {len(cells)} columns, give at most {MAX_COLUMNS}")
+    if all(_parse_number(cell) is not None for cell in cells):
         raise RecordingError(
             "has no header, name the columns in the first row (without '#'), "
             "as in 'time [s],q1 [rad],q1_velocity [rad/s],q1_force [N m]'"
         )
     units: dict[str, str] = {}
     for position, cell in enumerate(cells, start=1):
-        name, unit = heading_of(cell)
-        if not name or len(cell) > _LONG_NAME:
-            hint = f", at most {_LONG_NAME} characters" if name else ""
+        name, unit = parse_heading(cell)
+        if not name or len(cell) > _MAX_NAME_LENGTH:
+            hint = f", at most {_MAX_NAME_LENGTH} characters" if name else ""
             raise RecordingError(
-                f"column {position} is headed '{_shown(cell)}', write 'name [unit]'{hint}"
+                f"column {position} is headed '{_shortened(cell)}', write 'name [unit]'{hint}"
             )
         if name in units:
             raise RecordingError(f"column '{name}' is there twice, rename or remove one")
-        check_column(name, unit)
+        check_column_name(name, unit)
         units[name] = unit
     if TIME not in units:
         raise RecordingError(
             f"no column '{TIME}' in the header, add '{TIME} [s]', or say by a file of columns "
             "(--columns) which column of a log is which"
         )
-    check_unit(TIME, units[TIME], spellings("s"))
+    check_unit(TIME, units[TIME], accepted_units("s"))
     return units
 
 
-def heading_of(cell: str) -> tuple[str, str]:
+def parse_heading(cell: str) -> tuple[str, str]:
     """Name and unit in 'name [unit]'; no name where it is something else."""
     name, bracket, unit = cell.strip().partition("[")
     if bracket:
@@ -447,7 +461,7 @@ def heading_of(cell: str) -> tuple[str, str]:
     return name.strip(), unit.strip()
 
 
-def _shown(cell: str) -> str:
+def _shortened(cell: str) -> str:
     cell = cell.strip()
     return cell if len(cell) < 60 else cell[:60] + "..."
 
@@ -464,40 +478,40 @@ def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
         raise RecordingError(f"column '{column}' {found}, give {wanted}")
 
 
-def _values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
+def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
     """Numbers (N, columns) below the header row, which is line `header` of so many."""
-    values, count, sound = scratch.empty(lines - header, len(units)), 0, True
+    values, count, is_valid = scratch_arrays.empty_array(lines - header, len(units)), 0, True
     try:
         with path.open(encoding="utf-8") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about blank lines alone
             for _ in itertools.islice(file, header):
                 pass
             for line in file:
-                block = itertools.chain([line], itertools.islice(file, _ROWS_AT_ONCE - 1))
+                block = itertools.chain([line], itertools.islice(file, _BLOCK_ROWS - 1))
                 rows = np.loadtxt(block, delimiter=",", comments=None, ndmin=2)
                 if not rows.size:
                     continue
                 if rows.shape[1] != len(units):
-                    sound = False
+                    is_valid = False
                     break
-                sound = sound and bool(np.isfinite(rows).all())
+                is_valid = is_valid and bool(np.isfinite(rows).all())
                 values[count : count + len(rows)] = rows
                 count += len(rows)
-                scratch.release()
+                scratch_arrays.release_pages()
     except ValueError as error:
-        _find_fault(path, header, units)
+        _raise_first_fault(path, header, units)
         reason = " ".join(str(error).split())[:120]
         raise RecordingError(f"{reason}, correct the file") from None
-    if sound and not count:
+    if is_valid and not count:
         raise RecordingError("has a header and no samples, write one row per sample")
     values = values[:count]
-    if not sound or (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
-        _find_fault(path, header, units)
+    if not is_valid or (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
+        _raise_first_fault(path, header, units)
     return values
 
 
-def _numbers(
-    rows: Callable[[], Iterator[str]], header: int, between: str, names: Sequence[str]
+def _read_log_values(
+    rows: Callable[[], Iterator[str]], header: int, separator: str, names: Sequence[str]
 ) -> Array:
     """Numbers (N, columns) of a log, whose rows are below its header row, line `header`.
 
@@ -508,38 +522,40 @@ def _numbers(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about a file without samples
-            values = np.loadtxt(rows(), delimiter=between, comments=None, ndmin=2)
+            values = np.loadtxt(rows(), delimiter=separator, comments=None, ndmin=2)
     except ValueError:
-        _find_word(rows(), header, between, names)
+        _raise_invalid_cell(rows(), header, separator, names)
         raise
     if not values.size:
         raise RecordingError("has a header and no samples, write one row per sample")
     return values
 
 
-def _find_word(rows: Iterator[str], header: int, between: str, names: Sequence[str]) -> None:
+def _raise_invalid_cell(
+    rows: Iterator[str], header: int, separator: str, names: Sequence[str]
+) -> None:
     """Raise an error about the first cell of a log that is no number."""
     for line, text in enumerate(rows, start=header + 1):
-        cells = text.rstrip("\n").split(between) if text.strip() else []
+        cells = text.rstrip("\n").split(separator) if text.strip() else []
         for name, cell in zip(names, cells, strict=False):
-            if _number(cell) is None:
+            if _parse_number(cell) is None:
                 raise RecordingError(
-                    f"line {line}, column '{name}': '{_shown(cell)}' is not a number, correct "
+                    f"line {line}, column '{name}': '{_shortened(cell)}' is not a number, correct "
                     f"or remove the line"
                 )
 
 
-def _number(cell: str) -> float | None:
+def _parse_number(cell: str) -> float | None:
     try:
         return float(cell) if "_" not in cell else None
     except ValueError:
         return None
 
 
-def _find_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
+def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
     """Raise an error about the first line that is wrong."""
     names, last = list(units), -np.inf
-    with path.open(encoding=_UTF8) as file:
+    with path.open(encoding=_UTF8_ENCODING) as file:
         for line, text in enumerate(file, start=1):
             if line <= header or not text.strip():
                 continue
@@ -549,10 +565,10 @@ def _find_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
                     f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
                 )
             for name, cell in zip(names, cells, strict=True):
-                value = _number(cell)
+                value = _parse_number(cell)
                 if value is None or not np.isfinite(value):
                     raise RecordingError(
-                        f"line {line}, column '{name}': '{_shown(cell)}' is not a finite "
+                        f"line {line}, column '{name}': '{_shortened(cell)}' is not a finite "
                         f"number, correct or remove the line"
                     )
             now = float(cells[names.index(TIME)])

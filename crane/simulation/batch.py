@@ -9,28 +9,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneError, InputError
+from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.progress import progress_reporter
 from crane.common.samples import Array
-from crane.common.shown import Brief, counted
-from crane.common.waiting import telling
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.simulation.judgement import said
-from crane.simulation.run import (
+from crane.simulation.run_checks import run_warnings
+from crane.simulation.simulation_run import (
     Progress,
-    as_controller,
-    as_driven,
     count_steps,
-    fixed,
+    has_fixed_steps,
     integrate,
-    reference_beyond,
+    machine_under_control,
+    reference_limits_text,
+    resolve_controller,
 )
 
 _Result = tuple[Array, Array, Array, Array, Array, str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Batch(Brief):
+class Batch(OneLineRepr):
     """Results of B simulations of N instants with n active joints.
 
     Attributes:
@@ -51,11 +51,11 @@ class Batch(Brief):
     failures: dict[int, str]
     warnings: dict[int, str]
 
-    def _line(self) -> str:
+    def _one_line(self) -> str:
         """How many, how long, and how many failed."""
         return (
-            f"Batch of {counted(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
-            f"{counted(len(self.time), 'sample')}: {len(self.failures)} failed"
+            f"Batch of {format_count(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
+            f"{format_count(len(self.time), 'sample')}: {len(self.failures)} failed"
         )
 
 
@@ -90,15 +90,16 @@ def simulate_batch(
     Raises:
         InputError: Lengths or active joints that do not go together.
     """
-    progress = telling(progress)
+    progress = progress_reporter(progress)
     if isinstance(machines, Machine):
         machines = [machines] * (1 if initial is None else len(initial))
     if not machines:
         raise InputError("there are no machines, give at least one")
-    starts = [None] * len(machines) if initial is None else list(initial)
-    if len(starts) != len(machines):
+    initial_states = [None] * len(machines) if initial is None else list(initial)
+    if len(initial_states) != len(machines):
         raise InputError(
-            f"{len(machines)} machines and {len(starts)} initial states do not go together, give "
+            f"{len(machines)} machines and {len(initial_states)} initial states do not go "
+            f"together, give "
             "one state per machine, or one machine"
         )
     active = machines[0].active
@@ -109,41 +110,44 @@ def simulate_batch(
                 f"{', '.join(active)}: simulate them apart"
             )
 
-    beyond: dict[int, str] = {}
+    limit_warnings: dict[int, str] = {}
 
     def run(i: int) -> _Result:
         machine = machines[i]
-        control = as_controller(None if controller is None else controller(machine), machine)
-        machine = as_driven(machine, control)
+        control = resolve_controller(None if controller is None else controller(machine), machine)
+        machine = machine_under_control(machine, control)
         steps = count_steps(control, duration, step)
-        if text := reference_beyond(machine, control, steps * step):
-            beyond[i] = text
+        if text := reference_limits_text(machine, control, steps * step):
+            limit_warnings[i] = text
         dynamics = Dynamics(machine)
         found = integrate(
             dynamics,
             control,
-            starts[i],
+            initial_states[i],
             steps,
             step,
             method,
             tolerance=tolerance,
-            ends=duration is None,
+            ends_with_command=duration is None,
         )
         if found.stop is not None:
             raise found.stop
         time, rows = found.time, found.rows
         energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.lost])
         q_a = rows.q[:, machine.closure.active]
-        doubts = [*found.notes, *said(machine, time, rows, step, fixed(dynamics, control, method))]
+        doubts = [
+            *found.notes,
+            *run_warnings(machine, time, rows, step, has_fixed_steps(dynamics, control, method)),
+        ]
         return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
 
     results: dict[int, _Result] = {}
     failures: dict[int, str] = {}
     # one first, so that the others find their machine code made
-    waiting = list(range(len(machines)))
+    indices = list(range(len(machines)))
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
-        for i, future in _finished(pool, run, (waiting[:1], waiting[1:])):
+        for i, future in _completed_runs(pool, run, (indices[:1], indices[1:])):
             error = future.exception()
             if isinstance(error, CraneError):
                 failures[i] = str(error)
@@ -153,10 +157,10 @@ def simulate_batch(
                 progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
-    return _stack(results, failures, beyond, len(machines))
+    return _stack_results(results, failures, limit_warnings, len(machines))
 
 
-def _finished(
+def _completed_runs(
     pool: ThreadPoolExecutor, run: Callable[[int], _Result], groups: Sequence[Sequence[int]]
 ) -> Iterator[tuple[int, Future[_Result]]]:
     """Every run as it is finished, one group after the other."""
@@ -166,10 +170,10 @@ def _finished(
             yield futures[future], future
 
 
-def _stack(
+def _stack_results(
     results: dict[int, _Result],
     failures: dict[int, str],
-    beyond: dict[int, str],
+    limit_warnings: dict[int, str],
     count: int,
 ) -> Batch:
     lengths = {len(result[0]) for result in results.values()}
@@ -183,8 +187,8 @@ def _stack(
         for stack, part in zip(stacks, result[1:5], strict=True):
             stack[i] = part
     q, v, tau, energy = stacks
-    doubts = {}
+    warning_texts = {}
     for i in sorted(results):
-        if text := "; ".join(filter(None, (beyond.get(i, ""), results[i][5]))):
-            doubts[i] = text
-    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), doubts)
+        if text := "; ".join(filter(None, (limit_warnings.get(i, ""), results[i][5]))):
+            warning_texts[i] = text
+    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), warning_texts)

@@ -6,20 +6,24 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.description.ground import Contact
+from crane.description.ground_contact import Contact
 from crane.dynamics import Dynamics
-from crane.dynamics.external import at_rest
-from crane.dynamics.frames import FrameJacobians
+from crane.dynamics.external_forces import static_active_forces
+from crane.dynamics.frame_jacobians import FrameJacobians
 
-_BALANCED = 1e-10  # acceleration that is left, in characteristic lengths per characteristic time^2
-_FALL = 2e-3  # of the characteristic length: a tenth of what a free fall moves in an iteration
-_ITERATIONS, _POLISHED = 300, 5
-_NEUTRAL = 1e-6  # share of the largest stiffness below which a direction has none
-_DIFFERENCE = 1e-7  # rad, or share of the characteristic length
-_FARTHEST = 0.1  # likewise: what is farther from standing is meant to fall
+_ACCELERATION_TOLERANCE = (
+    1e-10  # acceleration that is left, in characteristic lengths per characteristic time^2
+)
+_MAX_FALL_PER_ITERATION = (
+    2e-3  # of the characteristic length: a tenth of what a free fall moves in an iteration
+)
+_MAX_ITERATIONS, _POLISHING_ITERATIONS = 300, 5
+_RANK_TOLERANCE = 1e-6  # share of the largest stiffness below which a direction has none
+_DIFFERENCE_STEP = 1e-7  # rad, or share of the characteristic length
+_MAX_DISTANCE_FROM_HOME = 0.1  # likewise: what is farther from standing is meant to fall
 
 
-def on_contacts(dynamics: Dynamics, q_a: Array) -> tuple[Array, str]:
+def equilibrium_on_contacts(dynamics: Dynamics, q_a: Array) -> tuple[Array, str]:
     """Coordinates of static equilibrium on the contacts, from which a run starts.
 
     Args:
@@ -30,7 +34,9 @@ def on_contacts(dynamics: Dynamics, q_a: Array) -> tuple[Array, str]:
         Coordinates (n,), and a text, "" where nothing stands on contacts.
     """
     machine = dynamics.machine
-    if not machine.free or not any(isinstance(force, Contact) for force in machine.external):
+    if not machine.free or not any(
+        isinstance(force, Contact) for force in machine.external_forces
+    ):
         return q_a, ""
     equilibrium = StaticEquilibrium(dynamics, q_a)
     columns = equilibrium.columns
@@ -40,14 +46,17 @@ def on_contacts(dynamics: Dynamics, q_a: Array) -> tuple[Array, str]:
     found = equilibrium.find()
     if found is None:
         return q_a, "at home, near which it has no static equilibrium on its contacts"
-    x, holds = found
+    x, is_held = found
     moved = columns[np.abs(x - q_a)[columns].argmax()]
     joint = machine.active[int(moved)]
     text = (
         f"in static equilibrium on its contacts, {joint} {x[moved] - q_a[moved]:+.4g} "
         f"{machine.unit(joint)} from home"
     )
-    return x, text if holds else f"{text}, where only friction in motion holds it along the ground"
+    return (
+        x,
+        text if is_held else f"{text}, where only friction in motion holds it along the ground",
+    )
 
 
 class StaticEquilibrium:
@@ -68,39 +77,41 @@ class StaticEquilibrium:
     """
 
     def __init__(self, dynamics: Dynamics, q_a: Array):
-        self._dynamics, self._home = dynamics, q_a
+        self._dynamics, self._home_coordinates = dynamics, q_a
         self._machine = machine = dynamics.machine
-        self._contacts = [force for force in machine.external if isinstance(force, Contact)]
+        self._contacts = [force for force in machine.external_forces if isinstance(force, Contact)]
         self._jacobians = FrameJacobians(machine)
-        self._places = []
-        q = machine.closure.solve(q_a, guess=machine.home)
+        self._home_positions = []
+        q = machine.closure.solve(q_a, initial_guess=machine.home)
         moves = np.zeros(len(q_a))
-        for _, jacobian, place in self._at(q):
-            self._places.append(place)
+        for _, jacobian, place in self._contact_jacobians(q):
+            self._home_positions.append(place)
             moves = np.maximum(moves, np.abs(jacobian).max(axis=0))
         free = np.array([name in machine.free for name in machine.active], dtype=bool)
         self.columns = np.flatnonzero(free & (moves > 0))
         closure = machine.closure
         self._units = closure.units[closure.active][self.columns]
-        self._rate = 1.0 / closure.pace**2
+        self._inverse_time_squared = 1.0 / closure.characteristic_time**2
 
-    def _at(self, q: Array) -> Iterator[tuple[Contact, Array, Array]]:
+    def _contact_jacobians(self, q: Array) -> Iterator[tuple[Contact, Array, Array]]:
         """Contacts with the Jacobian (3, n) of their frame's origin, and where that is."""
-        self._jacobians.place(q)
+        self._jacobians.set_configuration(q)
         gamma = self._machine.closure.gamma(q)
         for contact in self._contacts:
-            jacobian = self._jacobians.of(contact.frame)[:3] @ gamma
-            yield contact, jacobian, self._jacobians.pose(contact.frame).translation.copy()
+            jacobian = self._jacobians.jacobian(contact.frame)[:3] @ gamma
+            yield contact, jacobian, self._jacobians.frame_pose(contact.frame).translation.copy()
 
-    def _missing(self, x: Array, stick: bool = True) -> Array:
+    def _unbalanced_forces(self, x: Array, with_tangential_stiffness: bool = True) -> Array:
         """Generalized forces (k,) that are missing at coordinates (k,)."""
-        q_a, rest = self._home.copy(), np.zeros(len(self._home))
+        q_a, rest = self._home_coordinates.copy(), np.zeros(len(self._home_coordinates))
         q_a[self.columns] = x
-        q = self._machine.closure.solve(q_a, guess=self._machine.home)
-        force = self._dynamics.inverse(q_a, rest, rest) - at_rest(self._machine, q)
-        for (contact, jacobian, place), home in zip(self._at(q), self._places, strict=True):
-            above, normal = contact.ground.over(place.tolist())
-            if stick and float(above) < contact.radius:  # type: ignore[arg-type]
+        q = self._machine.closure.solve(q_a, initial_guess=self._machine.home)
+        force = self._dynamics.inverse(q_a, rest, rest) - static_active_forces(self._machine, q)
+        for (contact, jacobian, place), home in zip(
+            self._contact_jacobians(q), self._home_positions, strict=True
+        ):
+            above, normal = contact.ground.distance_and_normal(place.tolist())
+            if with_tangential_stiffness and float(above) < contact.radius:  # type: ignore[arg-type]
                 axis = np.array(normal, dtype=np.float64)
                 slid = place - home
                 slid -= (slid @ axis) * axis
@@ -113,36 +124,54 @@ class StaticEquilibrium:
         Returns:
             None where there is no equilibrium near home.
         """
-        x = self._home[self.columns].copy()
-        mass = self._dynamics.mass_matrix(self._home)[np.ix_(self.columns, self.columns)]
-        inertia = np.diag(mass) * self._units * self._rate
+        x = self._home_coordinates[self.columns].copy()
+        mass = self._dynamics.mass_matrix(self._home_coordinates)[
+            np.ix_(self.columns, self.columns)
+        ]
+        inertia = np.diag(mass) * self._units * self._inverse_time_squared
         try:
-            missing = self._missing(x)
-            first = largest = float(np.abs(missing / inertia).max(initial=0.0))
-            for _ in range(_ITERATIONS):
-                if largest < _BALANCED:
+            unbalanced = self._unbalanced_forces(x)
+            first = largest = float(np.abs(unbalanced / inertia).max(initial=0.0))
+            for _ in range(_MAX_ITERATIONS):
+                if largest < _ACCELERATION_TOLERANCE:
                     break
-                damping = self._rate / _FALL * min(1.0, largest / first)
-                x = x - np.linalg.solve(self._stiffness(x, True) + damping * mass, missing)
-                if np.abs((x - self._home[self.columns]) / self._units).max() > _FARTHEST:
+                damping = (
+                    self._inverse_time_squared
+                    / _MAX_FALL_PER_ITERATION
+                    * min(1.0, largest / first)
+                )
+                x = x - np.linalg.solve(self._stiffness(x, True) + damping * mass, unbalanced)
+                if (
+                    np.abs((x - self._home_coordinates[self.columns]) / self._units).max()
+                    > _MAX_DISTANCE_FROM_HOME
+                ):
                     return None
-                missing = self._missing(x)
-                largest = float(np.abs(missing / inertia).max())
+                unbalanced = self._unbalanced_forces(x)
+                largest = float(np.abs(unbalanced / inertia).max())
             # what stuck lets go, the shortest way
-            for _ in range(_POLISHED):
+            for _ in range(_POLISHING_ITERATIONS):
                 stiffness = self._stiffness(x, False)
-                x = x - np.linalg.lstsq(stiffness, self._missing(x, False), rcond=_NEUTRAL)[0]
-            held = float(np.abs(self._missing(x, False) / inertia).max())
+                x = (
+                    x
+                    - np.linalg.lstsq(
+                        stiffness, self._unbalanced_forces(x, False), rcond=_RANK_TOLERANCE
+                    )[0]
+                )
+            slip_residual = float(np.abs(self._unbalanced_forces(x, False) / inertia).max())
         except (ClosureError, np.linalg.LinAlgError):
             return None
-        if not largest < np.sqrt(_BALANCED):
+        if not largest < np.sqrt(_ACCELERATION_TOLERANCE):
             return None
-        q_a = self._home.copy()
+        q_a = self._home_coordinates.copy()
         q_a[self.columns] = x
-        return q_a, held < np.sqrt(_BALANCED)
+        return q_a, slip_residual < np.sqrt(_ACCELERATION_TOLERANCE)
 
-    def _stiffness(self, x: Array, stick: bool) -> Array:
+    def _stiffness(self, x: Array, with_tangential_stiffness: bool) -> Array:
         """(k, k) derivatives of what is missing, by differences."""
-        steps = np.diag(_DIFFERENCE * self._units)
-        columns = [self._missing(x + h, stick) - self._missing(x - h, stick) for h in steps]
+        steps = np.diag(_DIFFERENCE_STEP * self._units)
+        columns = [
+            self._unbalanced_forces(x + h, with_tangential_stiffness)
+            - self._unbalanced_forces(x - h, with_tangential_stiffness)
+            for h in steps
+        ]
         return np.column_stack(columns) / (2 * steps.diagonal())

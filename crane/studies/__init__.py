@@ -1,12 +1,12 @@
 """Measures of a machine over its parameters, and of its runs."""
 
-from crane.studies.power import PowerAccount, power_account
+from crane.studies.hydraulic_power_balance import PowerBalance, power_balance
 from crane.studies.power_comparison import PowerComparison
-from crane.studies.run import study
-from crane.studies.sway import SwayRow, SwayStudy, sway_study
-from crane.studies.table import Study
+from crane.studies.residual_sway_study import SwayRow, SwayStudy, sway_study
+from crane.studies.study_table import Study
+from crane.studies.variant_study import study
 
 __all__ = [
-    "PowerAccount", "PowerComparison", "Study", "SwayRow", "SwayStudy", "power_account", "study",
+    "PowerBalance", "PowerComparison", "Study", "SwayRow", "SwayStudy", "power_balance", "study",
     "sway_study",
 ]  # fmt: skip

@@ -12,22 +12,22 @@ from crane.control import ComputedTorque, joystick
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import task_trajectory
-from crane.motion.workspaces.extremes import farthest
-from crane.motion.workspaces.section import upwards
+from crane.motion.task_trajectories import task_trajectory
+from crane.motion.workspaces.workspace_extremes import maximize_on_branch
+from crane.motion.workspaces.workspace_section import up_direction
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation import simulate
 
-_RATE = 200  # samples per second of a task
-_LEVERS = 5e-3  # [s] between samples of a task of levers
-_CELLS = 1000  # postures of the grid over the strokes that move passive joints
-_POSTURES = 5000  # with those of the other strokes
-_STEPS = 16  # from one of the grid to the next
-_DRAWN = 8  # postures at which a stroke is seen to move the tip
-_MOVES = 1e-9  # slope of the tip that it does so by [m/m], [m/rad]
-_STARTS = 12  # postures of the grid from which the farthest reach is sought
-_FEW = 4  # the same for the end of a stroke
-_APART = 0.2  # of the strokes, between two of them
+_SAMPLES_PER_SECOND = 200  # samples per second of a task
+_LEVER_TASK_STEP = 5e-3  # [s] between samples of a task of levers
+_COUPLED_GRID_SIZE = 1000  # postures of the grid over the strokes that move passive joints
+_MAX_CONFIGURATIONS = 5000  # with those of the other strokes
+_CONTINUATION_STEPS = 16  # from one of the grid to the next
+_RANDOM_CONFIGURATIONS = 8  # postures at which a stroke is seen to move the tip
+_MOTION_TOLERANCE = 1e-9  # slope of the tip that it does so by [m/m], [m/rad]
+_REACH_START_COUNT = 12  # postures of the grid from which the farthest reach is sought
+_STROKE_START_COUNT = 4  # the same for the end of a stroke
+_MIN_START_DISTANCE = 0.2  # of the strokes, between two of them
 
 
 def task_measures(machine: Machine) -> dict[str, str]:
@@ -53,7 +53,9 @@ def stroke_measures(machine: Machine) -> dict[str, str]:
     }
 
 
-def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dict[str, float]]:
+def measure_task(
+    machine: Machine, dynamics: Dynamics, task: str
+) -> tuple[float, dict[str, float]]:
     """What the driven joints need to move as a task asks, and its duration [s].
 
     Inverse dynamics of the reference motion, friction included, while free joints move as they
@@ -68,65 +70,67 @@ def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dic
         CraneError: The machine cannot do it.
     """
     if machine.tasks[task].space == "joystick":
-        return _of_levers(machine, task)
-    path = task_trajectory(machine, task)
-    time = np.linspace(0.0, path.duration, int(np.ceil(_RATE * path.duration)) + 1)
+        return _measure_lever_task(machine, task)
+    trajectory = task_trajectory(machine, task)
+    time = np.linspace(
+        0.0, trajectory.duration, int(np.ceil(_SAMPLES_PER_SECOND * trajectory.duration)) + 1
+    )
     if machine.free:
         step = float(time[1] - time[0])
-        run = simulate(machine, ComputedTorque(machine, path), step=step)
+        run = simulate(machine, ComputedTorque(machine, trajectory), step=step)
         v_a, tau = run.v, run.tau
     else:
-        q_a, v_a, a_a = path(time)
+        q_a, v_a, a_a = trajectory(time)
         tau = dynamics.inverse(q_a, v_a, a_a, friction=True)
-    return path.duration, _of_forces(machine, time, v_a, tau)
+    return trajectory.duration, _force_measures(machine, time, v_a, tau)
 
 
-def _of_levers(machine: Machine, name: str) -> tuple[float, dict[str, float]]:
+def _measure_lever_task(machine: Machine, name: str) -> tuple[float, dict[str, float]]:
     """The same of a task of levers, simulated with its circuit and loads."""
     task = machine.tasks[name]
     run = simulate(
-        machine.under(*task.loads),
+        machine.with_external_forces(*task.loads),
         joystick(machine, name),
         duration=None if task.phases else task.duration,
-        step=_LEVERS,
+        step=_LEVER_TASK_STEP,
     )
-    found = _of_forces(machine, run.time, run.v, run.tau)
-    found["pump_work"] = float(run.channels["pump_work"][-1])
-    return float(run.time[-1]), found
+    measures = _force_measures(machine, run.time, run.v, run.tau)
+    measures["pump_work"] = float(run.channels["pump_work"][-1])
+    return float(run.time[-1]), measures
 
 
-def _of_forces(machine: Machine, time: Array, v_a: Array, tau: Array) -> dict[str, float]:
+def _force_measures(machine: Machine, time: Array, v_a: Array, tau: Array) -> dict[str, float]:
     """Measures of forces (N, n) along a motion."""
     power, duration = tau * v_a, float(time[-1] - time[0])
-    found = {}
+    measures = {}
     for joint in machine.driven_joints:
         i = machine.active.index(joint)
-        found[f"peak_{joint}"] = float(np.abs(tau[:, i]).max())
-        square = np.trapezoid(tau[:, i] ** 2, time) / duration
-        found[f"rms_{joint}"] = float(np.sqrt(square))
-    found["energy"] = float(np.trapezoid(np.maximum(power, 0.0).sum(axis=1), time))
-    found["work"] = float(np.trapezoid(power.sum(axis=1), time))
-    found["duration"] = duration
-    return found
+        measures[f"peak_{joint}"] = float(np.abs(tau[:, i]).max())
+        mean_square = np.trapezoid(tau[:, i] ** 2, time) / duration
+        measures[f"rms_{joint}"] = float(np.sqrt(mean_square))
+    measures["energy"] = float(np.trapezoid(np.maximum(power, 0.0).sum(axis=1), time))
+    measures["work"] = float(np.trapezoid(power.sum(axis=1), time))
+    measures["duration"] = duration
+    return measures
 
 
-def together(tasks: Sequence[tuple[float, dict[str, float]]]) -> dict[str, float]:
-    """Measures of tasks done one after the other, from those of each, see `of_task`."""
-    whole = sum(duration for duration, _ in tasks)
+def combine_task_measures(tasks: Sequence[tuple[float, dict[str, float]]]) -> dict[str, float]:
+    """Measures of tasks done one after the other, from those of each, see `measure_task`."""
+    total_duration = sum(duration for duration, _ in tasks)
     out = {}
     for name in [x for x in tasks[0][1] if all(x in found for _, found in tasks)]:
-        values = [found[name] for _, found in tasks]
+        values = [measures[name] for _, measures in tasks]
         if name.startswith("peak_"):
             out[name] = max(values)
         elif name.startswith("rms_"):
             squares = [d * x * x for (d, _), x in zip(tasks, values, strict=True)]
-            out[name] = float(np.sqrt(sum(squares) / whole))
+            out[name] = float(np.sqrt(sum(squares) / total_duration))
         else:
             out[name] = sum(values)
     return out
 
 
-def of_strokes(machine: Machine) -> dict[str, float]:
+def measure_strokes(machine: Machine) -> dict[str, float]:
     """Where the strokes can go from home with the loops closed, within the limits.
 
     A grid over the limits finds where, and the extremes of it are improved until they are exact,
@@ -135,70 +139,80 @@ def of_strokes(machine: Machine) -> dict[str, float]:
     fine as that.
     """
     home = machine.home[machine.closure.active]
-    coupled = _coupled(machine)
-    low, high = _ends(machine, home)
-    count = _values(coupled)
+    is_coupled = _coupled_strokes(machine)
+    lower, upper = _stroke_ranges(machine, home)
+    count = _values_per_stroke(is_coupled)
     axes = [
-        np.linspace(a, b, count) if moves else np.array([at])
-        for a, b, at, moves in zip(low, high, home, coupled, strict=True)
+        np.linspace(a, b, count) if is_moved else np.array([home_value])
+        for a, b, home_value, is_moved in zip(lower, upper, home, is_coupled, strict=True)
     ]
-    postures = _closed(machine, axes)
-    found = {"range": len(postures) / int(np.prod([len(axis) for axis in axes]))}
-    if not len(postures):
-        return found
-    strokes = np.flatnonzero(coupled)
+    configurations = _closed_configurations(machine, axes)
+    measures = {"range": len(configurations) / int(np.prod([len(axis) for axis in axes]))}
+    if not len(configurations):
+        return measures
+    strokes = np.flatnonzero(is_coupled)
     for joint in machine.driven_joints:
         i = machine.active.index(joint)
-        found[f"lower_{joint}"], found[f"upper_{joint}"] = float(low[i]), float(high[i])
-        if not coupled[i]:
+        measures[f"lower_{joint}"], measures[f"upper_{joint}"] = float(lower[i]), float(upper[i])
+        if not is_coupled[i]:
             continue
         for name, sign in (("lower", -1.0), ("upper", 1.0)):
-            found[f"{name}_{joint}"] = _end(machine, postures, strokes, (low, high), i, sign)
+            measures[f"{name}_{joint}"] = _stroke_end(
+                machine, configurations, strokes, (lower, upper), i, sign
+            )
     if machine.tip is not None:
-        found["reach"] = _reach(machine, postures, coupled, (low, high))
-    return found
+        measures["reach"] = _largest_reach(machine, configurations, is_coupled, (lower, upper))
+    return measures
 
 
-def notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ...]:
+def resolution_notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ...]:
     """How fine measures are that are not exact, a line each."""
-    found = []
+    lines = []
     if any(name in task_measures(machine) for name in measures):
-        found.append(f"forces are taken every {1e3 / _RATE:g} ms of a task")
+        lines.append(f"forces are taken every {1e3 / _SAMPLES_PER_SECOND:g} ms of a task")
     if "range" in measures:
-        coupled = _coupled(machine)
-        count = int(coupled.sum())
+        is_coupled = _coupled_strokes(machine)
+        count = int(is_coupled.sum())
         strokes = f"{count} stroke{'s' * (count != 1)}"
-        found.append(f"range is counted on {_values(coupled)} values of each of {strokes}")
-    return tuple(found)
+        lines.append(
+            f"range is counted on {_values_per_stroke(is_coupled)} values of each of {strokes}"
+        )
+    return tuple(lines)
 
 
-def _coupled(machine: Machine) -> NDArray[np.bool_]:
+def _coupled_strokes(machine: Machine) -> NDArray[np.bool_]:
     """Which driven joints (n,) move passive ones."""
     gamma = machine.closure.gamma(machine.home)[machine.closure.passive]
-    return np.asarray((np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.driven)
+    return np.asarray((np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.is_driven)
 
 
-def _values(coupled: NDArray[np.bool_]) -> int:
+def _values_per_stroke(is_coupled: NDArray[np.bool_]) -> int:
     """How many values of each stroke the grid has."""
-    return max(3, int(_CELLS ** (1 / max(1, int(coupled.sum()))) + 1e-9))
+    return max(3, int(_COUPLED_GRID_SIZE ** (1 / max(1, int(is_coupled.sum()))) + 1e-9))
 
 
-def _ends(machine: Machine, home: Array) -> tuple[Array, Array]:
+def _stroke_ranges(machine: Machine, home_values: Array) -> tuple[Array, Array]:
     """Limits of the active joints; a turn about home where an angle has none, free ones there."""
-    half = np.array([np.pi if machine.unit(joint) == "rad" else 0.0 for joint in machine.active])
-    low = np.where(np.isfinite(machine.lower), machine.lower, home - half)
-    high = np.where(np.isfinite(machine.upper), machine.upper, home + half)
-    return np.where(machine.driven, low, home), np.where(machine.driven, high, home)
+    half_turn = np.array(
+        [np.pi if machine.unit(joint) == "rad" else 0.0 for joint in machine.active]
+    )
+    lower = np.where(np.isfinite(machine.lower), machine.lower, home_values - half_turn)
+    upper = np.where(np.isfinite(machine.upper), machine.upper, home_values + half_turn)
+    return np.where(machine.is_driven, lower, home_values), np.where(
+        machine.is_driven, upper, home_values
+    )
 
 
-def _next_to(cell: tuple[int, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+def _neighbouring_cells(
+    cell: tuple[int, ...], grid_shape: tuple[int, ...]
+) -> Iterator[tuple[int, ...]]:
     """The neighbours of a cell along the axes of a grid."""
-    for i, step in itertools.product(range(len(shape)), (-1, 1)):
-        if 0 <= cell[i] + step < shape[i]:
+    for i, step in itertools.product(range(len(grid_shape)), (-1, 1)):
+        if 0 <= cell[i] + step < grid_shape[i]:
             yield (*cell[:i], cell[i] + step, *cell[i + 1 :])
 
 
-def _closed(machine: Machine, axes: list[Array]) -> Array:
+def _closed_configurations(machine: Machine, axes: list[Array]) -> Array:
     """Closed postures (N, nq) of a grid that are connected with home."""
     closure = machine.closure
     try:
@@ -207,106 +221,153 @@ def _closed(machine: Machine, axes: list[Array]) -> Array:
         pass
     shape = tuple(len(axis) for axis in axes)
     home = machine.home[closure.active]
-    last = [len(axis) - 1 for axis in axes]
-    above = [int(np.searchsorted(axis, at)) for axis, at in zip(axes, home, strict=True)]
-    around = [{max(k - 1, 0), min(k, most)} for k, most in zip(above, last, strict=True)]
-    found, seen = {}, set(itertools.product(*around))
-    waiting = [(cell, machine.home) for cell in sorted(seen)]
-    while waiting:
-        cell, beside = waiting.pop(0)
+    last_indices = [len(axis) - 1 for axis in axes]
+    upper_indices = [
+        int(np.searchsorted(axis, home_value)) for axis, home_value in zip(axes, home, strict=True)
+    ]
+    adjacent_indices = [
+        {max(k - 1, 0), min(k, last_index)}
+        for k, last_index in zip(upper_indices, last_indices, strict=True)
+    ]
+    configurations, visited = {}, set(itertools.product(*adjacent_indices))
+    pending = [(cell, machine.home) for cell in sorted(visited)]
+    while pending:
+        cell, neighbour_configuration = pending.pop(0)
         q_a = np.array([axis[k] for axis, k in zip(axes, cell, strict=True)])
-        posture = _beside(machine, beside, q_a)
-        if posture is None:
+        configuration = _close_from_neighbour(machine, neighbour_configuration, q_a)
+        if configuration is None:
             continue
-        found[cell] = posture
-        new = [near for near in _next_to(cell, shape) if near not in seen]
-        seen.update(new)
-        waiting += [(near, posture) for near in new]
-    return np.array([found[cell] for cell in sorted(found)]).reshape(-1, len(machine.home))
+        configurations[cell] = configuration
+        new_cells = [
+            neighbour for neighbour in _neighbouring_cells(cell, shape) if neighbour not in visited
+        ]
+        visited.update(new_cells)
+        pending += [(near, configuration) for near in new_cells]
+    return np.array([configurations[cell] for cell in sorted(configurations)]).reshape(
+        -1, len(machine.home)
+    )
 
 
-def _beside(machine: Machine, q: Array, target: Array) -> Array | None:
+def _close_from_neighbour(machine: Machine, q: Array, target: Array) -> Array | None:
     """The closed posture at a target beside a posture q (nq,), None where the loops open."""
     closure = machine.closure
-    if closure.compiled:  # to find out slowly that they do would take most of the time
-        fast = closure.fast
-        cursor, start = fast.cursor(), q[closure.active]
-        fast.start_near(cursor, q)
-        way = start + np.linspace(0, 1, _STEPS + 1)[1:, None] * (target - start)
-        out = np.empty((_STEPS, len(q)))
-        return out[-1] if fast.follow(cursor, way, out) == _STEPS else None
+    if closure.is_compiled:  # to find out slowly that they do would take most of the time
+        compiled_closure = closure.compiled_closure
+        cursor, start = compiled_closure.new_cursor(), q[closure.active]
+        compiled_closure.start_cursor_at(cursor, q)
+        targets = start + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (target - start)
+        out = np.empty((_CONTINUATION_STEPS, len(q)))
+        return (
+            out[-1]
+            if compiled_closure.follow_targets(cursor, targets, out) == _CONTINUATION_STEPS
+            else None
+        )
     try:
-        return closure.solve(target, guess=q)
+        return closure.solve(target, initial_guess=q)
     except ClosureError:
         return None
 
 
-def _end(
+def _stroke_end(
     machine: Machine,
-    postures: Array,
+    configurations: Array,
     strokes: NDArray[np.intp],
-    ends: tuple[Array, Array],
-    i: int,
+    limits: tuple[Array, Array],
+    stroke_index: int,
     sign: float,
 ) -> float:
     """How far one stroke goes up (sign 1) or down (-1), from the closed postures of the grid."""
-    column = machine.closure.active[i]
-    limit = float(ends[int(sign > 0)][i])
-    values = sign * postures[:, column]
+    column = machine.closure.active[stroke_index]
+    limit = float(limits[int(sign > 0)][stroke_index])
+    values = sign * configurations[:, column]
     if (values >= sign * limit).any():
         return limit
-    slope = np.zeros(machine.model.nv)
-    slope[column] = sign
+    gradient = np.zeros(machine.model.nv)
+    gradient[column] = sign
 
-    def goal(q: Array) -> tuple[float, Array]:
-        return sign * float(q[column]), slope
+    def objective(q: Array) -> tuple[float, Array]:
+        return sign * float(q[column]), gradient
 
-    q_a = postures[:, machine.closure.active]
-    starts = postures[_apart(values, _shares(q_a, ends))[:_FEW]]
-    return sign * max(farthest(machine, q, strokes.tolist(), ends, goal)[0] for q in starts)
+    q_a = configurations[:, machine.closure.active]
+    starts = configurations[
+        _separated_indices(values, _relative_strokes(q_a, limits))[:_STROKE_START_COUNT]
+    ]
+    return sign * max(
+        maximize_on_branch(machine, q, strokes.tolist(), limits, objective)[0] for q in starts
+    )
 
 
-def _reach(
-    machine: Machine, postures: Array, coupled: NDArray[np.bool_], ends: tuple[Array, Array]
+def _largest_reach(
+    machine: Machine,
+    configurations: Array,
+    is_coupled: NDArray[np.bool_],
+    limits: tuple[Array, Array],
 ) -> float:
     """Largest horizontal distance of the tip, over all strokes."""
-    kinematics, up = Kinematics(machine), upwards(machine)
+    kinematics, up = Kinematics(machine), up_direction(machine)
     active = machine.closure.active
 
-    def goal(q: Array) -> tuple[float, Array]:
-        tip = kinematics.position_at(q)
-        away = tip - up * (up @ tip)
-        length = float(np.linalg.norm(away))
-        return length, (away / (length or 1.0)) @ kinematics.tree_jacobian(q)
+    def objective(q: Array) -> tuple[float, Array]:
+        tip = kinematics.position_at_configuration(q)
+        horizontal = tip - up * (up @ tip)
+        length = float(np.linalg.norm(horizontal))
+        return length, (horizontal / (length or 1.0)) @ kinematics.tree_jacobian(q)
 
     random = np.random.default_rng(0)
-    drawn = postures[random.integers(len(postures), size=_DRAWN)]
-    drawn[:, active[~coupled]] = random.uniform(*ends, (_DRAWN, len(active)))[:, ~coupled]
-    moves = np.abs([goal(q)[1][active] for q in drawn]).max(axis=0) > _MOVES
-    moves &= machine.driven
-    free = np.flatnonzero(~coupled & moves)
-    each = max(2, int((_POSTURES / len(postures)) ** (1 / max(1, len(free)))))
-    turns = np.array(
-        list(itertools.product(*(np.linspace(ends[0][i], ends[1][i], each) for i in free)))
+    random_configurations = configurations[
+        random.integers(len(configurations), size=_RANDOM_CONFIGURATIONS)
+    ]
+    random_configurations[:, active[~is_coupled]] = random.uniform(
+        *limits, (_RANDOM_CONFIGURATIONS, len(active))
+    )[:, ~is_coupled]
+    moves_tip = (
+        np.abs([objective(q)[1][active] for q in random_configurations]).max(axis=0)
+        > _MOTION_TOLERANCE
     )
-    every = np.repeat(postures, len(turns), axis=0)
-    every[:, active[free]] = np.tile(turns, (len(postures), 1))
-    strokes = np.flatnonzero(coupled | moves)
-    places = _shares(every[:, active], ends)[:, strokes]
-    starts = every[_apart(np.array([goal(q)[0] for q in every]), places)]
-    return max(farthest(machine, q, strokes.tolist(), ends, goal)[0] for q in starts)
+    moves_tip &= machine.is_driven
+    uncoupled_strokes = np.flatnonzero(~is_coupled & moves_tip)
+    values_per_stroke = max(
+        2, int((_MAX_CONFIGURATIONS / len(configurations)) ** (1 / max(1, len(uncoupled_strokes))))
+    )
+    stroke_values = np.array(
+        list(
+            itertools.product(
+                *(
+                    np.linspace(limits[0][i], limits[1][i], values_per_stroke)
+                    for i in uncoupled_strokes
+                )
+            )
+        )
+    )
+    all_configurations = np.repeat(configurations, len(stroke_values), axis=0)
+    all_configurations[:, active[uncoupled_strokes]] = np.tile(
+        stroke_values, (len(configurations), 1)
+    )
+    strokes = np.flatnonzero(is_coupled | moves_tip)
+    relative_strokes = _relative_strokes(all_configurations[:, active], limits)[:, strokes]
+    starts = all_configurations[
+        _separated_indices(
+            np.array([objective(q)[0] for q in all_configurations]), relative_strokes
+        )
+    ]
+    return max(
+        maximize_on_branch(machine, q, strokes.tolist(), limits, objective)[0] for q in starts
+    )
 
 
-def _shares(q_a: Array, ends: tuple[Array, Array]) -> Array:
+def _relative_strokes(q_a: Array, limits: tuple[Array, Array]) -> Array:
     """Active coordinates (N, n) as shares of the way between their ends."""
-    return (q_a - ends[0]) / np.where(ends[1] > ends[0], ends[1] - ends[0], 1.0)
+    return (q_a - limits[0]) / np.where(limits[1] > limits[0], limits[1] - limits[0], 1.0)
 
 
-def _apart(values: Array, places: Array) -> list[int]:
+def _separated_indices(values: Array, relative_strokes: Array) -> list[int]:
     """Indices of the largest values (N,) whose places (N, n) are not beside each other."""
-    left = np.argsort(-values, kind="stable")
+    remaining = np.argsort(-values, kind="stable")
     chosen: list[int] = []
-    while len(left) and len(chosen) < _STARTS:
-        chosen.append(int(left[0]))
-        left = left[np.abs(places[left] - places[left[0]]).max(axis=1) > _APART]
+    while len(remaining) and len(chosen) < _REACH_START_COUNT:
+        chosen.append(int(remaining[0]))
+        remaining = remaining[
+            np.abs(relative_strokes[remaining] - relative_strokes[remaining[0]]).max(axis=1)
+            > _MIN_START_DISTANCE
+        ]
     return chosen

@@ -15,41 +15,43 @@ import matplotlib as mpl
 from markdown_it import MarkdownIt
 
 from crane.common.errors import CraneError
-from crane.formats import recalled
+from crane.formats import load_from_expression
 from crane.machine import Machine
 from crane.recordings.recording import Recording
-from crane.recordings.summary import summarize
-from crane.view.facts import Fact, facts_of
-from crane.view.page.build import page
-from crane.view.page.document import table
-from crane.view.plots.recording import STYLE
-from crane.view.plots.tags import drawing_tag, image_tag
-from crane.view.sketch.draw import sketch_figure
+from crane.recordings.recording_summary import summarize
+from crane.view.machine_facts import MachineFact, machine_facts
+from crane.view.page.html_document import html_table
+from crane.view.page.report_page import report_html
+from crane.view.plots.image_tags import image_tag, svg_tag
+from crane.view.plots.recording_figure import FIGURE_STYLE
+from crane.view.sketch.sketch_figure import sketch_figure
 
-_SHARE = 0.06  # of the frames and spans of a page: a notebook keeps all its outputs in one file
-_MOST_FIGURES = 8
+_FRAME_SHARE = (
+    0.06  # of the frames and spans of a page: a notebook keeps all its outputs in one file
+)
+_MAX_FIGURES = 8
 _FIGURES: Mapping[str, tuple[str, ...]] = {  # by class, in `crane.view.plots`
-    "Calibration": ("calibration.calibration_figure",),
-    "Capacity": ("capacity.capacity_figure",),
-    "Comparison": ("comparison.comparison_figure",),
-    "Design": ("design.design_figure",),
-    "Excitation": ("excitation.excitation_figure",),
-    "Identification": ("identification.force_figures",),
-    "LinearModel": ("modes.modes_figure",),
-    "PowerAccount": ("sankey.sankey_figure", "power.power_figure"),
-    "PowerComparison": ("power_comparison.power_comparison_figure",),
-    "Recording": ("recording.recording_figure",),
-    "Sensitivities": ("sensitivities.sensitivities_figure",),
-    "SignalExcitation": ("excitation.signals_figure",),
-    "Study": ("study.study_figure",),
-    "ToolForce": ("tool_force.tool_force_figure",),
-    "WorkingRange": ("working_range.working_range_figure",),
-    "Workspace": ("workspace.workspace_figure",),
+    "Calibration": ("calibration_figure.calibration_figure",),
+    "Capacity": ("capacity_figure.capacity_figure",),
+    "Comparison": ("comparison_figure.comparison_figure",),
+    "Design": ("design_figure.design_figure",),
+    "Excitation": ("excitation_figure.excitation_figure",),
+    "Identification": ("identification_figures.force_figures",),
+    "LinearModel": ("modes_figure.modes_figure",),
+    "PowerBalance": ("sankey_diagram.sankey_figure", "power_figure.power_figure"),
+    "PowerComparison": ("power_comparison_figure.power_comparison_figure",),
+    "Recording": ("recording_figure.recording_figure",),
+    "Sensitivities": ("sensitivities_figure.sensitivities_figure",),
+    "SignalExcitation": ("excitation_figure.signals_figure",),
+    "Study": ("study_figure.study_figure",),
+    "ToolForce": ("tool_force_figure.tool_force_figure",),
+    "WorkingRange": ("working_range_figure.working_range_figure",),
+    "Workspace": ("workspace_figure.workspace_figure",),
 }
 # What moves, and how.
 _MOTIONS: Mapping[str, Callable[[Any], tuple[Machine, Recording | None]]] = {
     "LinearModel": lambda model: (model.machine, model.motion()),
-    "Recording": lambda recording: (recalled(recording.machine), recording),
+    "Recording": lambda recording: (load_from_expression(recording.machine), recording),
 }
 # Colours are those of whatever notebook it stands in, light or dark; pictures are on white.
 _CSS = """
@@ -77,94 +79,96 @@ _CSS = """
 """
 
 
-def html(what: Any) -> str | None:
+def to_html(value: Any) -> str | None:
     """An object as HTML; None where nothing is to be shown but its line."""
-    parts = [*_page(what), *_pictures(what), *_words(what)]
+    parts = [*_motion_frame(value), *_figure_images(value), *_text_blocks(value)]
     if not parts:
         return None
-    line = f'<p class="crane-line">{escape(repr(what))}</p>'
+    line = f'<p class="crane-line">{escape(repr(value))}</p>'
     return f'<div class="crane-shown"><style>{_CSS}</style>{line}{"".join(parts)}</div>'
 
 
-def _of(what: Any, by_class: Mapping[str, Any]) -> Any:
+def _lookup_by_class(value: Any, by_class: Mapping[str, Any]) -> Any:
     """What is said of an object's class, or of the nearest that it inherits from."""
-    return next((by_class[x.__name__] for x in type(what).__mro__ if x.__name__ in by_class), None)
+    return next(
+        (by_class[x.__name__] for x in type(value).__mro__ if x.__name__ in by_class), None
+    )
 
 
-def _page(what: Any) -> Iterator[str]:
+def _motion_frame(value: Any) -> Iterator[str]:
     """The page that plays its motion, in a frame that nothing gets out of."""
-    if (motion_of := _of(what, _MOTIONS)) is None:
+    if (motion_of := _lookup_by_class(value, _MOTIONS)) is None:
         return
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # said when the machine was loaded first
-            machine, motion = motion_of(what)
+            machine, motion = motion_of(value)
             if motion is None:
                 return
-            text = page(machine, motion, share=_SHARE)
+            text = report_html(machine, motion, frame_share=_FRAME_SHARE)
     except CraneError as error:
-        yield _note(f"its motion is not played: {error}")
+        yield _note_paragraph(f"its motion is not played: {error}")
         return
     source = text.replace("&", "&amp;").replace('"', "&quot;")
     yield f'<iframe title="motion" sandbox="allow-scripts" srcdoc="{source}"></iframe>'
 
 
-def _pictures(what: Any) -> Iterator[str]:
+def _figure_images(value: Any) -> Iterator[str]:
     try:
-        with mpl.rc_context(STYLE):
-            if isinstance(what, Machine):
-                yield drawing_tag(sketch_figure(what), f"sketch of {what.name}")
-            for name in _of(what, _FIGURES) or ():
+        with mpl.rc_context(FIGURE_STYLE):
+            if isinstance(value, Machine):
+                yield svg_tag(sketch_figure(value), f"sketch of {value.name}")
+            for name in _lookup_by_class(value, _FIGURES) or ():
                 module, _, function = name.partition(".")
-                drawn = getattr(import_module(f"crane.view.plots.{module}"), function)(what)
-                figures = drawn if isinstance(drawn, list) else [drawn]
-                yield from (image_tag(figure, repr(what)) for figure in figures[:_MOST_FIGURES])
+                result = getattr(import_module(f"crane.view.plots.{module}"), function)(value)
+                figures = result if isinstance(result, list) else [result]
+                yield from (image_tag(figure, repr(value)) for figure in figures[:_MAX_FIGURES])
     except CraneError as error:
-        yield _note(f"no picture: {error}")
+        yield _note_paragraph(f"no picture: {error}")
 
 
-def _words(what: Any) -> Iterator[str]:
-    if isinstance(what, Machine):
+def _text_blocks(value: Any) -> Iterator[str]:
+    if isinstance(value, Machine):
         # notebooks are given away, and where a file lies here concerns nobody there
-        yield from _facts([fact for fact in facts_of(what) if fact.name != "file"])
-    elif isinstance(what, Recording):
-        yield from _blocks(summarize(what).to_markdown(), _markdown)
-    elif hasattr(what, "to_markdown"):
-        yield from _blocks(what.to_markdown(), _markdown)
-    elif hasattr(what, "to_text"):
-        yield from _blocks(what.to_text(), _typed)
+        yield from _fact_tables([fact for fact in machine_facts(value) if fact.name != "file"])
+    elif isinstance(value, Recording):
+        yield from _split_blocks(summarize(value).to_markdown(), _render_markdown)
+    elif hasattr(value, "to_markdown"):
+        yield from _split_blocks(value.to_markdown(), _render_markdown)
+    elif hasattr(value, "to_text"):
+        yield from _split_blocks(value.to_text(), _preformatted)
 
 
-def _facts(facts: list[Fact]) -> Iterator[str]:
+def _fact_tables(facts: list[MachineFact]) -> Iterator[str]:
     """What is said in a word first, then what has a table, which can be folded."""
     rows = [(escape(x.name), f'<td class="crane-words">{escape(x.text)}</td>') for x in facts]
-    yield table(["*", "*"], [row for row, x in zip(rows, facts, strict=True) if not x.rows])
+    yield html_table(["*", "*"], [row for row, x in zip(rows, facts, strict=True) if not x.rows])
     for fact in facts:
         if fact.rows:
-            head = [f"{escape(name)}*" for name in fact.head]
-            cells = table(head, [[escape(cell) for cell in row] for row in fact.rows])
+            heading = [f"{escape(name)}*" for name in fact.heading]
+            cells = html_table(heading, [[escape(cell) for cell in row] for row in fact.rows])
             title = escape(f"{fact.name}: {fact.text}")
             yield f"<details open><summary>{title}</summary>{cells}</details>"
 
 
-def _blocks(text: str, otherwise: Callable[[str], str]) -> Iterator[str]:
+def _split_blocks(text: str, render_text: Callable[[str], str]) -> Iterator[str]:
     """Parts of a text that blank lines divide; its tables as such, without its title."""
     for block in re.split(r"\n\s*\n", re.sub(r"\A# .*\n", "", text).strip("\n")):
         if block.lstrip().startswith("|"):
-            yield f'<div class="scroll">{_markdown(block)}</div>'
+            yield f'<div class="scroll">{_render_markdown(block)}</div>'
         elif block:
-            yield otherwise(block)
+            yield render_text(block)
 
 
-def _markdown(text: str) -> str:
+def _render_markdown(text: str) -> str:
     """Markdown of lists, tables, bold words and code; HTML, links and images are but text."""
     rules = ["backticks", "emphasis", "heading", "list", "table"]
     return MarkdownIt("zero").enable(rules).render(text)
 
 
-def _typed(text: str) -> str:
+def _preformatted(text: str) -> str:
     return f"<pre>{escape(text)}</pre>"
 
 
-def _note(text: str) -> str:
+def _note_paragraph(text: str) -> str:
     return f'<p class="crane-note">{escape(text)}</p>'

@@ -6,9 +6,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from crane.common.output import replacing
+from crane.common.atomic_output import replace_file
 from crane.common.samples import Array
-from crane.view.plots.recording import STYLE
+from crane.view.plots.recording_figure import FIGURE_STYLE
 from forwarder.paper import JOINTS, SIGNALS, TASKS, published
 from forwarder.runs import Run
 
@@ -24,7 +24,7 @@ UNITS = (("deg", "deg/s", "N m"), ("mm", "mm/s", "N"), ("mm", "mm/s", "N"))
 def save(figure: Figure, path: Path) -> None:
     """Write a figure whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(STYLE), replacing(path) as part:
+    with mpl.rc_context(FIGURE_STYLE), replace_file(path) as part:
         figure.savefig(part, format="png", dpi=110)
 
 
@@ -36,7 +36,7 @@ def trajectory(number: int, runs: dict[str, Run], reference: tuple[Array, Array]
         runs: By name, a key of `LOOK`.
         reference: Coordinates and velocities (N, 3) to follow.
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(12.5, 7.2), layout="constrained")
         grid = figure.add_gridspec(3, 4, width_ratios=[1, 1, 1, 1.25])
         time = next(iter(runs.values())).time
@@ -81,7 +81,7 @@ def scoreboard(rms: dict[str, dict[str, Array]], ranges: dict[str, dict[str, Arr
         rms: (3,) by task and formulation.
         ranges: (2, 3) least and largest over the feasible set, by task and formulation.
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(10.5, 3.4), layout="constrained")
         for j, (axes, signal) in enumerate(zip(figure.subplots(1, 3), SIGNALS, strict=True)):
             for k, task in enumerate(TASKS):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import crane
-from crane.codegen.scalar import apply
+from crane.codegen.symbolic import apply_function
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control import PI, At
+from crane.control import PI, ControllerInputs
 from forwarder.paper import (
     CRUISE,
     DURATION,
@@ -55,15 +55,15 @@ class Pushed(PI):
         """F_F, (3,) or (N, 3)."""
         return friction_as_printed(v_a, np.tanh(v_a / _TURNS))
 
-    def law(self, at: At) -> tuple[list, list]:
+    def law(self, inputs: ControllerInputs) -> tuple[list, list]:
         """See `PI`."""
-        n = len(at.q_a)
-        tau, rate = super().law(at)
-        table = at.settings[2 * n :]
+        n = len(inputs.q_a)
+        tau, rate = super().law(inputs)
+        table = inputs.settings[2 * n :]
         out = []
-        for i, (force, v) in enumerate(zip(tau, at.v_a, strict=True)):
+        for i, (force, v) in enumerate(zip(tau, inputs.v_a, strict=True)):
             mean, offset, viscous, viscous_offset = table[4 * i : 4 * i + 4]
-            sign = apply("tanh", v / float(_TURNS[i]))
+            sign = apply_function("tanh", v / float(_TURNS[i]))
             out.append(force - mean * sign - offset - viscous * v - viscous_offset * (v * sign))
         return out, rate
 

@@ -9,16 +9,20 @@ from scipy.interpolate import PPoly
 
 import crane
 from crane.common.samples import Array
-from crane.control import Signals
+from crane.control import ValveSignals
 from crane.hydraulics.components import PDGains
 from crane.identification.hydraulics.cylinder_friction import (
     CylinderFriction,
     identify_cylinder_friction,
 )
 from crane.identification.hydraulics.cylinder_signals import cylinder_signals
-from crane.identification.hydraulics.orifices import METHODS, Orifices, identify_orifices
-from crane.identification.hydraulics.valve import ValveCurve, identify_valve
-from crane.identification.signals.motion import differentiate, low_pass
+from crane.identification.hydraulics.orifice_coefficients import (
+    METHODS,
+    OrificeCoefficients,
+    identify_orifices,
+)
+from crane.identification.hydraulics.valve_curve import ValveCurve, identify_valve
+from crane.identification.signals.signal_processing import differentiate, low_pass
 from hydraulic_forwarder.experiment import (
     COEFFICIENTS,
     CYLINDERS,
@@ -62,7 +66,7 @@ def logged(
 
 def identified(
     plant: Crane, runs: Runs, methods: tuple[str, ...] = METHODS
-) -> dict[str, Orifices]:
+) -> dict[str, OrificeCoefficients]:
     """X of the lift cylinder by method."""
     return {
         method: identify_orifices(plant.machine, list(runs.values()), JOINT, method)
@@ -70,7 +74,7 @@ def identified(
     }
 
 
-def left_out(plant: Crane, runs: Runs, method: str) -> dict[str, Orifices]:
+def left_out(plant: Crane, runs: Runs, method: str) -> dict[str, OrificeCoefficients]:
     """X from all recordings but one, by the name of that one."""
     return {
         name: identify_orifices(
@@ -158,13 +162,13 @@ def with_valve(plant: Crane, **numbers: float) -> Crane:
     return Crane(plant.machine.replace(hydraulics=other), plant.joints)
 
 
-def signals_used(plant: Crane, runs: Runs, folder: Path) -> dict[str, Orifices]:
+def signals_used(plant: Crane, runs: Runs, folder: Path) -> dict[str, OrificeCoefficients]:
     """X by what stands for the opening."""
     voltage = logged(plant, runs, folder)
     spool = logged(plant, runs, folder, spool=True)
     at_once = with_valve(plant, rate=0.0, bandwidth=0.0)
 
-    def found(who: Crane, which: Runs) -> Orifices:
+    def found(who: Crane, which: Runs) -> OrificeCoefficients:
         return identified(who, which, ("chambers",))["chambers"]
 
     return {
@@ -174,7 +178,7 @@ def signals_used(plant: Crane, runs: Runs, folder: Path) -> dict[str, Orifices]:
     }
 
 
-def disturbed(plant: Crane, runs: Runs) -> dict[str, Orifices]:
+def disturbed(plant: Crane, runs: Runs) -> dict[str, OrificeCoefficients]:
     """X from logged recordings with sensors or assumptions that are off."""
 
     def shifted(channel: str, by: float) -> Runs:
@@ -234,8 +238,10 @@ def staircase(
     plant = crane_of(kind)
     if not leakage:
         tight = {f"cylinder.{x}.leakage_{side}": 0.0 for x in CYLINDERS for side in "ab"}
-        machine = crane.load("patu655", dict(plant.machine.changes) | tight, {"slew": 0.0})
-        plant = Crane(machine, machine.driven_by(ANGLES))
+        machine = crane.load(
+            "patu655", dict(plant.machine.parameter_changes) | tight, {"slew": 0.0}
+        )
+        plant = Crane(machine, machine.with_active_joints(ANGLES))
     volts, hold, ramp = [], 2.5, 0.1
     for up, down in ((0.40, 0.42), (0.5, 0.5), (0.6, 0.6), (0.75, 0.7), (0.9, 0.85), (1.1, 1.0)):
         volts += [5.8 - up, 5.8, 5.8 + down, 5.8]
@@ -245,7 +251,7 @@ def staircase(
         levels += [level, level]
     run = crane.simulate(
         plant.machine,
-        Signals(plant.machine, time, {joint: levels}),
+        ValveSignals(plant.machine, time, {joint: levels}),
         initial=plant.strokes(np.array([posture]))[0],
         duration=round(time[-1], 2),
         step=STEP,
@@ -286,5 +292,5 @@ def friction_strokes(folder: Path, share: float, masses: float = 1.0) -> Cylinde
     taken = machine
     if masses != 1.0:
         mass = {"lift_boom.mass": masses * 143.66}
-        taken = crane.load("patu655", dict(machine.changes) | mass, {"slew": 0.0})
+        taken = crane.load("patu655", dict(machine.parameter_changes) | mass, {"slew": 0.0})
     return identify_cylinder_friction(taken, read, JOINT)

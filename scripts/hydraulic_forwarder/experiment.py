@@ -11,8 +11,8 @@ from scipy.interpolate import CubicSpline
 import crane
 from crane.common.samples import Array
 from crane.hydraulics.components import PDGains
-from crane.identification.excitation.fourier import Fourier
-from crane.identification.signals.motion import average_periods
+from crane.identification.excitation.fourier_trajectory import FourierTrajectory
+from crane.identification.signals.signal_processing import average_periods
 from crane.recordings import timeseries
 from hydraulic_forwarder.paper import ANGLES
 
@@ -97,13 +97,15 @@ def crane_of(kind: str) -> Crane:
         for joint in CYLINDERS:
             changes |= {f"valve.{joint}.rate": 0.0, f"valve.{joint}.bandwidth": 0.0}
     machine = crane.load("patu655", changes, {"slew": 0.0})
-    return Crane(machine, machine.driven_by(ANGLES))
+    return Crane(machine, machine.with_active_joints(ANGLES))
 
 
 Tones = Mapping[int, tuple[float, float]]
 
 
-def series(period: float, periods: int, rows: Sequence[tuple[float, float, Tones]]) -> Fourier:
+def series(
+    period: float, periods: int, rows: Sequence[tuple[float, float, Tones]]
+) -> FourierTrajectory:
     """A periodic reference of the joints.
 
     Args:
@@ -122,7 +124,7 @@ def series(period: float, periods: int, rows: Sequence[tuple[float, float, Tones
         for k, (share, phase) in tones.items():
             table[k, i] = scale * share * w * k * np.cos(phase)
             table[harmonics + k, i] = -scale * share * w * k * np.sin(phase)
-    return Fourier(table, period, periods)
+    return FourierTrajectory(table, period, periods)
 
 
 # To learn from, and the validation sets of Figures 4 and 5
@@ -164,7 +166,7 @@ LIFTS = {
 }
 
 
-def perform(plant: Crane, motion: Fourier, step: float = STEP) -> crane.Recording:
+def perform(plant: Crane, motion: FourierTrajectory, step: float = STEP) -> crane.Recording:
     """Follow a reference by (37) and record its steady periods.
 
     The joints' reference is mapped to strokes by the closed loops.
@@ -227,7 +229,7 @@ def log(
             columns[f"spool_{joint}"] = "", recording.channels[f"spool_{joint}"]
     units = {"time": "s"} | {name: unit for name, (unit, _) in columns.items()}
     values = np.column_stack([recording.time, *(values for _, values in columns.values())])
-    timeseries.write(path, timeseries.Table(units, values, {"machine": recording.machine}))
+    timeseries.write_table(path, timeseries.Table(units, values, {"machine": recording.machine}))
 
 
 def measured(

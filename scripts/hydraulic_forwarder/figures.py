@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from crane.common.output import replacing
+from crane.common.atomic_output import replace_file
 from crane.common.samples import Array
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
-from crane.identification.hydraulics.valve import ValveCurve
-from crane.identification.signals.motion import Motion
-from crane.view.plots.hydraulics import draw_friction, draw_valve
-from crane.view.plots.recording import DASHED, RECORDED, STYLE
+from crane.identification.hydraulics.valve_curve import ValveCurve
+from crane.identification.signals.signal_processing import Motion
+from crane.view.plots.hydraulics_figures import draw_friction, draw_valve_curve
+from crane.view.plots.recording_figure import DASHED_STYLE, FIGURE_STYLE, RECORDED_COLOUR
 from hydraulic_forwarder.mechanics import Judged
 
 LIGHT = {"color": "#c9c9c9", "linewidth": 0.6}
@@ -23,7 +23,7 @@ REFERENCE = {"color": "#333333", "linestyle": (0, (4, 2)), "linewidth": 0.9}
 def save(figure: Figure, path: Path) -> None:
     """Write a figure whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(STYLE), replacing(path) as part:
+    with mpl.rc_context(FIGURE_STYLE), replace_file(path) as part:
         figure.savefig(part, format="png", dpi=110)
 
 
@@ -35,7 +35,7 @@ def data(motion: Motion, reference: tuple[Array, Array, Array], title: str) -> F
         reference: q, q', q'' (N, 3) that was followed.
         title: Of the figure.
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(9.6, 6.0), layout="constrained")
         grid = figure.subplots(3, 3, sharex=True)
         heads = (r"first link, $q_2$", r"second link, $q_3$", r"telescope, $q_4$")
@@ -47,7 +47,10 @@ def data(motion: Motion, reference: tuple[Array, Array, Array], title: str) -> F
                 axes = grid[row, j]
                 what = ("coordinate", "velocity", "acceleration")[row]
                 axes.plot(
-                    motion.time, values[:, j], color=RECORDED, linewidth=(1.4, 1.2, 0.7)[row]
+                    motion.time,
+                    values[:, j],
+                    color=RECORDED_COLOUR,
+                    linewidth=(1.4, 1.2, 0.7)[row],
                 )
                 if row < 2:
                     axes.plot(motion.time, wanted[:, j], **REFERENCE)
@@ -68,14 +71,14 @@ def torques(judged: Judged, measured: Array, title: str) -> Figure:
         measured: (N, 3) before the filter.
         title: Of the figure.
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(8.2, 7.0), layout="constrained")
         rows = figure.subplots(3, 1, sharex=True)
         labels = (r"$\tau_2$ [kN m]", r"$\tau_3$ [kN m]", r"$F_4$ [kN]")
         for i, (axes, label) in enumerate(zip(rows, labels, strict=True)):
             axes.plot(judged.time, measured[:, i] / 1e3, **LIGHT)
-            axes.plot(judged.time, judged.measured[:, i] / 1e3, color=RECORDED)
-            axes.plot(judged.time, judged.modelled[:, i] / 1e3, **DASHED)
+            axes.plot(judged.time, judged.measured[:, i] / 1e3, color=RECORDED_COLOUR)
+            axes.plot(judged.time, judged.modelled[:, i] / 1e3, **DASHED_STYLE)
             share = f"relative error {100 * judged.relative[i]:.2g} %"
             error = f"RMS error {judged.rmse[i]:.2g} {'N' if i == 2 else 'N m'}"
             axes.set_title(f"{error}, {share}", loc="left", fontsize=9)
@@ -94,7 +97,7 @@ def torques(judged: Judged, measured: Array, title: str) -> Figure:
 
 def lifting(runs: list[tuple[Array, Array, Array, Array]]) -> Figure:
     """Figure 8: of each recording time, reference of q2, u and F' [N/s], (N,) each."""
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(9.6, 6.2), layout="constrained")
         grid = figure.subplots(3, 3)
         heads = ("reference of the first link", "control input", "estimate of the force's rate")
@@ -108,7 +111,7 @@ def lifting(runs: list[tuple[Array, Array, Array, Array]]) -> Figure:
                 )
             ):
                 axes = grid[row, j]
-                axes.plot(time, values, color=RECORDED, linewidth=(1.4, 1.0, 0.6)[j])
+                axes.plot(time, values, color=RECORDED_COLOUR, linewidth=(1.4, 1.0, 0.6)[j])
                 axes.set_ylabel(label)
                 axes.margins(x=0.0)
                 if row == 0:
@@ -126,10 +129,10 @@ def valve_and_friction(curve: ValveCurve, friction: CylinderFriction, law: Array
         friction: Of a cylinder.
         law: (2, N) speeds and true friction.
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(9.0, 3.6), layout="constrained")
         left, right = figure.subplots(1, 2)
-        draw_valve(left, curve)
+        draw_valve_curve(left, curve)
         left.set_title("valve of the extension", loc="left", fontsize=9)
         draw_friction(right, friction)
         for part in (law[:, law[0] < 0], law[:, law[0] > 0]):

@@ -6,12 +6,12 @@ import numpy as np
 
 import crane
 from crane.common.samples import Array
-from crane.identification.mechanics.friction import friction
+from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertias import Inertial, body_names
-from crane.identification.mechanics.result import Identification
-from crane.identification.mechanics.term import Samples, Term
-from crane.identification.signals.motion import Motion, differentiate, low_pass
+from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
+from crane.identification.mechanics.model_term import ModelTerm, MotionSamples
+from crane.identification.signals.signal_processing import Motion, differentiate, low_pass
 from hydraulic_forwarder.experiment import CYLINDERS, STEP, Crane, averaged
 from hydraulic_forwarder.paper import ANGLES
 
@@ -48,7 +48,7 @@ class Seven:
     """
 
     names = tuple(f"theta_{i}" for i in range(1, 8))
-    signs = (False,) * 7
+    nonnegative = (False,) * 7
 
     def __init__(self, machine: crane.Machine):
         self._dynamics = crane.Dynamics(machine)
@@ -72,9 +72,9 @@ class Seven:
              second[9] + third[9], np.hypot(*first[1:3])]
         )  # fmt: skip
 
-    def columns(self, at: Samples) -> Array:
-        """See `Term`."""
-        return self._dynamics.regressor(at.q_a, at.v_a, at.a_a) @ self.B
+    def columns(self, samples: MotionSamples) -> Array:
+        """See `ModelTerm`."""
+        return self._dynamics.regressor(samples.q_a, samples.v_a, samples.a_a) @ self.B
 
 
 def joint_motion(plant: Crane, recording: crane.Recording, period: float) -> Motion:
@@ -174,9 +174,9 @@ def learned(
             bodies; "seven, friction at joints": and its friction (15).
         stribeck: Velocities of stiction, which (14) does not have [m/s].
     """
-    bodies: Term = Inertial(joints) if model == "closed" else Seven(joints)
+    bodies: ModelTerm = InertialTerm(joints) if model == "closed" else Seven(joints)
     places = ANGLES if "joints" in model else CYLINDERS
-    terms = [bodies, *(friction(joints, place, stribeck=stribeck) for place in places)]
+    terms = [bodies, *(friction_term(joints, place, stribeck=stribeck) for place in places)]
     return identify(joints, motion, terms=terms, bandwidth=BANDWIDTH)
 
 
@@ -193,6 +193,6 @@ def combined(found: Identification, factors: dict[str, float]) -> tuple[float, f
     row = np.array([factors.get(name, 0.0) for name in found.names])
     value = float(row @ found.values)
     half = float(np.sqrt(row @ found.covariance @ row)) * float(
-        t.ppf(0.975, found.estimate.freedom)
+        t.ppf(0.975, found.estimate.degrees_of_freedom)
     )
     return value, value - half, value + half

@@ -47,7 +47,7 @@ def requirements(found: Results) -> list[tuple[str, str, str, bool]]:
         worst = max(one.relative[i] for one in found.judged["closed"].values())
         what = f"{signal} of sets 1 and 2 by the identified crane"
         out.append((what, percent(most), percent(worst), worst <= most))
-    curve = found.valves["X_ext"].table()
+    curve = found.valves["X_ext"].parameter_intervals()
     for name, true, unit in (("neutral", 5.8, " V"), ("dead_band", 0.1143, "")):
         value, a, b = curve[name]
         what = f"{name.replace('_', ' ')} of the compensated valve, {true:g}{unit}"

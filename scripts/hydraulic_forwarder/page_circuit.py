@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from crane.identification.hydraulics.orifices import NAMES
-from crane.identification.hydraulics.valve import ValveCurve
+from crane.identification.hydraulics.orifice_coefficients import PARAMETER_NAMES
+from crane.identification.hydraulics.valve_curve import ValveCurve
 from hydraulic_forwarder.circuit import PASSES, TRUE
 from hydraulic_forwarder.experiment import LIFTS, OIL
 from hydraulic_forwarder.paper import LIFTING, STIFF
@@ -71,7 +71,9 @@ def orifices(found: Results) -> str:
     quiet = percent(float(found.quiet.values[0] / TRUE[0] - 1))
     values = [
         [name, f"{true:.4g}", f"{x:.4g}", span(a, b, 4)]
-        for name, true, x, (a, b) in zip(NAMES, TRUE, X.values, X.interval(), strict=True)
+        for name, true, x, (a, b) in zip(
+            PARAMETER_NAMES, TRUE, X.values, X.interval(), strict=True
+        )
     ]
     both = ", ".join(f"{name} {percent(x)}" for name, x in found.all_joints.items())
     return "\n\n".join(
@@ -79,13 +81,13 @@ def orifices(found: Results) -> str:
             "**Without noise**, on the paper's crane (rigid hoses and walls, no leakage, a spool "
             "that follows at once), through the logger's file and back, not averaged, relative "
             "errors of X:",
-            table(("method", *NAMES), clean),
+            table(("method", *PARAMETER_NAMES), clean),
             "`ls` is the paper's (36) on the smoother's F' and x'; `weak` is (29) integrated "
             "over windows, nothing differentiated; `chambers` both equations (23).",
             "**With noise**, X from the three recordings; relative errors of (29) on each "
             "recording by X of the other two. Bold: the truth (for 1/beta that of the oil alone) "
             "is outside of the 95 % interval.",
-            table(("", *NAMES, "(29) held out"), rows),
+            table(("", *PARAMETER_NAMES, "(29) held out"), rows),
             "- All methods find c1 to c4 to less than 1 %. `chambers` knows them "
             f"{ratio.min():.0f} to {ratio.max():.0f} times better than `weak`, because in (29) c1 "
             "and c2 differ only by how V_A / V_B changes "
@@ -144,7 +146,7 @@ def assumptions(found: Results) -> str:
     """What stands for the opening, and what is off."""
     signals = [[name, *errors(X)] for name, X in found.signals.items()]
     off = [[name, *errors(X), f"{X.misfit:.3g}"] for name, X in found.disturbed.items()]
-    edges = found.edges.table()
+    edges = found.edges.parameter_intervals()
     neutral, band = (
         f"{value:.5g} ({span(a, b, 5)})" for value, a, b in (edges["neutral"], edges["dead_band"])
     )
@@ -152,12 +154,12 @@ def assumptions(found: Results) -> str:
         [
             "### What has to be known",
             "The signal that stands for the opening (machine, `chambers`):",
-            table(("", *NAMES), signals),
+            table(("", *PARAMETER_NAMES), signals),
             "A real crane has the voltage. Its spool's second order is in data sheets; without it "
             "each c is wrong by a percent in motions as slow as these. A spool sensor would "
             "tell as much.",
             "What sensors and numbers that are off do:",
-            table(("", *NAMES, "misfit"), off),
+            table(("", *PARAMETER_NAMES, "misfit"), off),
             "Offsets of single sensors go into one or two c; the misfit does not see them. What "
             "has to be right is the valve's middle and dead band: at |u| of 0.2 to 0.3 an error "
             "of 0.01 is a tenth of the opening. They come from a staircase of the same valve, "
@@ -172,7 +174,7 @@ def valve(found: Results) -> str:
     """Neutral voltage and dead band of the machine as published."""
 
     def row(curve: ValveCurve, name: str, digits: int = 5) -> str:
-        value, low, high = curve.table()[name]
+        value, low, high = curve.parameter_intervals()[name]
         return f"{value:.{digits}g} ({span(low, high, digits)})"
 
     true = {

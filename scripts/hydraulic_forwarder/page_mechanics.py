@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crane.identification.mechanics.result import Identification
+from crane.identification.mechanics.identification_result import Identification
 from hydraulic_forwarder import mechanics
 from hydraulic_forwarder.paper import SIGNALS, UNITS
 from hydraulic_forwarder.results import Results

@@ -7,11 +7,11 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
-from crane.identification.hydraulics.orifice_rows import Sides
-from crane.identification.hydraulics.orifices import Orifices
-from crane.identification.hydraulics.valve import ValveCurve
-from crane.identification.mechanics.result import Identification
-from crane.identification.signals.motion import Motion
+from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
+from crane.identification.hydraulics.orifice_equations import EquationSides
+from crane.identification.hydraulics.valve_curve import ValveCurve
+from crane.identification.mechanics.identification_result import Identification
+from crane.identification.signals.signal_processing import Motion
 from hydraulic_forwarder import circuit, mechanics
 from hydraulic_forwarder.experiment import LIFTS, MOTIONS, averaged, crane_of, measured, perform
 
@@ -60,19 +60,19 @@ class Results:
     judged: dict[str, dict[str, mechanics.Judged]]
     shares: dict[str, tuple[Array, Array]]
     oscillation: float
-    clean: dict[str, Orifices]
-    quiet: Orifices
-    tight: Orifices
-    noisy: dict[str, dict[str, Orifices]]
-    left_out: dict[str, dict[str, dict[str, Orifices]]]
+    clean: dict[str, OrificeCoefficients]
+    quiet: OrificeCoefficients
+    tight: OrificeCoefficients
+    noisy: dict[str, dict[str, OrificeCoefficients]]
+    left_out: dict[str, dict[str, dict[str, OrificeCoefficients]]]
     predicted: dict[str, dict[str, dict[str, float]]]
     sizes: dict[str, circuit.Sizes]
     lifting: list[tuple[Array, Array, Array, Array]]
-    held_out: dict[str, Sides]
+    held_out: dict[str, EquationSides]
     all_joints: dict[str, float]
     softness: Array
-    signals: dict[str, Orifices]
-    disturbed: dict[str, Orifices]
+    signals: dict[str, OrificeCoefficients]
+    disturbed: dict[str, OrificeCoefficients]
     valves: dict[str, ValveCurve]
     edges: ValveCurve
     friction: CylinderFriction
@@ -111,9 +111,9 @@ def compute(folder: Path) -> Results:
         part = mechanics.forces_of(plant.joints, motions["set 1"], bodies)
         shares[group] = np.sqrt(np.mean(part**2, axis=0)) / whole, np.abs(part).max(axis=0)
 
-    clean: dict[str, Orifices] = {}
-    noisy: dict[str, dict[str, Orifices]] = {}
-    left_out: dict[str, dict[str, dict[str, Orifices]]] = {}
+    clean: dict[str, OrificeCoefficients] = {}
+    noisy: dict[str, dict[str, OrificeCoefficients]] = {}
+    left_out: dict[str, dict[str, dict[str, OrificeCoefficients]]] = {}
     predicted: dict[str, dict[str, dict[str, float]]] = {}
     for kind in KINDS:
         lifter, runs = circuit.lifts(kind)
@@ -127,7 +127,7 @@ def compute(folder: Path) -> Results:
         noisy[kind] = circuit.identified(lifter, logged)
         left_out[kind] = {m: circuit.left_out(lifter, logged, m) for m in circuit.METHODS}
         predicted[kind] = {
-            method: {name: X.predict(logged[name]).relative for name, X in one.items()}
+            method: {name: X.predict(logged[name]).relative_error for name, X in one.items()}
             for method, one in left_out[kind].items()
         }
     # the last kind is the crane itself
@@ -158,7 +158,7 @@ def compute(folder: Path) -> Results:
         sizes=circuit.sizes(lifter, logged),
         lifting=lifting,
         held_out={name: chosen[name].predict(run) for name, run in logged.items()},
-        all_joints={name: X.predict(recorded[name]).relative for name in ("set 1", "set 2")},
+        all_joints={name: X.predict(recorded[name]).relative_error for name in ("set 1", "set 2")},
         softness=softness,
         signals=circuit.signals_used(lifter, runs, folder),
         disturbed=circuit.disturbed(lifter, logged),
@@ -174,7 +174,7 @@ def compute(folder: Path) -> Results:
     )
 
 
-def without_leakage(folder: Path) -> Orifices:
+def without_leakage(folder: Path) -> OrificeCoefficients:
     """X of the machine whose closed spools do not leak, without noise."""
     lifter, runs = circuit.lifts("tight")
     exact = {name: measured(lifter, run, folder, 0, 0.0, spool=True) for name, run in runs.items()}

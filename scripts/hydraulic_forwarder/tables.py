@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from crane.identification.hydraulics.orifices import Orifices
+from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
 from hydraulic_forwarder.circuit import TRUE
 
 KIND = {"paper": "paper's crane", "rigid": "with the spool", "orifices": "the machine"}
@@ -27,7 +27,7 @@ def span(low: float, high: float, digits: int = 3) -> str:
     return f"{low:.{digits}g} to {high:.{digits}g}"
 
 
-def errors(X: Orifices) -> list[str]:
+def errors(X: OrificeCoefficients) -> list[str]:
     """Relative errors of X against `TRUE`, bold outside of the 95 % interval."""
     low, high = X.interval().T
     out = []
@@ -37,7 +37,7 @@ def errors(X: Orifices) -> list[str]:
     return out
 
 
-def inside(X: Orifices, level: float = 0.95) -> np.ndarray:
+def inside(X: OrificeCoefficients, level: float = 0.95) -> np.ndarray:
     """Which of the intervals (5,) hold the truth."""
     low, high = X.interval(level).T
     return (low < TRUE) & (high > TRUE)

@@ -9,7 +9,7 @@ import pinocchio as pin
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description import Friction, MachineSpec, parameters
-from crane.formats import read
+from crane.formats import read_machine_spec
 from crane.machine import Machine
 
 _STRIBECK = {"rad": 1e-2, "m": 1e-3}  # [rad/s], [m/s] where stiction ends; A
@@ -51,10 +51,10 @@ def drawn(
     machine: Machine, tolerances: Tolerances, random: np.random.Generator
 ) -> dict[str, float]:
     """Changes that make a plant of a machine, by the names of `crane.description.parameters`."""
-    spec = read(machine.reference)
+    spec = read_machine_spec(machine.load_name)
     printed = parameters(spec)
-    nominal = {**printed, **machine.changes}
-    changes = dict(machine.changes)
+    nominal = {**printed, **machine.parameter_changes}
+    changes = dict(machine.parameter_changes)
 
     def move(name: str, by: float) -> None:
         if nominal.get(name):  # no number of a file: where a chain is attached

@@ -6,26 +6,32 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from crane.codegen import Number
+from crane.codegen import Scalar
 from crane.common.errors import (
     ClosureError,
     CraneError,
     CraneWarning,
     InputError,
     SimulationError,
-    known,
+    suggest_names,
 )
 from crane.common.samples import Array, as_number, as_seed
-from crane.control import PI, At, Law
+from crane.control import PI, ControlLaw, ControllerInputs
 from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.machine import Machine
-from crane.motion.curves import Trajectory
 from crane.motion.kinematics import Kinematics
-from crane.motion.limits import beyond_limits
-from crane.motion.trajectories import with_free
+from crane.motion.limit_violations import limit_violation_message
+from crane.motion.task_trajectories import add_free_joints
+from crane.motion.trajectory import Trajectory
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
-from crane.simulation.integration import Chart, HaltedError, Steps, explained, row_layout
+from crane.simulation.integration import (
+    Chart,
+    FixedStepIntegrator,
+    IntegrationHaltError,
+    explain_halt,
+    row_layout,
+)
 from rig.plant import Tolerances, drawn
 from rig.sensors import Sensors, default_sensors
 
@@ -70,7 +76,7 @@ class Rig:
         seed = as_seed(seed)
         for joint in sensors or {}:
             if joint not in machine.active:
-                raise InputError(f"sensors of '{joint}', {known(machine.active, joint)}")
+                raise InputError(f"sensors of '{joint}', {suggest_names(machine.active, joint)}")
         self.machine, self.seed, self._runs = machine, seed, 0
         self.sensors = {
             joint: (sensors or {}).get(joint) or default_sensors(machine, joint)
@@ -78,14 +84,14 @@ class Rig:
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
-            if load(machine.reference, machine.changes).model != machine.model:
+            if load(machine.load_name, machine.parameter_changes).model != machine.model:
                 raise InputError(
                     f"'{machine.name}' has a payload or locked joints that loading it again does "
                     "not give, load it with a change of payload.mass and without locks"
                 )
             self.changes = drawn(machine, tolerances, np.random.default_rng([seed, 0]))
             try:
-                plant = load(machine.reference, self.changes)
+                plant = load(machine.load_name, self.changes)
             except CraneError as error:
                 raise InputError(f"the plant of seed {seed} does not close: {error}") from None
         self.plant = plant.replace(
@@ -126,7 +132,8 @@ class Rig:
         drives the actuator, as when it lowers.
 
         Args:
-            path: Reference of the driven joints, see `with_free`; the plant starts on it at rest.
+            path: Reference of the driven joints, see `add_free_joints`; the plant starts on it at
+                rest.
             step: Sampling interval [s].
             label: Name of the motion to put into the recording.
 
@@ -144,8 +151,8 @@ class Rig:
         machine, plant, n = self.machine, self.plant, len(self.machine.active)
         if not (isinstance(label, str) and label.isprintable() and label == label.strip()):
             raise InputError(f"label {label!r} is not one line of text")
-        step = as_number(step, "the step", "s", above=0)
-        path = with_free(machine, path)
+        step = as_number(step, "the step", "s", greater_than=0)
+        path = add_free_joints(machine, path)
         count = round(path.duration / step)
         if count < 1 or abs(count * step - path.duration) > 1e-9 * path.duration:
             raise InputError(f"the step of {step:g} s is no part of {path.duration:g} s")
@@ -158,11 +165,11 @@ class Rig:
                 f"the path is of {reference.shape[1]} joints, '{machine.name}' has {n}"
             )
         plant.check_limits(reference[0], "the start of the path")
-        if text := beyond_limits(machine, path):
+        if text := limit_violation_message(machine, path):
             warnings.warn(text, CraneWarning, stacklevel=2)
         for closure in (machine.closure, plant.closure):
             # what was solved before shows in the last bits of what is solved next: start afresh
-            closure.solve(closure.home[closure.active], guess=closure.home)
+            closure.solve(closure.home[closure.active], initial_guess=closure.home)
         random = np.random.default_rng([self.seed, 2, self._runs])
         self._runs += 1
         noise = random.standard_normal((2, count + 1, n))
@@ -183,7 +190,7 @@ class Rig:
                     channels[f"{name}_{joint}"], units[f"{name}_{joint}"] = values[:, i], of
         if machine.tip is not None:
             known_tip, tip = Kinematics(machine).position(measured), Kinematics(plant)
-            true_tip = tip.positions(postures)
+            true_tip = tip.positions_at_configurations(postures)
             for name, points in (("tip", known_tip), ("true_tip", true_tip)):
                 for axis, values in zip("xyz", points.T, strict=True):
                     channels[f"{name}_{axis}"], units[f"{name}_{axis}"] = values, "m"
@@ -196,7 +203,7 @@ class Rig:
             units={joint: machine.unit(joint) for joint in machine.active},
             channels=channels,
             channel_units=units,
-            machine=machine.call,
+            machine=machine.load_expression,
             task=": ".join(filter(None, (f"virtual rig, seed {self.seed}", label))),
             free=machine.free,
         )
@@ -206,17 +213,17 @@ class Rig:
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Measured coordinates, commands, forces, postures (., nq) and velocities, all (., n)."""
         control, sensors = PI(self.machine, path), list(self.sensors.values())
-        kp, ki = (self.machine.spread(x, "gains") for x in np.split(control.settings, 2))
+        kp, ki = (self.machine.expand_driven(x, "gains") for x in np.split(control.settings, 2))
         noise = noise * [s.noise for s in sensors]
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
         held, substeps = _Held(plant), _substeps(dynamics, reference, step)
-        h, steps = step / substeps, Steps(Chart.of(dynamics), held, 0)
-        steps.limit(np.array([np.inf, -np.inf]))  # the rig stays away from dead centres
+        h, steps = step / substeps, FixedStepIntegrator(Chart.from_dynamics(dynamics), held, 0)
+        steps.set_chart_limits(np.array([np.inf, -np.inf]))  # the rig stays away from dead centres
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
-        now = steps.slow.layout.view(state)
+        now = steps.python_stepper.state_layout.view(state)
         rows = np.empty((substeps, row_layout(plant, held, 0).size))
-        integral = self.machine.spread(control.start(reference[0]), "the integral")
+        integral = self.machine.expand_driven(control.start(reference[0]), "the integral")
         measured, command, force = (np.empty_like(reference) for _ in range(3))
         postures, v = np.empty((len(reference), nq)), np.empty_like(reference)
         for k in range(len(reference)):
@@ -227,14 +234,14 @@ class Rig:
             integral = integral + step * error
             force[k] = np.minimum(np.maximum(command[k], -self.limits), self.limits)
             postures[k], v[k] = now.q, now.v_a
-            held.settings[:] = force[k, plant.driven]
+            held.settings[:] = force[k, plant.is_driven]
             if k < len(reference) - 1:
                 times = k * step + h * np.arange(substeps, dtype=np.float64)
                 try:
                     steps.run(times, state, h, rows)
-                except HaltedError as halt:
+                except IntegrationHaltError as halt:
                     before = step * np.arange(k + 1.0), postures[: k + 1, active]
-                    raise explained(plant, halt, *before, path) from None
+                    raise explain_halt(plant, halt, *before, path) from None
         return measured, command, force, postures, v
 
     def _currents(self, force: Array, sign: Array, noise: Array) -> tuple[Array, Array]:
@@ -247,15 +254,15 @@ class Rig:
         return current, tau
 
 
-class _Held(Law):
+class _Held(ControlLaw):
     """Forces that hold until they are set again."""
 
     def __init__(self, machine: Machine):
         super().__init__(machine)
         self.settings = np.zeros(len(machine.driven_joints))
 
-    def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
-        return self.spread(at.settings), ()
+    def law(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        return self.expand_driven(inputs.settings), ()
 
 
 def _velocity(q: Array, step: float) -> Array:
@@ -276,7 +283,7 @@ def _substeps(dynamics: Dynamics, reference: Array, step: float) -> int:
     machine, fastest = dynamics.machine, 0.0
     slopes = np.zeros(machine.model.nv)
     for joint, f in machine.friction.items():
-        smoothed = f.breakaway / f.smoothing if f.smoothing else 0.0
+        smoothed = f.breakaway_force / f.smoothing if f.smoothing else 0.0
         slopes[machine.column(joint)] = f.viscous + smoothed
     # the plant goes no farther than its limits, wherever its reference is
     within = np.clip(reference[:: max(1, len(reference) // 100)], machine.lower, machine.upper)

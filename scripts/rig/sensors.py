@@ -28,7 +28,7 @@ class Converter:
     high: float = math.inf
 
     def __post_init__(self) -> None:
-        as_number(self.step, "the step of a converter", "", above=0)
+        as_number(self.step, "the step of a converter", "", greater_than=0)
 
     def __call__(self, x: Array) -> Array:
         """The nearest value that can be told."""
@@ -71,8 +71,8 @@ class Sensors:
     driver: float = 2.0
 
     def __post_init__(self) -> None:
-        as_number(self.gain, "the gain of a current", "", above=0)
-        as_number(self.driver, "the driver's largest current", "A", above=self.no_load)
+        as_number(self.gain, "the gain of a current", "", greater_than=0)
+        as_number(self.driver, "the driver's largest current", "A", greater_than=self.no_load)
 
 
 def default_sensors(machine: Machine, joint: str) -> Sensors:

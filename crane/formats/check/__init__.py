@@ -1,5 +1,5 @@
 """Everything that is wrong or unusual about a description, at once."""
 
-from crane.formats.check.report import Finding, Report, check
+from crane.formats.check.check_report import CheckReport, Finding, check
 
-__all__ = ["Finding", "Report", "check"]
+__all__ = ["Finding", "CheckReport", "check"]

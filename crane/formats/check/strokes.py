@@ -9,7 +9,7 @@ from crane.closure import Closure
 from crane.common.errors import ClosureError, CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec
-from crane.description.spec import TIP
+from crane.description.specification import TIP_COORDINATES
 
 _SAMPLES, _WORK = 150, 6000  # of the strokes' box, and samples times joints at most
 _FAILED = 20  # of these that end it: each takes a hundred times as long as one that closes
@@ -31,10 +31,10 @@ def warn_of_tasks(spec: MachineSpec, closure: Closure) -> None:
     coordinates, active = closure.equations.coordinates, closure.active
     names = closure.active_names
     slack = _SLACK * closure.units
-    place, reach = spec.where.get("tasks", spec.path.name), _reach(spec)
+    place, reach = spec.source_locations.get("tasks", spec.path.name), _reach(spec)
     for name, task in spec.tasks.items():
         for via in task.via if task.space == "tip" else ():
-            away = float(np.linalg.norm([via.point.get(axis, 0.0) for axis in TIP]))
+            away = float(np.linalg.norm([via.point.get(axis, 0.0) for axis in TIP_COORDINATES]))
             if away > reach:
                 _warn(
                     f"{place}: task '{name}' has its tip {away:.4g} m from the root at t = "
@@ -49,7 +49,7 @@ def warn_of_tasks(spec: MachineSpec, closure: Closure) -> None:
                 lower, upper = coordinates.lower[column], coordinates.upper[column]
                 value = q_a[names.index(joint)] = point[joint]
                 if not lower - slack[column] <= value <= upper + slack[column]:
-                    unit = "m" if coordinates.slides[column] else "rad"
+                    unit = "m" if coordinates.is_translation[column] else "rad"
                     _warn(
                         f"{place}: task '{name}' has '{joint}' at {value:g} {unit} {what}, beyond "
                         f"its limits {lower:g} to {upper:g} {unit}, choose a position within them"
@@ -73,7 +73,9 @@ def warn_of_strokes(spec: MachineSpec, closure: Closure) -> None:
     """
     coordinates, active = closure.equations.coordinates, closure.active
     lower, upper = coordinates.lower[active], coordinates.upper[active]
-    moved = coordinates.slides[active] & (upper - lower < _LONG * closure.size)
+    moved = coordinates.is_translation[active] & (
+        upper - lower < _LONG * closure.characteristic_length
+    )
     moved &= (closure.equations.sign[:, active] != 0).any(axis=0)
     if not moved.any():
         return
@@ -97,7 +99,8 @@ def warn_of_strokes(spec: MachineSpec, closure: Closure) -> None:
     if part >= _TOLD:
         names = ", ".join(x for x, yes in zip(closure.active_names, moved, strict=True) if yes)
         _warn(
-            f"{spec.where.get('active', spec.path.name)}: {100 * part:.0f} % of the strokes "
+            f"{spec.source_locations.get('active', spec.path.name)}: {100 * part:.0f} % of the "
+            f"strokes "
             f"within the limits of {names} lie beyond dead centres, the nearest "
             f"of those tried: "
             f"{min(failed)[1]}; narrow the limits, or see that the lengths are right"

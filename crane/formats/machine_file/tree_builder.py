@@ -3,13 +3,13 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
-from crane.common.errors import CraneError, DescriptionError, known
-from crane.description.findings import FollowUpError, flag, recoverable
-from crane.description.floating import afloat_tree
-from crane.description.spec import Chain, LoopSpec
-from crane.description.tree import Joint, Link, Tree
-from crane.formats.machine_file.section import Section
-from crane.formats.urdf.read import Urdf
+from crane.common.errors import CraneError, DescriptionError, suggest_names
+from crane.description.findings import FollowUpError, error_recovery, report_error
+from crane.description.floating_bases import add_base_joints
+from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.specification import Chain, LoopSpec
+from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.urdf.urdf_reader import UrdfModel
 
 
 class TreeBuilder:
@@ -18,177 +18,195 @@ class TreeBuilder:
     Attributes:
         links: By name.
         joints: Those that move, by name.
-        complete: Whether every name is here; where findings are collected, a chain or a name may
-            have been refused.
+        is_complete: Whether every name is here; where findings are collected, a chain or a name
+            may have been refused.
     """
 
     def __init__(self) -> None:
         self.links: dict[str, Link] = {}
         self.joints: dict[str, Joint] = {}
-        self.complete = True
-        self._every: dict[str, Joint] = {}
-        self._body: dict[str, str] = {}  # link -> the link it is rigidly attached to
+        self.is_complete = True
+        self._all_joints: dict[str, Joint] = {}
+        self._body_of_link: dict[str, str] = {}  # link -> the link it is rigidly attached to
 
     @property
     def tree(self) -> Tree:
         """All that has been added."""
-        return Tree(dict(self.links), dict(self._every))
+        return Tree(dict(self.links), dict(self._all_joints))
 
-    def add(self, chain: Chain, urdf: Urdf) -> None:
+    def add_chain(self, chain: Chain, urdf: UrdfModel) -> None:
         """Hang a chain from its parent frame, the first from the world.
 
         Raises:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
-        self._body[urdf.root] = urdf.root
-        with recoverable():
-            self._hang(chain, urdf)
+        self._body_of_link[urdf.root_link] = urdf.root_link
+        with error_recovery():
+            self._attach_to_parent(chain, urdf)
         parts = list(urdf.tree)
-        free = list(self.free(parts))
+        free = list(self.filter_new_names(parts))
         # what is not there goes by another name
-        self.complete &= urdf.complete and len(free) == len(parts)
+        self.is_complete &= urdf.is_complete and len(free) == len(parts)
         for part in free:
-            self._enter(part)
-        self._attach(urdf)
+            self._add_part(part)
+        self._assign_bodies(urdf)
 
-    def let_float(self, freedoms: Sequence[str]) -> None:
+    def add_floating_base(self, freedoms: Sequence[str]) -> None:
         """Let the root of the first chain float instead of standing on the world."""
         if not freedoms or not self.links:
             return
-        root = self.tree.root
-        whole = afloat_tree(self.tree, freedoms)
-        self.links, self._every = dict(whole.links), dict(whole.joints)
-        self.joints = {name: joint for name, joint in whole.joints.items() if joint.moves}
-        bodies = {link: root for link, body in self._body.items() if body == root}
-        self._body = {whole.root: whole.root} | self._body | bodies
+        root = self.tree.root_link
+        floating_tree = add_base_joints(self.tree, freedoms)
+        self.links, self._all_joints = dict(floating_tree.links), dict(floating_tree.joints)
+        self.joints = {
+            name: joint for name, joint in floating_tree.joints.items() if joint.is_movable
+        }
+        bodies = {link: root for link, body in self._body_of_link.items() if body == root}
+        self._body_of_link = (
+            {floating_tree.root_link: floating_tree.root_link} | self._body_of_link | bodies
+        )
 
-    def free(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
+    def filter_new_names(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
         for part in parts:
-            earlier = self._same(part)
+            earlier = self._find_same_name(part)
             if earlier is None:
                 yield part
                 continue
-            flag(_taken(part, earlier))
-            if earlier.where == part.where:
+            report_error(_duplicate_name_error(part, earlier))
+            if earlier.source_location == part.source_location:
                 return  # one file twice: the rest of it is there, too
 
-    def _same(self, part: Link | Joint) -> Link | Joint | None:
-        names = self.links if isinstance(part, Link) else self._every
+    def _find_same_name(self, part: Link | Joint) -> Link | Joint | None:
+        names = self.links if isinstance(part, Link) else self._all_joints
         return names.get(part.name)
 
-    def _enter(self, part: Link | Joint) -> None:
+    def _add_part(self, part: Link | Joint) -> None:
         if isinstance(part, Link):
             self.links[part.name] = part
             return
-        self._every[part.name] = part
-        if part.moves:
+        self._all_joints[part.name] = part
+        if part.is_movable:
             self.joints[part.name] = part
 
-    def _hang(self, chain: Chain, urdf: Urdf) -> None:
+    def _attach_to_parent(self, chain: Chain, urdf: UrdfModel) -> None:
         if chain.parent is None:
             return
         if chain.parent not in self.links:
-            raise self.unknown(
-                f"{chain.where}: chain '{chain.name}' hangs from '{chain.parent}', no frame "
-                f"of an earlier chain, {known(self.links, chain.parent)}",
+            raise self.unknown_name_error(
+                f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', no "
+                f"frame "
+                f"of an earlier chain, {suggest_names(self.links, chain.parent)}",
                 chain.parent,
             )
-        joint = chain.attached(urdf.root)
-        if (earlier := self._same(joint)) is not None:
-            raise _taken(joint, earlier)
-        self._enter(joint)
-        self._body[urdf.root] = self._body.get(chain.parent, urdf.root)
+        joint = chain.attachment_joint(urdf.root_link)
+        if (earlier := self._find_same_name(joint)) is not None:
+            raise _duplicate_name_error(joint, earlier)
+        self._add_part(joint)
+        self._body_of_link[urdf.root_link] = self._body_of_link.get(chain.parent, urdf.root_link)
 
-    def unknown(self, message: str, name: str = "?") -> CraneError:
+    def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
-        told = not self.complete or not name
-        return FollowUpError(message) if told else DescriptionError(message)
+        is_follow_up = not self.is_complete or not name
+        return FollowUpError(message) if is_follow_up else DescriptionError(message)
 
-    def _attach(self, urdf: Urdf) -> None:
+    def _assign_bodies(self, urdf: UrdfModel) -> None:
         """Find out which links of a chain make one body."""
-        below = urdf.tree.below()  # which is a forest, see `crane.formats.urdf.graph`
-        waiting = [urdf.root]
-        while waiting:
-            link = waiting.pop()
-            for joint in below.get(link, ()):
-                self._body[joint.child] = joint.child if joint.moves else self._body[link]
-                waiting.append(joint.child)
+        joints_by_parent = (
+            urdf.tree.joints_by_parent()
+        )  # which is a forest, see `crane.formats.urdf.joint_graph`
+        pending = [urdf.root_link]
+        while pending:
+            link = pending.pop()
+            for joint in joints_by_parent.get(link, ()):
+                self._body_of_link[joint.child] = (
+                    joint.child if joint.is_movable else self._body_of_link[link]
+                )
+                pending.append(joint.child)
 
-    def check_joint(self, joint: str, where: str) -> None:
+    def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
         if joint in self.joints:
             return
-        if joint in self._every:
-            problem = f"{where}: joint '{joint}' is fixed, name a moving one"
+        if joint in self._all_joints:
+            problem = f"{source_location}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        problem = f"{where}: joint '{joint}' is unknown, {known(self.joints, joint)}"
-        raise self.unknown(problem, joint)
+        problem = (
+            f"{source_location}: joint '{joint}' is unknown, {suggest_names(self.joints, joint)}"
+        )
+        raise self.unknown_name_error(problem, joint)
 
-    def check_link(self, link: str, where: str, what: str) -> None:
-        """Raise for a link that does not exist, called `what`."""
+    def check_link(self, link: str, source_location: str, label: str) -> None:
+        """Raise for a link that does not exist, called `label`."""
         if link not in self.links:
-            problem = f"{where}: {what} '{link}' is unknown, {known(self.links, link)}"
-            raise self.unknown(problem, link)
+            problem = (
+                f"{source_location}: {label} '{link}' is unknown, "
+                f"{suggest_names(self.links, link)}"
+            )
+            raise self.unknown_name_error(problem, link)
 
-    def joint(self, section: Section) -> str:
+    def read_joint_name(self, section: YamlSection) -> str:
         """The joint that a section names."""
         joint = section.text("joint")
-        self.check_joint(joint, section.where("joint"))
+        self.check_joint(joint, section.source_location("joint"))
         return joint
 
-    def frames(self, section: Section) -> tuple[str, str]:
+    def read_frame_pair(self, section: YamlSection) -> tuple[str, str]:
         """The two frames that a section is between, on two bodies.
 
         Raises:
             DescriptionError: There are not two, one is unknown, or both are on one body.
         """
-        links, where = section.names("between"), section.where("between")
+        links, where = section.names("between"), section.source_location("between")
         if len(links) != 2:
-            raise section.fail("between", f"{section.title} is between two frames, name two")
+            raise section.error_at("between", f"{section.title} is between two frames, name two")
         for link in links:
             self.check_link(link, where, "the frame")
-        one, two = links
-        body = self._body.get(one)
-        if body is not None and body == self._body.get(two):
-            raise section.fail(
+        first, second = links
+        body = self._body_of_link.get(first)
+        if body is not None and body == self._body_of_link.get(second):
+            raise section.error_at(
                 "between",
-                f"'{one}' and '{two}' are both on the body '{body}', choose frames of two bodies",
+                f"'{first}' and '{second}' are both on the body '{body}', choose frames of two "
+                f"bodies",
             )
-        return one, two
+        return first, second
 
     def check_loop(self, loop: LoopSpec) -> None:
         """Raise for a loop between frames that do not move against each other."""
-        body = self._body.get(loop.predecessor)
-        if body is not None and body == self._body.get(loop.successor):
+        body = self._body_of_link.get(loop.predecessor)
+        if body is not None and body == self._body_of_link.get(loop.successor):
             raise DescriptionError(
-                f"{loop.where}: loop '{loop.name}' joins '{loop.predecessor}' and "
+                f"{loop.source_location}: loop '{loop.name}' joins '{loop.predecessor}' and "
                 f"'{loop.successor}', both on the body '{body}': choose frames of two bodies"
             )
 
-    def moves(self, link: str) -> bool:
+    def is_movable(self, link: str) -> bool:
         """Whether a link is not fixed to the world."""
-        return not self.complete or self._body.get(link) != next(iter(self._body))
+        return not self.is_complete or self._body_of_link.get(link) != next(
+            iter(self._body_of_link)
+        )
 
-    def unlimited(self, joint: str) -> str:
+    def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""
         found = self.joints.get(joint)
         if found is None:
             return ""
-        endless = [math.isinf(end) for end in (found.limits.lower, found.limits.upper)]
-        if all(endless) and found.kind == "revolute":
+        is_infinite = [math.isinf(end) for end in (found.limits.lower, found.limits.upper)]
+        if all(is_infinite) and found.kind == "revolute":
             return "is continuous"
-        return "is not limited at both ends" if any(endless) else ""
+        return "is not limited at both ends" if any(is_infinite) else ""
 
-    def only_leaf(self) -> str | None:
+    def single_leaf_link(self) -> str | None:
         """The last link of an unbranched chain."""
-        parents = {joint.parent for joint in self._every.values()}
+        parents = {joint.parent for joint in self._all_joints.values()}
         leaves = [name for name in self.links if name not in parents]
         return leaves[0] if len(leaves) == 1 else None
 
 
-def _taken(part: Link | Joint, earlier: Link | Joint) -> DescriptionError:
+def _duplicate_name_error(part: Link | Joint, earlier: Link | Joint) -> DescriptionError:
     kind = "link" if isinstance(part, Link) else "joint"
     return DescriptionError(
-        f"{part.where}: {kind} '{part.name}' is also in {earlier.where}, rename one"
+        f"{part.source_location}: {kind} '{part.name}' is also in {earlier.source_location}, "
+        f"rename one"
     )

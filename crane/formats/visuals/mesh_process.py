@@ -1,6 +1,6 @@
 """A process that reads mesh files: whatever is in them can end this process, and nothing else.
 
-Run by crane.formats.visuals.meshes, which sends it, as JSON, {"files": paths, "triangles": how
+Run by crane.formats.visuals.mesh_files, which sends it, as JSON, {"files": paths, "triangles": how
 many they may have together}. Per file it writes a line of JSON, {"parts": [{"vertices": V,
 "faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether nothing else was opened for it}
 or {"wrong": "what"}, then the numbers of each part: V 3 float64, F 3 int64. Time and memory are
@@ -15,24 +15,27 @@ import sys
 import warnings
 from typing import Any, BinaryIO
 
-MEMORY, SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
-TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
-_FEW, _TIMES = 100_000, 10  # triangles that a file may repeat its parts to: as many, or tenfold
-_FORMATS = ("stl", "obj", "dae", "glb", "gltf", "ply", "off")
+MAX_MEMORY, MAX_SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
+MAX_TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
+_MAX_REPEATED, _MAX_REPETITION_FACTOR = (
+    100_000,
+    10,
+)  # triangles that a file may repeat its parts to: as many, or tenfold
+_MESH_FORMATS = ("stl", "obj", "dae", "glb", "gltf", "ply", "off")
 
 
 def main() -> None:
     """Read what is asked for."""
     import logging  # which whoever asks for it has no use for
 
-    out = os.fdopen(os.dup(1), "wb")
-    silence = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silence, 1)  # the output is ours alone
-    os.dup2(silence, 2)
+    output = os.fdopen(os.dup(1), "wb")
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null_device, 1)  # the output is ours alone
+    os.dup2(null_device, 2)
     warnings.simplefilter("ignore")
     logging.disable()
-    asked = json.load(sys.stdin)
-    files, left = asked["files"], asked["triangles"]
+    request = json.load(sys.stdin)
+    files, remaining = request["files"], request["triangles"]
     # what trimesh does without when it reads, and takes longer to import than most meshes to read
     for name in ("networkx", "rtree", "scipy", "shapely"):
         sys.modules[name] = None  # type: ignore[assignment]
@@ -40,43 +43,49 @@ def main() -> None:
         import trimesh  # noqa: F401  before time is counted
     except ImportError as error:
         for _ in files:
-            _send(out, {"wrong": str(error)}, [])
+            _send_answer(output, {"wrong": str(error)}, [])
         return
     for file in files:
-        _limit()
+        _limit_resources()
         try:
-            head, arrays = _read(file, left)
-            left -= sum(part["faces"] for part in head["parts"])
+            header, arrays = _read_mesh(file, remaining)
+            remaining -= sum(part["faces"] for part in header["parts"])
         except MemoryError:
-            head, arrays = {"wrong": f"reading it takes more than {MEMORY >> 30} GB"}, []
+            header, arrays = {"wrong": f"reading it takes more than {MAX_MEMORY >> 30} GB"}, []
         except Exception as error:  # whatever a reader raises for what is none of its format
-            words = " ".join(str(error).split()) or type(error).__name__
-            head, arrays = {"wrong": words[:80]}, []
-        _send(out, head, arrays)
+            message = " ".join(str(error).split()) or type(error).__name__
+            header, arrays = {"wrong": message[:80]}, []
+        _send_answer(output, header, arrays)
 
 
-def _limit() -> None:
+def _limit_resources() -> None:
     """Time for one more file, and memory, where the system can limit them."""
     try:
         import resource
     except ImportError:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-    soon = int(used.ru_utime + used.ru_stime) + SECONDS
-    resource.setrlimit(resource.RLIMIT_CPU, (soon if hard < 0 else min(soon, hard), hard))
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY if hard < 0 else min(MEMORY, hard), hard))
+    hard_limit = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    time_limit = int(used.ru_utime + used.ru_stime) + MAX_SECONDS
+    resource.setrlimit(
+        resource.RLIMIT_CPU,
+        (time_limit if hard_limit < 0 else min(time_limit, hard_limit), hard_limit),
+    )
+    hard_limit = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(
+        resource.RLIMIT_AS,
+        (MAX_MEMORY if hard_limit < 0 else min(MAX_MEMORY, hard_limit), hard_limit),
+    )
 
 
-def _send(out: BinaryIO, head: dict[str, Any], arrays: list[Any]) -> None:
-    out.write(json.dumps(head).encode() + b"\n")
+def _send_answer(output: BinaryIO, header: dict[str, Any], arrays: list[Any]) -> None:
+    output.write(json.dumps(header).encode() + b"\n")
     for array in arrays:
-        out.write(array.tobytes())
-    out.flush()
+        output.write(array.tobytes())
+    output.flush()
 
 
-def _read(file: str, most: int) -> tuple[dict[str, Any], list[Any]]:
+def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]]:
     """Triangles of a file, in the frame of its scene, if there are not too many."""
     import numpy as np
     import trimesh
@@ -91,12 +100,12 @@ def _read(file: str, most: int) -> tuple[dict[str, Any], list[Any]]:
             return super().get(name)
 
     kind = file.rpartition(".")[2].lower()
-    if kind not in _FORMATS:
-        raise ValueError(f"no mesh ends in .{kind}, known: {', '.join(_FORMATS)}")
+    if kind not in _MESH_FORMATS:
+        raise ValueError(f"no mesh ends in .{kind}, known: {', '.join(_MESH_FORMATS)}")
     # unmerged vertices keep the edges of the drawing sharp
     scene = trimesh.load_scene(file, resolver=Beside(file), process=False)
-    own = sum(len(getattr(part, "faces", ())) for part in scene.geometry.values())
-    repeated = max(_FEW, _TIMES * own)
+    unique_triangles = sum(len(getattr(part, "faces", ())) for part in scene.geometry.values())
+    max_repeated = max(_MAX_REPEATED, _MAX_REPETITION_FACTOR * unique_triangles)
     by_colour: dict[tuple[float, ...] | None, list[tuple[Any, Any]]] = {}
     count = 0
     for node in scene.graph.nodes_geometry:
@@ -105,10 +114,12 @@ def _read(file: str, most: int) -> tuple[dict[str, Any], list[Any]]:
         if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
             continue
         count += len(part.faces)
-        if count > repeated:
-            raise ValueError(f"it repeats its {own} triangles to more than {repeated}")
-        if count > most:
-            raise ValueError(f"with it there are more than {TRIANGLES} triangles to draw")
+        if count > max_repeated:
+            raise ValueError(
+                f"it repeats its {unique_triangles} triangles to more than {max_repeated}"
+            )
+        if count > max_triangles:
+            raise ValueError(f"with it there are more than {MAX_TRIANGLES} triangles to draw")
         vertices = trimesh.transform_points(np.asarray(part.vertices, np.float64), placement)
         faces = np.asarray(part.faces, np.int64)
         if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3):
@@ -117,27 +128,29 @@ def _read(file: str, most: int) -> tuple[dict[str, Any], list[Any]]:
             raise ValueError("a triangle of vertices that are not there")
         if not np.isfinite(vertices).all():
             raise ValueError("coordinates that are not finite")
-        by_colour.setdefault(_colour(part), []).append((vertices, faces))
+        by_colour.setdefault(_part_colour(part), []).append((vertices, faces))
     if not by_colour:
         raise ValueError("no triangles in it")
     parts: list[dict[str, Any]] = []
     arrays: list[Any] = []
-    for colour, pieces in by_colour.items():
-        first = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
-        vertices = np.concatenate([vertices for vertices, _ in pieces])
-        faces = np.concatenate([x + start for start, (_, x) in zip(first, pieces, strict=False)])
+    for colour, colour_parts in by_colour.items():
+        first = np.cumsum([0, *(len(vertices) for vertices, _ in colour_parts)])
+        vertices = np.concatenate([vertices for vertices, _ in colour_parts])
+        faces = np.concatenate(
+            [x + start for start, (_, x) in zip(first, colour_parts, strict=False)]
+        )
         parts.append({"vertices": len(vertices), "faces": len(faces), "colour": colour})
         arrays += [vertices, faces]
     return {"parts": parts, "alone": not Beside.asked}, arrays
 
 
-def _colour(part: Any) -> tuple[float, ...] | None:
+def _part_colour(part: Any) -> tuple[float, ...] | None:
     """Its own colour, if it has one that can be read."""
     try:
         if not part.visual.defined:
             return None
-        painted = getattr(part.visual, "material", part.visual)
-        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in painted.main_color)
+        material = getattr(part.visual, "material", part.visual)
+        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in material.main_color)
     except MemoryError:
         raise
     except Exception:  # a texture that is damaged, a colour that is none

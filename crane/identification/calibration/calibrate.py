@@ -6,52 +6,69 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, at
-from crane.common.errors import known as known_names
+from crane.common.errors import InputError, RecordingError, prefix_location
+from crane.common.errors import suggest_names as known_names
+from crane.common.progress import progress_reporter
 from crane.common.samples import Array
-from crane.common.threads import on_one_thread
-from crane.common.waiting import telling
-from crane.description.number_units import number_unit
+from crane.common.threads import with_single_threaded_blas
+from crane.description.parameter_units import parameter_unit
 from crane.description.sensors import (
-    SENSOR,
-    SIGNAL,
+    SENSOR_PREFIX,
+    VALVE_SIGNAL_PREFIX,
     Sensor,
-    named_numbers,
-    unit_of,
-    with_numbers,
+    quantity_unit,
+    sensor_parameters,
+    with_sensor_parameters,
 )
 from crane.formats import load
-from crane.formats.loading import Variants
-from crane.identification.calibration.automatic import told
-from crane.identification.calibration.candidates import candidates
-from crane.identification.calibration.ends import Found, found_by
-from crane.identification.calibration.problem import Case, Problem, case_of
-from crane.identification.calibration.result import Calibration, Channel, Fitted
-from crane.identification.calibration.search import Progress, Search
-from crane.identification.calibration.states import states
-from crane.identification.calibration.unknowns import Unknown, unknowns_of
+from crane.formats.machine_loading import MachineVariants
+from crane.identification.calibration.calibration_problem import (
+    CalibrationProblem,
+    RecordingCase,
+    recording_case,
+)
+from crane.identification.calibration.calibration_result import (
+    Calibration,
+    CalibrationChannel,
+    FittedParameter,
+)
+from crane.identification.calibration.candidate_parameters import candidate_parameters
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
+from crane.identification.calibration.parameter_selection import select_parameters
+from crane.identification.calibration.profile_likelihood import (
+    CalibrationEstimate,
+    estimate_with_profiles,
+)
+from crane.identification.calibration.simulated_states import simulated_states
+from crane.identification.calibration.unknowns import Unknown, build_unknowns
 from crane.machine import Machine
-from crane.recordings.logs import lines_of
-from crane.recordings.reading import ALWAYS, Span, known_sensors, readings, within
-from crane.recordings.recording import IDEAL, SENSORS
-from crane.recordings.timeseries import Table, heading_of
-from crane.simulation.readings import sensors_of
+from crane.recordings.logs import read_log_columns
+from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
+from crane.recordings.recording_reader import (
+    FULL_TIME_SPAN,
+    TimeSpan,
+    known_sensors,
+    read_sensor_readings,
+    select_time_span,
+)
+from crane.recordings.timeseries import Table, parse_heading
+from crane.simulation.simulated_readings import simulated_columns
 
 AUTO = "auto"  # what is fitted if nobody says what
-_COUPLED = 0.95  # correlation of two numbers of which the data know a combination alone
-_VAGUE = 0.5  # standard deviation, of a number's size, that says nothing
+_MAX_CORRELATION = 0.95  # correlation of two numbers of which the data know a combination alone
+_MAX_STD_SHARE = 0.5  # standard deviation, of a number's size, that says nothing
 
 
-@on_one_thread
+@with_single_threaded_blas
 def calibrate(
     machine: Machine | str | Path,
     recordings: Sequence[str | Path] | str | Path,
     fit: Mapping[str, object] | Sequence[str],
     *,
-    train: Span = ALWAYS,
+    train: TimeSpan = FULL_TIME_SPAN,
     validation: Sequence[str | Path] = (),
     columns: str | Path | None = None,
-    span: Span = ALWAYS,
+    span: TimeSpan = FULL_TIME_SPAN,
     sensors: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -96,7 +113,7 @@ def calibrate(
         RecordingError: A recording is malformed, or has no signals.
         SimulationError: The machine as it is cannot follow a recording.
     """
-    progress = telling(progress)
+    progress = progress_reporter(progress)
     if not isinstance(machine, Machine):
         machine = load(machine)
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
@@ -109,107 +126,129 @@ def calibrate(
             f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
             f"{span[1]:g} s, which is read"
         )
-    tables = [within(readings(path, machine, columns), span, path) for path in paths]
-    tables += [readings(path, machine, columns) for path in validation]
+    tables = [
+        select_time_span(read_sensor_readings(path, machine, columns), span, path)
+        for path in paths
+    ]
+    tables += [read_sensor_readings(path, machine, columns) for path in validation]
     cases = [
-        _case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
+        _read_case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
         for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
     ]
-    if not any(case.train.any() for case in cases):
+    if not any(case.train_mask.any() for case in cases):
         raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
-    given = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
-    auto = AUTO in given
-    if given.pop(AUTO, None) is not None:
+    requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
+    automatic = AUTO in requested
+    if requested.pop(AUTO, None) is not None:
         raise InputError(f"'{AUTO}' chooses numbers by itself, give it no start")
     for path, table in zip((*paths, *validation), tables, strict=True):
-        _check_readings(path, table, given)
-    variants = Variants(machine)
-    numbers = variants.values | named_numbers(cases[0].known)
+        _check_sensor_parameters(path, table, requested)
+    variants = MachineVariants(machine)
+    parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = {
         name: table.units[name]
         for case, table in zip(cases, tables, strict=True)
-        for name in (*case.sensors, *(SIGNAL + joint for joint in case.inputs.signals))
+        for name in (
+            *case.sensors,
+            *(VALVE_SIGNAL_PREFIX + joint for joint in case.inputs.signals),
+        )
     }
 
-    def asked(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
-        return unknowns_of(which, variants.spec, numbers, units)
+    def unknowns_for(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
+        return build_unknowns(which, variants.spec, parameters, units)
 
-    unknowns = [] if auto and not given else asked(given)
-    taken = {name for x in unknowns for name in (x.name, *dict(x.members))}
-    proposed = {x.name: x for x in candidates(machine, cases, numbers)}
+    unknowns = [] if automatic and not requested else unknowns_for(requested)
+    used_names = {name for x in unknowns for name in (x.name, *dict(x.members))}
+    proposed = {x.name: x for x in candidate_parameters(machine, cases, parameters)}
     extras = [
-        replace(x, scale=proposed[x.name].deviation, prior=1.0)
-        for x in asked({x.name: (x.start, x.low, x.high) for x in proposed.values()})
-        if not taken & {x.name, *dict(x.members)}
+        replace(x, scale=proposed[x.name].std, prior=1.0)
+        for x in unknowns_for({x.name: (x.start, x.low, x.high) for x in proposed.values()})
+        if not used_names & {x.name, *dict(x.members)}
     ]
-    problem = Problem(machine, unknowns, cases)
-    before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
-    search, left = Search(problem, progress), list[str]()
-    if auto:
-        problem, search, left = told(Problem(machine, [*unknowns, *extras], cases), progress)
-    end = found_by(search, len(problem.unknowns))
-    found = replace(_result(problem, search, end, before, units), left=tuple(left))
-    if not auto:
-        here = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
-        found = replace(found, lacking=tuple(search.lacking(here, end.z)))
-    known = dict(machine.sensors) | dict(cases[0].known)
-    return replace(found, machine=_sensing(found.machine, known, columns, found.changes))
+    problem = CalibrationProblem(machine, unknowns, cases)
+    initial_residuals = [
+        problem.residuals(case, np.zeros(problem.unknown_count)) for case in problem.cases
+    ]
+    search, excluded = LevenbergMarquardt(problem, progress), list[str]()
+    if automatic:
+        problem, search, excluded = select_parameters(
+            CalibrationProblem(machine, [*unknowns, *extras], cases), progress
+        )
+    estimate = estimate_with_profiles(search, len(problem.unknowns))
+    calibration = replace(
+        _calibration_result(problem, search, estimate, initial_residuals, units),
+        unobserved_parameters=tuple(excluded),
+    )
+    if not automatic:
+        applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
+        calibration = replace(
+            calibration, score_tests=tuple(search.score_test(applicable_extras, estimate.z))
+        )
+    known = dict(machine.sensors) | dict(cases[0].known_sensors)
+    return replace(
+        calibration,
+        machine=_machine_with_sensors(calibration.machine, known, columns, calibration.changes),
+    )
 
 
-def _check_readings(path: str | Path, table: Table, fit: Iterable[str]) -> None:
+def _check_sensor_parameters(path: str | Path, table: Table, fit: Iterable[str]) -> None:
     """See that numbers of sensors are fitted to what they read."""
     for name in fit:
-        if name.startswith(SENSOR) and table.notes.get(SENSORS) == IDEAL:
+        if name.startswith(SENSOR_PREFIX) and table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
             raise InputError(
-                f"{path}: '{name}' cannot be fitted to quantities, which its note '{SENSORS}: "
-                f"{IDEAL}' says they are: give the readings, or remove the note if they are"
+                f"{path}: '{name}' cannot be fitted to quantities, which its note "
+                f"'{SENSORS_NOTE}: "
+                f"{IDEAL_SENSORS}' says they are: give the readings, or remove the note if they "
+                f"are"
             )
 
 
-def _sensing(
-    fitted: Machine,
+def _machine_with_sensors(
+    machine: Machine,
     known: Mapping[str, Sensor],
     columns: str | Path | None,
     changes: Mapping[str, float],
 ) -> Machine:
     """The fitted machine with all that is known of its sensors, and of their columns in logs."""
     sensors = dict(known)
-    for line in lines_of(Path(columns))[1] if columns is not None else ():
-        name, unit = heading_of(line.heading)
-        if unit_of(fitted.tree, name) is not None:
-            known_as = sensors.get(name, Sensor())
-            sensors[name] = replace(known_as, column=line.expression, unit=unit)
-    own = {name: value for name, value in changes.items() if name.startswith(SENSOR)}
-    return fitted.replace(sensors=with_numbers(sensors, own))
+    for line in read_log_columns(Path(columns))[1] if columns is not None else ():
+        name, unit = parse_heading(line.heading)
+        if quantity_unit(machine.tree, name) is not None:
+            known_sensor = sensors.get(name, Sensor())
+            sensors[name] = replace(known_sensor, column=line.expression, unit=unit)
+    sensor_changes = {
+        name: value for name, value in changes.items() if name.startswith(SENSOR_PREFIX)
+    }
+    return machine.replace(sensors=with_sensor_parameters(sensors, sensor_changes))
 
 
-def _case(
+def _read_case(
     machine: Machine,
     path: str | Path,
     table: Table,
     sensors: Sequence[str] | None,
     window: tuple[float, float],
-) -> Case:
+) -> RecordingCase:
     try:
-        found = sensors_of(machine, table)
+        compared = simulated_columns(machine, table)
         for name in sensors or ():
-            if name not in found:
-                raise InputError(f"'{name}' cannot be compared, {known_names(found, name)}")
-        found = found if sensors is None else list(sensors)
+            if name not in compared:
+                raise InputError(f"'{name}' cannot be compared, {known_names(compared, name)}")
+        compared = compared if sensors is None else list(sensors)
         known = known_sensors(table, machine)
-        return case_of(machine, Path(path).name, table, known, found, window)
+        return recording_case(machine, Path(path).name, table, known, compared, window)
     except RecordingError as error:
-        raise RecordingError(at(str(path), error)) from None
+        raise RecordingError(prefix_location(str(path), error)) from None
 
 
-def _result(
-    problem: Problem,
-    search: Search,
-    end: Found,
-    before: list[Array],
+def _calibration_result(
+    problem: CalibrationProblem,
+    search: LevenbergMarquardt,
+    estimate: CalibrationEstimate,
+    initial_residuals: list[Array],
     units: Mapping[str, str],
 ) -> Calibration:
-    unknowns, z, covariance = problem.unknowns, end.z, end.covariance
+    unknowns, z, covariance = problem.unknowns, estimate.z, estimate.covariance
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = problem.values(z)
     fitted = []
@@ -217,35 +256,58 @@ def _result(
         value, scale = values[unknown.name], unknown.scale
         bound = z[i] <= search.low[i] + 1e-9 or z[i] >= search.high[i] - 1e-9
         size = max(abs(value), abs(unknown.start)) if not unknown.sensor else np.inf
-        fitted.append(Fitted(
-            unknown.name, unknown.start, value, float(end.widths[i]) * scale, bool(bound),
-            bool(not bound and deviations[i] * scale > _VAGUE * size),
-            number_unit(problem.machine.tree, unknown.name), unknown.members, end.ends[i],
-        ))  # fmt: skip
-    after = [problem.residuals(case, z) for case in problem.cases]
-    seen = [
-        Channel(case.name, name, units[name], case.clock, case.train, case.measured[:, k],
-               old[:, k] + case.measured[:, k], new[:, k] + case.measured[:, k])
-        for case, old, new in zip(problem.cases, before, after, strict=True)
+        fitted.append(
+            FittedParameter(
+                unknown.name,
+                unknown.start,
+                value,
+                float(estimate.interval_half_widths[i]) * scale,
+                bool(bound),
+                bool(not bound and deviations[i] * scale > _MAX_STD_SHARE * size),
+                parameter_unit(problem.machine.tree, unknown.name),
+                unknown.members,
+                estimate.profile_ends[i],
+            )
+        )
+    final_residuals = [problem.residuals(case, z) for case in problem.cases]
+    channels = [
+        CalibrationChannel(
+            case.name,
+            name,
+            units[name],
+            case.file_time,
+            case.train_mask,
+            case.measured[:, k],
+            old[:, k] + case.measured[:, k],
+            new[:, k] + case.measured[:, k],
+        )
+        for case, old, new in zip(problem.cases, initial_residuals, final_residuals, strict=True)
         for k, name in enumerate(case.sensors)
-    ]  # fmt: skip
+    ]
     return Calibration(
-        problem.fitted(z), tuple(fitted), tuple(seen), problem.changes(z),
-        tuple(_coupled(unknowns, covariance)), problem.runs,
-        correlation=_correlation(covariance, len(unknowns)), states=states(problem, z),
-        lowest=end.lowest,
-    )  # fmt: skip
+        problem.fitted_machine(z),
+        tuple(fitted),
+        tuple(channels),
+        problem.changes(z),
+        tuple(_correlated_pairs(unknowns, covariance)),
+        problem.simulation_count,
+        correlation=_correlation_matrix(covariance, len(unknowns)),
+        states=simulated_states(problem, z),
+        is_lowest_minimum=estimate.is_lowest_minimum,
+    )
 
 
-def _correlation(covariance: Array, count: int) -> Array:
+def _correlation_matrix(covariance: Array, count: int) -> Array:
     """(n, n) of the first n, 0 of what is known exactly."""
     deviations = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0))
-    ones = np.where(deviations > 0, deviations, np.inf)
-    found: Array = covariance[:count, :count] / np.outer(ones, ones)
-    return found
+    divisors = np.where(deviations > 0, deviations, np.inf)
+    correlation: Array = covariance[:count, :count] / np.outer(divisors, divisors)
+    return correlation
 
 
-def _coupled(unknowns: Sequence[Unknown], covariance: Array) -> list[tuple[str, str, float]]:
+def _correlated_pairs(
+    unknowns: Sequence[Unknown], covariance: Array
+) -> list[tuple[str, str, float]]:
     """Pairs of numbers that the data tell apart badly, with their correlation."""
     count = len(unknowns)
     deviations = np.sqrt(np.diag(covariance))[:count]
@@ -253,7 +315,7 @@ def _coupled(unknowns: Sequence[Unknown], covariance: Array) -> list[tuple[str, 
     for i in range(count):
         for j in range(i):
             if deviations[i] and deviations[j]:
-                share = float(covariance[i, j] / (deviations[i] * deviations[j]))
-                if abs(share) > _COUPLED:
-                    found.append((unknowns[j].name, unknowns[i].name, share))
+                correlation = float(covariance[i, j] / (deviations[i] * deviations[j]))
+                if abs(correlation) > _MAX_CORRELATION:
+                    found.append((unknowns[j].name, unknowns[i].name, correlation))
     return sorted(found, key=lambda pair: -abs(pair[2]))

@@ -4,13 +4,13 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from crane.common.errors import InputError, known
-from crane.description.changes import unknown_parameter
-from crane.description.sensors import SENSOR
-from crane.description.spec import MachineSpec
+from crane.common.errors import InputError, suggest_names
+from crane.description.parameter_changes import unknown_parameter_text
+from crane.description.sensors import SENSOR_PREFIX
+from crane.description.specification import MachineSpec
 
-FITTED = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
-_SIZES = {
+SENSOR_PARAMETER_DEFAULTS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
+_ZERO_SCALES = {
     "rad": 0.02,
     "m": 5e-3,
     "rad/s": 0.02,
@@ -18,10 +18,12 @@ _SIZES = {
     "Pa": 1e5,
     "V": 0.05,
 }  # of zeros that sensors have
-_DELAY = 0.02  # [s]
-_LEAST = 1e-3  # share of a number's start below which it does not go, where it must be positive
+_DELAY_SCALE = 0.02  # [s]
+_MIN_SHARE = (
+    1e-3  # share of a number's start below which it does not go, where it must be positive
+)
 # Words that numbers end with which may have either sign.
-_SIGNED = (
+_SIGNED_PARAMETERS = (
     "x", "y", "z", "roll", "pitch", "yaw", "xx", "xy", "xz", "yy", "yz", "zz", "neutral", "full",
     "lower", "upper", "coulomb_offset", "viscous_offset",
 )  # fmt: skip
@@ -60,85 +62,93 @@ class Unknown:
         return {name: value for name, _ in self.members}
 
     @property
-    def what(self) -> str:
+    def sensor_parameter(self) -> str:
         """Of a sensor: zero, scale or delay."""
         return self.name.rpartition(".")[2] if self.sensor else ""
 
 
-def unknowns_of(
+def build_unknowns(
     fit: Mapping[str, object] | Sequence[str],
     spec: MachineSpec,
-    numbers: Mapping[str, float],
-    sensors: Mapping[str, str],
+    parameters: Mapping[str, float],
+    sensor_units: Mapping[str, str],
 ) -> list[Unknown]:
     """What is to be fitted.
 
     Args:
         fit: By name None, a start, or (start, low, high); None of these where not known. Or names.
         spec: The machine's description.
-        numbers: Of the machine and its sensors by name, see `parameters`.
-        sensors: Units by column.
+        parameters: Of the machine and its sensors by name, see `parameters`.
+        sensor_units: Units by column.
 
     Raises:
         InputError: An unknown name, bounds that hold no value, or a number of which nothing tells
             how large it may be.
     """
-    given = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
-    if not given:
+    requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
+    if not requested:
         raise InputError("nothing is to be fitted, name numbers such as 'payload.mass'")
-    return [_unknown(name, value, spec, numbers, sensors) for name, value in given.items()]
+    return [
+        _build_unknown(name, value, spec, parameters, sensor_units)
+        for name, value in requested.items()
+    ]
 
 
-def _unknown(
+def _build_unknown(
     name: str,
     given: object,
     spec: MachineSpec,
-    numbers: Mapping[str, float],
-    sensors: Mapping[str, str],
+    parameters: Mapping[str, float],
+    sensor_units: Mapping[str, str],
 ) -> Unknown:
-    start, low, high = _bounds(name, given)
-    if name.startswith(SENSOR):
-        column, _, what = name.removeprefix(SENSOR).rpartition(".")
-        if column not in sensors:
-            raise InputError(f"'{name}' is of no sensor, {known(sensors, column)}")
-        if what not in FITTED:
-            raise InputError(f"'{name}': a sensor has no '{what}', {known(FITTED, what)}")
-        usual = numbers.get(name, FITTED[what])
-        size = _DELAY if what == "delay" else _SIZES.get(sensors[column], 1.0)
+    start, low, high = _read_bounds(name, given)
+    if name.startswith(SENSOR_PREFIX):
+        column, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
+        if column not in sensor_units:
+            raise InputError(f"'{name}' is of no sensor, {suggest_names(sensor_units, column)}")
+        if what not in SENSOR_PARAMETER_DEFAULTS:
+            raise InputError(
+                f"'{name}': a sensor has no '{what}', "
+                f"{suggest_names(SENSOR_PARAMETER_DEFAULTS, what)}"
+            )
+        described = parameters.get(name, SENSOR_PARAMETER_DEFAULTS[what])
+        size = _DELAY_SCALE if what == "delay" else _ZERO_SCALES.get(sensor_units[column], 1.0)
         size = 0.05 if what == "scale" else size
-        begin = usual if start is None else start
-        least = (0.0 if what == "delay" else -float("inf")) if low is None else low
-        return _made(name, begin, least, high, size, ((name, usual),), column)
+        initial = described if start is None else start
+        lower = (0.0 if what == "delay" else -float("inf")) if low is None else low
+        return _bounded_unknown(name, initial, lower, high, size, ((name, described),), column)
     if "*" in name:
-        found = {x: numbers[x] for x in fnmatch.filter(numbers, name) if numbers[x]}
+        found = {x: parameters[x] for x in fnmatch.filter(parameters, name) if parameters[x]}
         if not found:
             raise InputError(f"'{name}' matches no number of the machine that is not 0")
-        begin = 1.0 if start is None else start
-        least = _LEAST if low is None else low
-        return _made(name, begin, least, high, 1.0, tuple(found.items()))
-    if name not in numbers:
-        raise InputError(unknown_parameter(spec, numbers, name))
-    begin = numbers[name] if start is None else start
+        initial = 1.0 if start is None else start
+        lower = _MIN_SHARE if low is None else low
+        return _bounded_unknown(name, initial, lower, high, 1.0, tuple(found.items()))
+    if name not in parameters:
+        raise InputError(unknown_parameter_text(spec, parameters, name))
+    initial = parameters[name] if start is None else start
     if name.endswith(".delay"):
-        least = 0.0 if low is None else low
-        return _made(name, begin, least, high, _DELAY, ((name, numbers[name]),))
-    signed = name.endswith(tuple("." + word for word in _SIGNED))
-    if not signed and begin >= 0:
-        low = _LEAST * begin if low is None else low
+        lower = 0.0 if low is None else low
+        return _bounded_unknown(
+            name, initial, lower, high, _DELAY_SCALE, ((name, parameters[name]),)
+        )
+    signed = name.endswith(tuple("." + word for word in _SIGNED_PARAMETERS))
+    if not signed and initial >= 0:
+        low = _MIN_SHARE * initial if low is None else low
     elif not signed:
-        high = _LEAST * begin if high is None else high
-    if begin:
-        size = abs(begin)
+        high = _MIN_SHARE * initial if high is None else high
+    if initial:
+        size = abs(initial)
     elif low is not None and high is not None:
         size = high - low
     else:
         raise InputError(f"'{name}' is 0 at first, say how large it may be: '{name}=0,LOW~HIGH'")
     if name.endswith((".x", ".y", ".z")):
         size = min(size, 0.1)
-    return _made(name, begin, low, high, size, ((name, numbers[name]),))
+    return _bounded_unknown(name, initial, low, high, size, ((name, parameters[name]),))
 
 
-def _bounds(name: str, given: object) -> tuple[float | None, float | None, float | None]:
+def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, float | None]:
     if given is None:
         return None, None, None
     if isinstance(given, int | float):
@@ -149,7 +159,7 @@ def _bounds(name: str, given: object) -> tuple[float | None, float | None, float
     return start, low, high
 
 
-def _made(
+def _bounded_unknown(
     name: str,
     start: float,
     low: float | None,
@@ -158,8 +168,8 @@ def _made(
     members: tuple[tuple[str, float], ...] = (),
     sensor: str = "",
 ) -> Unknown:
-    least = -float("inf") if low is None else float(low)
-    most = float("inf") if high is None else float(high)
-    if not least < most or not least <= start <= most:
-        raise InputError(f"'{name}': {start:g} does not lie within {least:g} to {most:g}")
-    return Unknown(name, float(start), least, most, scale, members, sensor)
+    lower = -float("inf") if low is None else float(low)
+    upper = float("inf") if high is None else float(high)
+    if not lower < upper or not lower <= start <= upper:
+        raise InputError(f"'{name}': {start:g} does not lie within {lower:g} to {upper:g}")
+    return Unknown(name, float(start), lower, upper, scale, members, sensor)

@@ -11,25 +11,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.common.shown import Brief
 from crane.identification.estimation.jackknife import Jackknife
-from crane.identification.estimation.noise import Noise, between
-from crane.identification.estimation.regressor import Regressor, Stored, factors, triangular
+from crane.identification.estimation.noise_model import NoiseModel, innovation_covariance
+from crane.identification.estimation.regressor import (
+    Regressor,
+    StoredRegressor,
+    triangular_factor,
+    triangular_factors,
+)
 
 Prior = tuple[Array, Array]
 """Means (p,) and standard deviations (p,) of the parameters; infinite where nothing is known."""
 
-_TURN = 1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
-_MAD = 1.482602218505602  # standard deviation over median absolute deviation of normal noise
-_CONVERGED = 1e-6  # standard deviations
-_ROUNDING = 1e-8  # of the forces, what base parameters leave out as nothing new
-_ROUNDS = 100
-_WAITING = 4096  # instants without rows that are passed at once
+_HUBER_THRESHOLD = (
+    1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
+)
+_MAD_TO_STD = (
+    1.482602218505602  # standard deviation over median absolute deviation of normal noise
+)
+_CONVERGENCE_TOLERANCE = 1e-6  # standard deviations
+_ROUNDING_SHARE = 1e-8  # of the forces, what base parameters leave out as nothing new
+_MAX_ITERATIONS = 100
+_GAP_BLOCK = 4096  # instants without rows that are passed at once
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Estimate(Brief):
+class Estimate(OneLineRepr):
     """Estimated parameters.
 
     Attributes:
@@ -37,9 +46,9 @@ class Estimate(Brief):
         covariance: (p, p), with the correlations of the noise.
         residuals: y - W values (m,).
         noise: Standard deviation of the noise of each group (g,).
-        effective: Number of independent rows that tell the mean of a group's noise as well as
-            its N correlated rows, N variance / spectral density at zero (g,).
-        freedom: Degrees of freedom behind the standard deviations, see `Jackknife`.
+        effective_samples: Number of independent rows that tell the mean of a group's noise as well
+            as its N correlated rows, N variance / spectral density at zero (g,).
+        degrees_of_freedom: Degrees of freedom behind the standard deviations, see `Jackknife`.
         condition: Condition number of W.
         scaled_condition: The same with columns of length one.
     """
@@ -48,8 +57,8 @@ class Estimate(Brief):
     covariance: Array
     residuals: Array
     noise: Array
-    effective: Array
-    freedom: float
+    effective_samples: Array
+    degrees_of_freedom: float
     condition: float
     scaled_condition: float
 
@@ -61,11 +70,11 @@ class Estimate(Brief):
     def interval(self, level: float = 0.95) -> Array:
         """Lower and upper ends (p, 2) of what covers the truth with this probability.
 
-        values -+ t std with Student's t for `freedom`.
+        values -+ t std with Student's t for `degrees_of_freedom`.
         """
         from scipy.stats import t
 
-        half = t.ppf(0.5 + 0.5 * level, self.freedom) * self.std
+        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
         return np.column_stack([self.values - half, self.values + half])
 
 
@@ -90,11 +99,11 @@ def least_squares(
     Raises:
         InputError: Shapes, too few rows, or columns that depend on each other.
     """
-    rows = _Rows(W, None, y, groups, samples, prior)
-    return rows.estimate(rows.common)
+    rows = _RegressionProblem(W, None, y, groups, samples, prior)
+    return rows.estimate(rows.common_noise)
 
 
-def weighted(
+def weighted_least_squares(
     W: Array | Regressor,
     y: Array,
     groups: np.ndarray,
@@ -105,8 +114,8 @@ def weighted(
 
     Arguments and errors as for `least_squares`.
     """
-    rows = _Rows(W, None, y, groups, samples, prior)
-    return rows.estimate(rows.scales)
+    rows = _RegressionProblem(W, None, y, groups, samples, prior)
+    return rows.estimate(rows.group_noise)
 
 
 def huber(
@@ -125,10 +134,10 @@ def huber(
 
     Arguments and errors as for `least_squares`.
     """
-    return _Rows(W, None, y, groups, samples, prior).robust()
+    return _RegressionProblem(W, None, y, groups, samples, prior).huber_estimate()
 
 
-def instrumental(
+def instrumental_variables(
     W: Array,
     y: Array,
     Z: Array,
@@ -145,18 +154,18 @@ def instrumental(
 
     Source: Janot, Vandanjon, Gautier 2014, IEEE Trans. Control Systems Technology 22(1).
     """
-    rows = _Rows(W, Z, y, groups, samples, prior)
-    return rows.estimate(rows.scales)
+    rows = _RegressionProblem(W, Z, y, groups, samples, prior)
+    return rows.estimate(rows.group_noise)
 
 
-def judged(
+def estimate_from_minimum(
     W: Array | Regressor,
     y: Array,
     groups: np.ndarray,
     samples: np.ndarray | None,
     values: Array,
     noise: Array,
-    pull: Array,
+    prior_root: Array,
 ) -> Estimate:
     """How well parameters are known that are the minimum of something else than least squares.
 
@@ -167,16 +176,16 @@ def judged(
         samples: Number of the instant of each row (m,).
         values: Minimum (p,) of |(y - W theta) / noise|^2 + c(theta).
         noise: Of each group (g,).
-        pull: L (k, p), L^T L half of the second derivative of c there.
+        prior_root: L (k, p), L^T L half of the second derivative of c there.
 
     Returns:
-        Theirs, with the covariance of `weighted` for a prior whose rows are L.
+        Theirs, with the covariance of `weighted_least_squares` for a prior whose rows are L.
     """
-    rows = _Rows(W, None, y, groups, samples, None, pull)
-    return rows.judge(values, rows.residuals(values), noise, math.inf)
+    rows = _RegressionProblem(W, None, y, groups, samples, None, prior_root)
+    return rows.evaluate_estimate(values, rows.residuals(values), noise, math.inf)
 
 
-def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
+def essential_parameters(estimate: Estimate, level: float = 0.05) -> np.ndarray:
     """Parameters without which the model would be significantly worse.
 
     The one with the largest relative standard deviation is set to zero, the others follow by
@@ -204,7 +213,7 @@ def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
         theta = estimate.values[trial]
         C = estimate.covariance[np.ix_(trial, trial)]
         F = theta @ np.linalg.solve(C, theta) / len(trial)
-        if f.sf(F, len(trial), estimate.freedom) < level:
+        if f.sf(F, len(trial), estimate.degrees_of_freedom) < level:
             break
         gain = covariance[:, worst] / covariance[worst, worst]
         rest = np.arange(len(kept)) != worst
@@ -214,7 +223,7 @@ def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
     return np.array(kept)
 
 
-class _Rows:
+class _RegressionProblem:
     """Equations and how to solve them: one engine for all estimators.
 
     With weights D = diag(1 / s^2) and prior rows L, such as diag(1 / std), appended to W, Z and
@@ -231,7 +240,7 @@ class _Rows:
         groups: np.ndarray | None,
         samples: np.ndarray | None,
         prior: Prior | None,
-        pull: Array | None = None,
+        prior_root: Array | None = None,
     ):
         count, size = np.shape(W) if isinstance(W, np.ndarray) else W.shape
         groups = np.zeros(count, int) if groups is None else np.asarray(groups)
@@ -249,39 +258,42 @@ class _Rows:
                 W, y = W[self._order], y[self._order]
                 groups, samples = groups[self._order], samples[self._order]
                 Z = None if Z is None else Z[self._order]
-            W = Stored(W, samples)
+            W = StoredRegressor(W, samples)
         self.W, self.y, self.samples = W, y, samples
-        self.Z = W if Z is None else Stored(Z, samples)
-        self.members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
+        self.Z = W if Z is None else StoredRegressor(Z, samples)
+        self.group_rows = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
         self.groups = groups
-        for g, rows in enumerate(self.members):
+        for g, rows in enumerate(self.group_rows):
             if len(rows) < 2:
                 raise InputError(f"group {g} has {len(rows)} row, give two at least")
             if (np.diff(samples[rows]) <= 0).any():
                 raise InputError(f"samples of group {g} do not increase, sort its rows by time")
         self.mean = np.zeros(size)
-        self.pull = np.zeros((0, size)) if pull is None else pull
+        self.prior_root = np.zeros((0, size)) if prior_root is None else prior_root
         if prior is not None:
-            mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
-            if mean.shape != (size,) or std.shape != (size,):
+            prior_mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
+            if prior_mean.shape != (size,) or std.shape != (size,):
                 raise InputError(
-                    f"the prior has means of the shape {mean.shape} and deviations of the shape "
+                    f"the prior has means of the shape {prior_mean.shape} and deviations of the "
+                    f"shape "
                     f"{std.shape}, give ({size},) each, one per column of the regressor"
                 )
             if not (std > 0).all():
                 raise InputError(f"the prior has the deviation {std.min():g}, give one above 0")
-            self.mean, self.pull = mean, np.diag(1 / std)
-        if count + np.count_nonzero(self.pull) <= size:
+            self.mean, self.prior_root = prior_mean, np.diag(1 / std)
+        if count + np.count_nonzero(self.prior_root) <= size:
             raise InputError(f"{count} rows for {size} parameters are too few, record longer")
         self.plain = (
-            W.factors(y, groups) if Z is None else factors(W, y, groups, Z=self.Z)
+            W.triangular_factors(y, groups)
+            if Z is None
+            else triangular_factors(W, y, groups, Z=self.Z)
         )  # of unweighted rows (g, k, k)
         if not np.isfinite(self.plain).all():
-            self._refuse_not_finite()
+            self._raise_not_finite()
         # of what counts as noise, so that equations that hold to rounding settle
-        self.smallest = _ROUNDING * max(_rms(y), np.finfo(float).tiny)
+        self.min_noise = _ROUNDING_SHARE * max(_rms(y), np.finfo(float).tiny)
 
-    def _refuse_not_finite(self) -> None:
+    def _raise_not_finite(self) -> None:
         order = np.arange(len(self.y)) if self._order is None else self._order
         for name, matrix in (("regressor", self.W), ("instruments", self.Z)):
             bad = [order[rows][~np.isfinite(W).all(axis=1)] for rows, W in matrix.blocks()]
@@ -290,27 +302,27 @@ class _Rows:
         at = order[~np.isfinite(self.y)]
         raise InputError(f"forces not finite in row {at.min()}, leave such rows out")
 
-    def common(self, theta: Array) -> Array:
+    def common_noise(self, theta: Array) -> Array:
         """One standard deviation for all rows, at each group (g,)."""
-        left = np.linalg.norm(self._left(theta)) / math.sqrt(len(self.y))
-        return np.full(len(self.members), max(float(left), self.smallest))
+        residual_rms = np.linalg.norm(self._residual_norms(theta)) / math.sqrt(len(self.y))
+        return np.full(len(self.group_rows), max(float(residual_rms), self.min_noise))
 
-    def scales(self, theta: Array) -> Array:
+    def group_noise(self, theta: Array) -> Array:
         """Standard deviation of each group (g,)."""
-        counts = np.array([len(rows) for rows in self.members])
-        return np.maximum(self._left(theta) / np.sqrt(counts), self.smallest)
+        counts = np.array([len(rows) for rows in self.group_rows])
+        return np.maximum(self._residual_norms(theta) / np.sqrt(counts), self.min_noise)
 
-    def _left(self, theta: Array) -> Array:
+    def _residual_norms(self, theta: Array) -> Array:
         """|y - W theta| of each group (g,), from the triangular factors."""
         size = len(self.mean)
         return np.linalg.norm(
             self.plain[:, :, -1] - self.plain[:, :, -1 - size : -1] @ theta, axis=1
         )
 
-    def _robust_scales(self, e: Array) -> Array:
+    def _robust_group_noise(self, e: Array) -> Array:
         """The same from medians of residuals (m,)."""
-        found = [_MAD * float(np.median(np.abs(e[rows]))) for rows in self.members]
-        return np.maximum(found, self.smallest)
+        found = [_MAD_TO_STD * float(np.median(np.abs(e[rows]))) for rows in self.group_rows]
+        return np.maximum(found, self.min_noise)
 
     def residuals(self, theta: Array) -> Array:
         """Residuals y - W theta (m,)."""
@@ -319,45 +331,49 @@ class _Rows:
             e[rows] -= W @ theta
         return e
 
-    def estimate(self, scales) -> Estimate:  # type: ignore[no-untyped-def]
+    def estimate(self, noise_function) -> Estimate:  # type: ignore[no-untyped-def]
         """Solve with the scales of the groups that the residuals ask for, until both agree."""
-        theta, s = np.zeros(len(self.mean)), scales(np.zeros(len(self.mean)))
-        for round_ in range(_ROUNDS):
+        theta, s = np.zeros(len(self.mean)), noise_function(np.zeros(len(self.mean)))
+        for round_ in range(_MAX_ITERATIONS):
             before = theta
             theta, _, A = self._solve(self.plain, s)
-            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
+            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
                 break
-            s = scales(theta)
-        return self.judge(theta, self.residuals(theta), s, math.inf)
+            s = noise_function(theta)
+        return self.evaluate_estimate(theta, self.residuals(theta), s, math.inf)
 
-    def robust(self) -> Estimate:
+    def huber_estimate(self) -> Estimate:
         """The same with rows of large residuals counting less, see `huber`."""
         e, R = self.y, self.plain
-        s, theta = self._robust_scales(e), np.zeros(len(self.mean))
-        for round_ in range(_ROUNDS):
+        s, theta = self._robust_group_noise(e), np.zeros(len(self.mean))
+        for round_ in range(_MAX_ITERATIONS):
             before = theta
             theta, _, A = self._solve(R, s)
             e = self.residuals(theta)
-            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
+            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
                 break
-            s = self._robust_scales(e)
-            clip = _TURN * s[self.groups]
-            shares = np.minimum(1, clip / np.maximum(np.abs(e), self.smallest))
-            R = factors(self.W, self.y, self.groups, np.sqrt(shares))
-        return self.judge(theta, e, s, _TURN)
+            s = self._robust_group_noise(e)
+            clip = _HUBER_THRESHOLD * s[self.groups]
+            shares = np.minimum(1, clip / np.maximum(np.abs(e), self.min_noise))
+            R = triangular_factors(self.W, self.y, self.groups, np.sqrt(shares))
+        return self.evaluate_estimate(theta, e, s, _HUBER_THRESHOLD)
 
-    def _solve(self, plain: Array, s: Array) -> tuple[Array, Array, Array]:
+    def _solve(self, group_factors: Array, s: Array) -> tuple[Array, Array, Array]:
         """theta, R (p, p) of the weighted instruments with the prior's rows, and Q^T W.
 
         Args:
-            plain: Triangular factors of [W y], or of [Z W y], of the groups (g, k, k).
+            group_factors: Triangular factors of [W y], or of [Z W y], of the groups (g, k, k).
             s: Standard deviations of the groups (g,).
         """
         size = len(self.mean)
-        copies = [self.pull] * ((plain.shape[2] - 1) // size)
-        prior = np.column_stack([*copies, self.pull @ self.mean])
-        whole = triangular(np.vstack([*(plain / s[:, None, None]), prior]))
-        R, A, right = whole[:size, :size], whole[:size, -1 - size : -1], whole[:size, -1]
+        copies = [self.prior_root] * ((group_factors.shape[2] - 1) // size)
+        prior = np.column_stack([*copies, self.prior_root @ self.mean])
+        stacked_factor = triangular_factor(np.vstack([*(group_factors / s[:, None, None]), prior]))
+        R, A, right_side = (
+            stacked_factor[:size, :size],
+            stacked_factor[:size, -1 - size : -1],
+            stacked_factor[:size, -1],
+        )
         length = np.linalg.norm(R, axis=0)
         length[length == 0] = 1.0
         values = np.linalg.svd(A / length, compute_uv=False)
@@ -367,9 +383,9 @@ class _Rows:
                 f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
                 "with finite deviations of those that do"
             )
-        return np.asarray(np.linalg.solve(A, right), dtype=np.float64), R, A
+        return np.asarray(np.linalg.solve(A, right_side), dtype=np.float64), R, A
 
-    def judge(self, theta: Array, e: Array, s: Array, turn: float) -> Estimate:
+    def evaluate_estimate(self, theta: Array, e: Array, s: Array, threshold: float) -> Estimate:
         """Covariance of theta: A^-1 (sum of Q^T noise) A^-T with the noise's correlations.
 
         The noise of joint i is modelled as autoregressive, a_i(z) e_i = u_i, with covariances
@@ -384,52 +400,58 @@ class _Rows:
         with which alone the estimate moves, Q of all. Residuals smaller than what rounding and
         the choice of base parameters make of the rows count as that.
         """
-        every = s[self.groups]
-        clipped = np.clip(e, -turn * every, turn * every)
-        counted = np.abs(e) <= turn * every
+        row_noise = s[self.groups]
+        clipped = np.clip(e, -threshold * row_noise, threshold * row_noise)
+        unclipped = np.abs(e) <= threshold * row_noise
         count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
-        noise = inflated * np.array([_rms(clipped[rows]) for rows in self.members])
-        for of_group in self.members:
-            if 0 < (left := _rms(clipped[of_group])) < self.smallest:
-                clipped[of_group] *= self.smallest / left
-        clipped /= every
-        del every
-        noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
-        rows = self.plain if counted.all() else factors(self.W, self.y, self.groups, counted)
-        _, R, A = self._solve(rows, s)
-        left_out = Jackknife(self.samples, noises, len(theta))
-        middle = self._coloured(R, s, noises, left_out, clipped, counted)
-        del clipped, counted
-        prior = np.linalg.solve(R.T, self.pull.T)
-        inverse = np.linalg.inv(A)
-        covariance, moved = (
-            inverse @ (x + prior @ prior.T) @ inverse.T
-            for x in (0.5 * (middle + middle.T), left_out.covariance())
+        noise = inflated * np.array([_rms(clipped[rows]) for rows in self.group_rows])
+        for group_indices in self.group_rows:
+            if 0 < (group_rms := _rms(clipped[group_indices])) < self.min_noise:
+                clipped[group_indices] *= self.min_noise / group_rms
+        clipped /= row_noise
+        del row_noise
+        noises = [NoiseModel.fit(clipped[rows], self.samples[rows]) for rows in self.group_rows]
+        rows = (
+            self.plain
+            if unclipped.all()
+            else triangular_factors(self.W, self.y, self.groups, unclipped)
         )
-        larger = np.sqrt(np.maximum(np.diag(moved) / np.diag(covariance), 1.0))
-        plain, scaled = conditions(np.vstack(list(self.plain[:, :, -1 - len(theta) : -1])))
+        _, R, A = self._solve(rows, s)
+        jackknife = Jackknife(self.samples, noises, len(theta))
+        middle = self._noise_covariance_product(R, s, noises, jackknife, clipped, unclipped)
+        del clipped, unclipped
+        prior = np.linalg.solve(R.T, self.prior_root.T)
+        inverse = np.linalg.inv(A)
+        covariance, jackknife_covariance = (
+            inverse @ (x + prior @ prior.T) @ inverse.T
+            for x in (0.5 * (middle + middle.T), jackknife.covariance())
+        )
+        inflation = np.sqrt(np.maximum(np.diag(jackknife_covariance) / np.diag(covariance), 1.0))
+        unweighted_factors, scaled = condition_numbers(
+            np.vstack(list(self.plain[:, :, -1 - len(theta) : -1]))
+        )
         if self._order is not None:
             e, ordered = np.empty(count), e
             e[self._order] = ordered
         return Estimate(
             values=theta,
-            covariance=covariance * np.outer(larger, larger),
+            covariance=covariance * np.outer(inflation, inflation),
             residuals=e,
             noise=noise,
-            effective=np.array([noise.effective for noise in noises]),
-            freedom=left_out.freedom,
-            condition=plain,
+            effective_samples=np.array([noise.effective_samples for noise in noises]),
+            degrees_of_freedom=jackknife.degrees_of_freedom,
+            condition=unweighted_factors,
             scaled_condition=scaled,
         )
 
-    def _coloured(
+    def _noise_covariance_product(
         self,
         R: Array,
         s: Array,
-        noises: list[Noise],
-        left_out: Jackknife,
+        noises: list[NoiseModel],
+        jackknife: Jackknife,
         e: Array,
-        counted: np.ndarray,
+        unclipped: np.ndarray,
     ) -> Array:
         """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on.
 
@@ -438,35 +460,37 @@ class _Rows:
         """
         from scipy.linalg import solve_triangular
 
-        S, size = between(noises), len(R)
-        carried = [noise.at_rest(size) for noise in noises]
+        S, size = innovation_covariance(noises), len(R)
+        filter_states = [noise.zero_state(size) for noise in noises]
         middle = np.zeros((size, size))
 
-        def pass_on(count: int, at: np.ndarray, groups: np.ndarray, Q: Array) -> None:
+        def filter_instants(count: int, at: np.ndarray, groups: np.ndarray, Q: Array) -> None:
             """So many instants, the last of which is 0, the one before it 1; Q (p, rows)."""
             filtered = []
             for i, noise in enumerate(noises):
                 dense = np.zeros((size, count))
                 dense[:, at[groups == i]] = Q[:, groups == i]
-                out, carried[i] = noise.pass_on(dense, carried[i])
+                out, filter_states[i] = noise.apply_filter(dense, filter_states[i])
                 filtered.append(out)
             for i, one in enumerate(filtered):
                 middle[:] += one @ sum(S[i, j] * other.T for j, other in enumerate(filtered))
 
-        def wait(count: int) -> None:
+        def skip_instants(count: int) -> None:
             nothing = np.zeros(0, dtype=np.intp)
-            for start in range(0, count, _WAITING):
-                pass_on(min(_WAITING, count - start), nothing, nothing, np.zeros((size, 0)))
+            for start in range(0, count, _GAP_BLOCK):
+                filter_instants(
+                    min(_GAP_BLOCK, count - start), nothing, nothing, np.zeros((size, 0))
+                )
 
         last = int(self.samples[-1]) + 1
         for rows, block in self.Z.blocks(backwards=True):
             at, groups = self.samples[rows], self.groups[rows]
             Q = solve_triangular(R, (block / s[groups, None]).T, trans="T")
-            left_out.add(self.samples[rows], Q, e[rows], counted[rows])
-            wait(last - 1 - int(at[-1]))
-            pass_on(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
+            jackknife.add(self.samples[rows], Q, e[rows], unclipped[rows])
+            skip_instants(last - 1 - int(at[-1]))
+            filter_instants(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
             last = int(at[0])
-        wait(max(noise.memory for noise in noises))
+        skip_instants(max(noise.memory_length for noise in noises))
         return middle
 
 
@@ -474,10 +498,12 @@ def _rms(e: Array) -> float:
     return math.sqrt(np.mean(np.square(e)))
 
 
-def conditions(W: Array) -> tuple[float, float]:
+def condition_numbers(W: Array) -> tuple[float, float]:
     """Condition numbers of W, or of its triangular factor, and with columns of length one."""
-    return _condition(W), _condition(W / np.maximum(np.linalg.norm(W, axis=0), 1e-300))
+    return _condition_number(W), _condition_number(
+        W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
+    )
 
 
-def _condition(W: Array) -> float:
+def _condition_number(W: Array) -> float:
     return float(np.linalg.cond(np.linalg.qr(W, mode="r")))

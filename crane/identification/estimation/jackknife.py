@@ -3,11 +3,13 @@
 import numpy as np
 
 from crane.common.samples import Array
-from crane.identification.estimation.noise import Noise
+from crane.identification.estimation.noise_model import NoiseModel
 
-_CORRELATED = 4.0  # mean correlation times of the joints' noise in a stretch, at least
-_FEWEST, _MOST = 20, 200  # stretches
-_ALONE = 1e-8  # of a direction's information, what others than one stretch have at least
+_MIN_CORRELATION_TIMES = 4.0  # mean correlation times of the joints' noise in a stretch, at least
+_MIN_SEGMENTS, _MAX_SEGMENTS = 20, 200  # stretches
+_MIN_REMAINING_SHARE = (
+    1e-8  # of a direction's information, what others than one stretch have at least
+)
 
 
 class Jackknife:
@@ -32,40 +34,45 @@ class Jackknife:
     of Statistics 17(3), for blocks of time.
     """
 
-    def __init__(self, samples: np.ndarray, noises: list[Noise], size: int):
-        longest = _CORRELATED * np.mean([noise.correlated for noise in noises])
+    def __init__(self, samples: np.ndarray, noises: list[NoiseModel], size: int):
+        longest = _MIN_CORRELATION_TIMES * np.mean([noise.correlation_time for noise in noises])
         span = int(samples[-1] - samples[0]) + 1
-        wanted = int(np.clip(span / longest, _FEWEST, _MOST))
+        wanted = int(np.clip(span / longest, _MIN_SEGMENTS, _MAX_SEGMENTS))
         starts = samples[np.arange(wanted) * len(samples) // wanted]
-        self._starts = np.unique(starts)  # an instant belongs to one stretch
-        self._H = np.zeros((len(self._starts), size, size))
-        self._c = np.zeros((len(self._starts), size))
+        self._segment_starts = np.unique(starts)  # an instant belongs to one stretch
+        self._H = np.zeros((len(self._segment_starts), size, size))
+        self._c = np.zeros((len(self._segment_starts), size))
 
-    def add(self, samples: np.ndarray, Q: Array, e: Array, counted: np.ndarray) -> None:
+    def add(self, samples: np.ndarray, Q: Array, e: Array, unclipped: np.ndarray) -> None:
         """Rows of whole instants (N,).
 
         Args:
             samples: Number of their instants.
             Q: (p, N).
             e: Weighted residuals.
-            counted: Whose small changes change the estimate: not those that are clipped.
+            unclipped: Whose small changes change the estimate: not those that are clipped.
         """
-        cuts = [0, *np.searchsorted(samples, self._starts[1:]).tolist(), len(samples)]
+        cuts = [0, *np.searchsorted(samples, self._segment_starts[1:]).tolist(), len(samples)]
         for k, rows in enumerate(map(slice, cuts[:-1], cuts[1:])):
-            here = Q[:, rows][:, counted[rows]]
+            here = Q[:, rows][:, unclipped[rows]]
             self._H[k] += here @ here.T
             self._c[k] += Q[:, rows] @ e[rows]
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """K - 1."""
         return len(self._c) - 1
 
     def covariance(self) -> Array:
         """Of R theta (p, p), of rank K - 1 at most."""
         shares, U = np.linalg.eigh(self._H)
-        rest = np.maximum(1 - shares, _ALONE)
-        turned = np.einsum("kji,kj->ki", U, self._c) / rest
-        moved = np.einsum("kij,kj->ki", U, turned)
-        moved -= moved.mean(axis=0)
-        return self.freedom / len(moved) * moved.T @ moved
+        rest = np.maximum(1 - shares, _MIN_REMAINING_SHARE)
+        rotated_changes = np.einsum("kji,kj->ki", U, self._c) / rest
+        parameter_changes = np.einsum("kij,kj->ki", U, rotated_changes)
+        parameter_changes -= parameter_changes.mean(axis=0)
+        return (
+            self.degrees_of_freedom
+            / len(parameter_changes)
+            * parameter_changes.T
+            @ parameter_changes
+        )

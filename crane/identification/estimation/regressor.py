@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_ROWS = 8192  # of a block
+_BLOCK_ROWS = 8192  # of a block
 
 
 class Regressor(Protocol):
@@ -22,11 +22,11 @@ class Regressor(Protocol):
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
         """Which rows, and W there; no instant is in two blocks. The last first if asked for."""
 
-    def factors(self, y: Array, groups: np.ndarray) -> Array:
-        """See `factors`."""
+    def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
+        """See `triangular_factors`."""
 
 
-class Stored:
+class StoredRegressor:
     """A matrix that is held as a whole.
 
     Args:
@@ -35,25 +35,25 @@ class Stored:
         rows: Of a block, about.
     """
 
-    def __init__(self, W: Array, samples: np.ndarray, rows: int = _ROWS):
+    def __init__(self, W: Array, samples: np.ndarray, rows: int = _BLOCK_ROWS):
         self.shape = W.shape
         self._W = W
         wanted = np.arange(0, len(W), rows)
         starts = np.unique(np.searchsorted(samples, samples[wanted])).tolist()
         ends = [*starts[1:], len(W)]
-        self._spans = [slice(*ends) for ends in zip(starts, ends, strict=True)]
+        self._row_slices = [slice(*ends) for ends in zip(starts, ends, strict=True)]
 
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
         """See `Regressor`."""
-        for span in reversed(self._spans) if backwards else self._spans:
+        for span in reversed(self._row_slices) if backwards else self._row_slices:
             yield span, self._W[span]
 
-    def factors(self, y: Array, groups: np.ndarray) -> Array:
-        """See `factors`."""
-        return factors(self, y, groups)
+    def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
+        """See `triangular_factors`."""
+        return triangular_factors(self, y, groups)
 
 
-def factors(
+def triangular_factors(
     W: Regressor,
     y: Array,
     groups: np.ndarray,
@@ -86,18 +86,18 @@ def factors(
         if weights is not None:
             whole *= weights[rows, None]
         for g in range(len(out)):
-            add_rows(out[g], whole[groups[rows] == g])
+            update_triangular_factor(out[g], whole[groups[rows] == g])
     return out
 
 
-def add_rows(R: Array, rows: Array) -> None:
+def update_triangular_factor(R: Array, rows: Array) -> None:
     """Make a triangular factor (k, k) that of its rows and of others (m, k)."""
     if len(rows):
         R[:] = np.linalg.qr(np.vstack([R, rows]), mode="r")
 
 
-def triangular(rows: Array) -> Array:
+def triangular_factor(rows: Array) -> Array:
     """Triangular factor (k, k) of a matrix (m, k), with rows of zeros where m < k."""
     out = np.zeros((rows.shape[-1],) * 2)
-    add_rows(out, rows)
+    update_triangular_factor(out, rows)
     return out

@@ -4,16 +4,19 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.valves import Signals, circuit_of
-from crane.description.sensors import SIGNAL
+from crane.control.valve_commands import ValveSignals, require_circuit
+from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.told import Told
+from crane.identification.excitation.signal_information import SignalInformation
 from crane.machine import Machine
 from crane.recordings.recording import Recording
-from crane.simulation.run import simulate
+from crane.simulation.simulation_run import simulate
 
-_OFF = 0.3  # share that a number is off by of which no bounds are given
-_END, _RESTS = 0.5, 0.1  # [s] before the end, and share of the velocities that counts as rest
+_DEFAULT_DEVIATION = 0.3  # share that a number is off by of which no bounds are given
+_FINAL_DURATION, _REST_SPEED_SHARE = (
+    0.5,
+    0.1,
+)  # [s] before the end, and share of the velocities that counts as rest
 
 
 class SignalLimits:
@@ -26,25 +29,25 @@ class SignalLimits:
     ends.
 
     Args:
-        told: Of the machine and the wanted numbers.
+        information: Of the machine and the wanted numbers.
         margin: Share of a stroke, of a relief pressure, of the pump's flow.
 
     Attributes:
         machine: See above.
         low: (m,) least coordinates [m], [rad].
         high: (m,) largest.
-        flow: The most that is asked of the pump [m3/s].
+        max_flow: The most that is asked of the pump [m3/s].
     """
 
-    def __init__(self, told: Told, margin: float):
-        machine = self.machine = told.machine
-        self._circuit, self._margin = circuit_of(machine), margin
+    def __init__(self, information: SignalInformation, margin: float):
+        machine = self.machine = information.machine
+        self._circuit, self._margin = require_circuit(machine), margin
         which = [machine.active.index(joint) for joint in self._circuit.joints]
         self._lower, self._upper = machine.lower[which], machine.upper[which]
-        self._span = self._upper - self._lower
+        self._stroke_lengths = self._upper - self._lower
         home = np.array([machine.home[machine.column(joint)] for joint in self._circuit.joints])
         below, above = np.minimum(
-            margin * self._span, [(home - self._lower) / 2, (self._upper - home) / 2]
+            margin * self._stroke_lengths, [(home - self._lower) / 2, (self._upper - home) / 2]
         )
         self.low, self.high = self._lower + below, self._upper - above
         supply = self._circuit.supply
@@ -58,54 +61,57 @@ class SignalLimits:
                 raise InputError(
                     f"signals are designed for cylinders, '{joint}' has a motor: lock it"
                 )
-        flow = supply.flow
-        self.flow = (1 - margin) * flow if flow else np.inf
-        self._doubts = [told.variant(values) for values in _doubts(told.unknowns)]
+        max_flow = supply.flow
+        self.flow = (1 - margin) * max_flow if max_flow else np.inf
+        self._perturbed_machines = [
+            information.perturbed_machine(values)
+            for values in _perturbed_values(information.unknowns)
+        ]
 
-    def refused(self, run: Recording) -> str:
+    def exceeded_limit(self, run: Recording) -> str:
         """Which limit a run exceeds, "" if none."""
         q = self._strokes(run)
         for i, joint in enumerate(self._circuit.joints):
             if q[:, i].min() < self.low[i] - 1e-9 or q[:, i].max() > self.high[i] + 1e-9:
                 return f"the stroke of '{joint}'"
-        if self.pump(run) > 1:
+        if self.pump_flow_share(run) > 1:
             return "the pump's flow"
-        for joint, pressure in zip(self._circuit.joints, self.pressures(run), strict=True):
+        for joint, pressure in zip(self._circuit.joints, self.peak_pressures(run), strict=True):
             relief = self._circuit.cylinders[joint].relief
             if relief and pressure > (1 - self._margin) * relief:
                 return f"the relief pressure of '{joint}'"
         speeds = np.abs(run.v)
-        last = speeds[run.time > run.time[-1] - _END].max(axis=0)
+        last = speeds[run.time > run.time[-1] - _FINAL_DURATION].max(axis=0)
         free = np.isin(run.joints, run.free)  # they sway as they will
-        moving = (last > _RESTS * speeds.max(axis=0)) & ~free
+        moving = (last > _REST_SPEED_SHARE * speeds.max(axis=0)) & ~free
         if moving.any():
             return f"the rest of '{run.joints[int(np.argmax(moving))]}' at the end"
         return ""
 
-    def left(self, run: Recording) -> Array:
+    def stroke_margins(self, run: Recording) -> Array:
         """(m,) what is left of strokes to their nearer ends, as shares of them."""
         q = self._strokes(run)
         ends = np.minimum(q.min(axis=0) - self._lower, self._upper - q.max(axis=0))
-        return np.asarray(ends / self._span)
+        return np.asarray(ends / self._stroke_lengths)
 
-    def doubted(self, run: Recording) -> Array:
+    def worst_case_stroke_margins(self, run: Recording) -> Array:
         """(m,) the same, of the worst machine whose numbers are off, driven by the same signals.
 
         Raises:
             CraneError: One cannot be simulated.
         """
-        runs = [played(machine, run) for machine in self._doubts]
-        return np.min([self.left(other) for other in (run, *runs)], axis=0)
+        runs = [replay_signals(machine, run) for machine in self._perturbed_machines]
+        return np.min([self.stroke_margins(other) for other in (run, *runs)], axis=0)
 
-    def pump(self, run: Recording) -> float:
+    def pump_flow_share(self, run: Recording) -> float:
         """The largest share of the pump's flow, 0 where it has no limit."""
         supply = self._circuit.supply
         if not supply.flow:
             return 0.0
-        asked = (supply.pressure - run.channels["pressure_supply"]) / supply.droop
-        return float(asked.max())
+        flow_shares = (supply.pressure - run.channels["pressure_supply"]) / supply.droop
+        return float(flow_shares.max())
 
-    def pressures(self, run: Recording) -> Array:
+    def peak_pressures(self, run: Recording) -> Array:
         """(m,) largest in a cylinder [Pa]."""
         return np.array([
             max(run.channels[f"pressure_{joint}_{side}"].max() for side in "ab")
@@ -116,26 +122,26 @@ class SignalLimits:
         return run.q[:, [run.joints.index(joint) for joint in self._circuit.joints]]
 
 
-def _doubts(unknowns: list[Unknown]) -> list[dict[str, float]]:
+def _perturbed_values(unknowns: list[Unknown]) -> list[dict[str, float]]:
     """Values of numbers of the machine that are off by as much as may be, one at a time."""
     found = []
     for one in unknowns:
         ends = one.low, one.high
         if not np.isfinite(ends).all():
-            off = _OFF * one.start if np.isfinite(ends).any() else 0.0
-            ends = one.start - off, one.start + off
+            deviation = _DEFAULT_DEVIATION * one.start if np.isfinite(ends).any() else 0.0
+            ends = one.start - deviation, one.start + deviation
         found += [{one.name: end} for end in ends if end != one.start and not one.sensor]
     return found
 
 
-def played(machine: Machine, run: Recording) -> Recording:
+def replay_signals(machine: Machine, run: Recording) -> Recording:
     """A machine driven by the signals of another run, from home.
 
     Raises:
         CraneError: It cannot be simulated.
     """
-    joints, step = circuit_of(machine).joints, float(run.time[1] - run.time[0])
-    signals = {joint: run.channels[SIGNAL + joint] for joint in joints}
+    joints, step = require_circuit(machine).joints, float(run.time[1] - run.time[0])
+    signals = {joint: run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
     return simulate(
-        machine, Signals(machine, run.time, signals), None, step * (len(run.time) - 1), step
+        machine, ValveSignals(machine, run.time, signals), None, step * (len(run.time) - 1), step
     )

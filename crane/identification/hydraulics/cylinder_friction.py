@@ -13,39 +13,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, known
+from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.common.shown import Brief
-from crane.common.threads import on_one_thread
+from crane.common.threads import with_single_threaded_blas
 from crane.description import Friction
 from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators
 from crane.identification.estimation.estimators import Estimate
-from crane.identification.hydraulics.cylinder_signals import column
-from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.signals.steady import steady
+from crane.identification.hydraulics.cylinder_signals import joint_index
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
+from crane.identification.signals.steady_samples import steady_samples
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
-NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")
+PARAMETER_NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")
 
-_RESTS = 1e-3  # of the largest speed, below which nothing slides
-_SLIDING = 3.0  # smoothing velocities, above which the sign of the speed is told
-_STEADY = 0.05  # of the speed, by which it may change
-_MOST = 4000  # samples
-_STILL = 0.01  # of the fastest speed
-_SEARCHED = 40  # stribeck velocities tried before the fit
+_REST_SPEED_SHARE = 1e-3  # of the largest speed, below which nothing slides
+_SLIDING_FACTOR = 3.0  # smoothing velocities, above which the sign of the speed is told
+_STEADY_SHARE = 0.05  # of the speed, by which it may change
+_MAX_SAMPLES = 4000  # samples
+_STANDSTILL_SHARE = 0.01  # of the fastest speed
+_STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CylinderFriction(Brief):
+class CylinderFriction(OneLineRepr):
     """Friction of one joint.
 
     Attributes:
         joint: Its name.
         values: (3,) coulomb, coulomb_offset, viscous; or (5,) with stiction and stribeck.
         covariance: (3, 3) or (5, 5).
-        freedom: Degrees of freedom behind it.
+        degrees_of_freedom: Degrees of freedom behind it.
         smoothing: Of the sign [m/s] or [rad/s], which is given, not estimated.
         speed: Steady samples (M,) [m/s] or [rad/s].
         force: Measured friction there (M,) [N] or [N m].
@@ -56,7 +56,7 @@ class CylinderFriction(Brief):
     joint: str
     values: Array
     covariance: Array
-    freedom: float
+    degrees_of_freedom: float
     smoothing: float
     speed: Array
     force: Array
@@ -66,7 +66,7 @@ class CylinderFriction(Brief):
     @property
     def names(self) -> tuple[str, ...]:
         """Of the values."""
-        return NAMES[: len(self.values)]
+        return PARAMETER_NAMES[: len(self.values)]
 
     @property
     def std(self) -> Array:
@@ -77,7 +77,7 @@ class CylinderFriction(Brief):
         """Ends (p, 2) of what covers the truth with this probability."""
         from scipy.stats import t
 
-        half = t.ppf(0.5 + 0.5 * level, self.freedom) * self.std
+        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
         return np.column_stack([self.values - half, self.values + half])
 
     @property
@@ -90,7 +90,7 @@ class CylinderFriction(Brief):
 
     def predict(self, speed: Array) -> Array:
         """Friction at speeds (N,)."""
-        return _law(self.values, speed, self.smoothing)
+        return _friction_law(self.values, speed, self.smoothing)
 
     def to_text(self, unit: str = "m") -> str:
         """A table of the parameters."""
@@ -107,7 +107,7 @@ class CylinderFriction(Brief):
         return "\n".join([*lines, *([self.note] if self.note else [])]) + "\n"
 
 
-@on_one_thread
+@with_single_threaded_blas
 def identify_cylinder_friction(
     machine: Machine,
     recording: Recording,
@@ -135,15 +135,20 @@ def identify_cylinder_friction(
         RecordingError: What is recorded cannot serve, or does not tell the parameters.
     """
     if joint not in machine.active:
-        raise InputError(f"'{joint}' is not an active joint, {known(machine.active, joint)}")
+        raise InputError(
+            f"'{joint}' is not an active joint, {suggest_names(machine.active, joint)}"
+        )
     index = machine.active.index(joint)
     motion = smoothed_motion(machine, recording)
     load = Dynamics(machine).inverse(motion.q, motion.v, motion.a)[:, index]
-    given = machine.friction.get(joint, Friction())
+    described_friction = machine.friction.get(joint, Friction())
     v = motion.v[:, index]
-    slow = max(_SLIDING * given.smoothing, _RESTS * float(np.abs(v).max()))
+    slow = max(
+        _SLIDING_FACTOR * described_friction.smoothing, _REST_SPEED_SHARE * float(np.abs(v).max())
+    )
     at = np.flatnonzero(
-        steady(motion.time, settle, v, share=_STEADY, relative=True) & (np.abs(v) > slow)
+        steady_samples(motion.time, settle, v, share=_STEADY_SHARE, relative=True)
+        & (np.abs(v) > slow)
     )
     speed, force = v[at], (motion.tau[:, index] - load)[at]
     for sense, word in ((1, "extends"), (-1, "retracts")):
@@ -153,22 +158,22 @@ def identify_cylinder_friction(
                 f"'{joint}' never {word} steadily at two speeds above "
                 f"{slow:.3g} {machine.unit(joint)}/s, record constant speeds both ways"
             )
-    every = max(1, len(at) // _MOST)
+    every = max(1, len(at) // _MAX_SAMPLES)
     at, speed, force = at[::every], speed[::every], force[::every]
-    result, note = _plain(at, speed, force, given.smoothing), ""
+    result, note = _fit_without_stiction(at, speed, force, described_friction.smoothing), ""
     if stribeck is not False:
-        curved, note = _curved(at, speed, force, given.smoothing)
+        stiction_fit, note = _fit_with_stiction(at, speed, force, described_friction.smoothing)
         if note and stribeck:
             raise RecordingError(f"stiction of '{joint}' cannot be told: {note}")
         if not note:
-            result = curved
+            result = stiction_fit
     values, estimate = result
     return CylinderFriction(
         joint=joint,
         values=values,
         covariance=estimate.covariance,
-        freedom=estimate.freedom,
-        smoothing=given.smoothing,
+        degrees_of_freedom=estimate.degrees_of_freedom,
+        smoothing=described_friction.smoothing,
         speed=speed,
         force=force,
         noise=float(estimate.noise[0]),
@@ -176,10 +181,10 @@ def identify_cylinder_friction(
     )
 
 
-Fit = tuple[Array, Estimate]
+FitResult = tuple[Array, Estimate]
 
 
-def _law(values: Array, v: Array, smoothing: float) -> Array:
+def _friction_law(values: Array, v: Array, smoothing: float) -> Array:
     sign = np.tanh(v / smoothing) if smoothing else np.sign(v)
     out = values[0] * sign + values[1] + values[2] * v
     if len(values) == 5:
@@ -187,7 +192,7 @@ def _law(values: Array, v: Array, smoothing: float) -> Array:
     return np.asarray(out)
 
 
-def _columns(v: Array, smoothing: float, stribeck: float | None = None) -> Array:
+def _friction_columns(v: Array, smoothing: float, stribeck: float | None = None) -> Array:
     """Of what the law is linear in (M, 3) or (M, 4)."""
     sign = np.tanh(v / smoothing) if smoothing else np.sign(v)
     columns = [sign, np.ones_like(v), v]
@@ -196,12 +201,14 @@ def _columns(v: Array, smoothing: float, stribeck: float | None = None) -> Array
     return np.column_stack(columns)
 
 
-def _plain(at: np.ndarray, v: Array, force: Array, smoothing: float) -> Fit:
-    estimate = estimators.least_squares(_columns(v, smoothing), force, samples=at)
+def _fit_without_stiction(at: np.ndarray, v: Array, force: Array, smoothing: float) -> FitResult:
+    estimate = estimators.least_squares(_friction_columns(v, smoothing), force, samples=at)
     return estimate.values, estimate
 
 
-def _curved(at: np.ndarray, v: Array, force: Array, smoothing: float) -> tuple[Fit, str]:
+def _fit_with_stiction(
+    at: np.ndarray, v: Array, force: Array, smoothing: float
+) -> tuple[FitResult, str]:
     """With stiction, and why it is not told ("" if it is)."""
     from scipy.optimize import minimize_scalar
 
@@ -209,34 +216,37 @@ def _curved(at: np.ndarray, v: Array, force: Array, smoothing: float) -> tuple[F
     slowest, fastest = float(sizes.min()), float(sizes.max())
 
     def cost(log_stribeck: float) -> float:
-        W = _columns(v, smoothing, float(np.exp(log_stribeck)))
+        W = _friction_columns(v, smoothing, float(np.exp(log_stribeck)))
         rest = force - W @ np.linalg.lstsq(W, force, rcond=None)[0]
         return float(rest @ rest)
 
     # for every stribeck velocity the rest is linear
-    grid = np.linspace(np.log(0.3 * slowest), np.log(fastest), _SEARCHED)
+    grid = np.linspace(np.log(0.3 * slowest), np.log(fastest), _STRIBECK_GRID_SIZE)
     best = int(np.argmin([cost(x) for x in grid]))
-    ends = grid[max(best - 1, 0)], grid[min(best + 1, _SEARCHED - 1)]
+    ends = grid[max(best - 1, 0)], grid[min(best + 1, _STRIBECK_GRID_SIZE - 1)]
     found = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-10})
     width = float(np.exp(found.x))
-    W = _columns(v, smoothing, width)
+    W = _friction_columns(v, smoothing, width)
     linear = np.linalg.lstsq(W, force, rcond=None)[0]
     values = np.append(linear, width)
-    slope = linear[3] * W[:, 3] * 2 * v**2 / width**3
-    plain = _plain(at, v, force, smoothing)
+    stribeck_derivative = linear[3] * W[:, 3] * 2 * v**2 / width**3
+    fit_without = _fit_without_stiction(at, v, force, smoothing)
     low = f"speeds from {slowest:.2g} to {fastest:.2g}"
     if best == 0 or width < slowest:
-        return plain, f"{low} hold none below the Stribeck velocity, record slower ones"
-    if best == _SEARCHED - 1 or width > 0.5 * fastest:
-        return plain, f"{low} do not exceed the Stribeck velocity twofold, record faster ones"
-    J = np.column_stack([W, slope])
+        return fit_without, f"{low} hold none below the Stribeck velocity, record slower ones"
+    if best == _STRIBECK_GRID_SIZE - 1 or width > 0.5 * fastest:
+        return (
+            fit_without,
+            f"{low} do not exceed the Stribeck velocity twofold, record faster ones",
+        )
+    J = np.column_stack([W, stribeck_derivative])
     if np.linalg.cond(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)) > 1e8:
-        return plain, f"{low} show no stiction"
+        return fit_without, f"{low} show no stiction"
     estimate = estimators.least_squares(
-        J, force - _law(values, v, smoothing) + J @ values, samples=at
+        J, force - _friction_law(values, v, smoothing) + J @ values, samples=at
     )
     if not linear[3] > 3 * estimate.std[3]:
-        return plain, f"{low} show no stiction"
+        return fit_without, f"{low} show no stiction"
     return (values, dataclasses.replace(estimate, values=values)), ""
 
 
@@ -259,7 +269,11 @@ class DirectionDifference:
 
 
 def direction_difference(
-    recording: Recording, joint: str, strokes: int = 10, settle: float = 0.3, match: float = 0.1
+    recording: Recording,
+    joint: str,
+    bins: int = 10,
+    settle: float = 0.3,
+    speed_tolerance: float = 0.1,
 ) -> DirectionDifference:
     """Half the difference of the force between both directions at the same stroke and speed.
 
@@ -270,33 +284,33 @@ def direction_difference(
     Args:
         recording: tau of the joint by (20).
         joint: Its name.
-        strokes: Number of equal bins of the stroke.
+        bins: Number of equal bins of the stroke.
         settle: [s] of constant speed.
-        match: Relative difference of speeds that count as the same.
+        speed_tolerance: Relative difference of speeds that count as the same.
 
     Raises:
         RecordingError: Nothing occurs both ways.
     """
-    i = column(recording, joint)
+    i = joint_index(recording, joint)
     x, v, force = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
-    kept = steady(recording.time, settle, v, share=_STEADY, relative=True) & (
-        np.abs(v) > _STILL * np.abs(v).max()
+    is_steady = steady_samples(recording.time, settle, v, share=_STEADY_SHARE, relative=True) & (
+        np.abs(v) > _STANDSTILL_SHARE * np.abs(v).max()
     )
-    edges = np.linspace(x.min(), x.max(), strokes + 1)
+    edges = np.linspace(x.min(), x.max(), bins + 1)
     rows = []
     for low, high in zip(edges[:-1], edges[1:], strict=True):
-        inside = kept & (x >= low) & (x <= high)
-        for level in _levels(np.abs(v[inside]), match):
-            same = inside & (np.abs(np.abs(v) - level) <= match * level)
-            ways = [np.flatnonzero(same & (sense * v > 0)) for sense in (1, -1)]
-            if min(map(len, ways)) < 3:
+        inside = is_steady & (x >= low) & (x <= high)
+        for level in _speed_levels(np.abs(v[inside]), speed_tolerance):
+            same = inside & (np.abs(np.abs(v) - level) <= speed_tolerance * level)
+            directions = [np.flatnonzero(same & (sense * v > 0)) for sense in (1, -1)]
+            if min(map(len, directions)) < 3:
                 continue
-            start, end = (max(x[w].min() for w in ways), min(x[w].max() for w in ways))
+            start, end = (max(x[w].min() for w in directions), min(x[w].max() for w in directions))
             if end <= start:
                 continue
             middle = 0.5 * (start + end)
-            up, down = (float(np.polyfit(x[w] - middle, force[w], 1)[-1]) for w in ways)
-            speed = float(np.mean([np.abs(v[w]).mean() for w in ways]))
+            up, down = (float(np.polyfit(x[w] - middle, force[w], 1)[-1]) for w in directions)
+            speed = float(np.mean([np.abs(v[w]).mean() for w in directions]))
             rows.append((middle, speed, 0.5 * (up - down), 0.5 * (up + down)))
     if not rows:
         raise RecordingError(
@@ -306,12 +320,12 @@ def direction_difference(
     return DirectionDifference(*np.array(rows).T)
 
 
-def _levels(sizes: Array, match: float) -> list[float]:
+def _speed_levels(sizes: Array, speed_tolerance: float) -> list[float]:
     """Speeds that stand for groups of equal ones."""
     out: list[float] = []
     rest = np.sort(sizes)
     while len(rest):
-        group = rest[rest <= rest[0] * (1 + match)]
+        group = rest[rest <= rest[0] * (1 + speed_tolerance)]
         out.append(float(np.median(group)))
         rest = rest[len(group) :]
     return out

@@ -4,17 +4,21 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, known
+from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.hydraulics.components import Cylinder, Valve
-from crane.identification.signals.motion import average_periods, differentiate, sampling
+from crane.identification.signals.signal_processing import (
+    average_periods,
+    differentiate,
+    sampling_step,
+)
 from crane.machine import Machine
-from crane.recordings.measured import moved_locks
-from crane.recordings.missing import check_there
+from crane.recordings.measured_recordings import locked_joint_conflicts
+from crane.recordings.missing_measurements import check_columns_present
 from crane.recordings.recording import Recording
 
-_SLACK = 1e-3  # of the stroke by which a noisy sensor may leave it
-_NOISY = 0.03  # of the fastest speed, noise that is worth smoothing
+_STROKE_TOLERANCE = 1e-3  # of the stroke by which a noisy sensor may leave it
+_NOISE_SHARE = 0.03  # of the fastest speed, noise that is worth smoothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +51,10 @@ class CylinderSignals:
         return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
 
 
-SENSORS = ("x", "opening", "p_a", "p_b", "p_s", "p_r")
+SIGNAL_NAMES = ("x", "opening", "p_a", "p_b", "p_s", "p_r")
 
 
-def parts(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
+def cylinder_and_valve(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     """Cylinder and valve of a joint.
 
     Raises:
@@ -60,7 +64,7 @@ def parts(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     if circuit is None:
         raise InputError(f"'{machine.name}' has no hydraulics, add the section to its file")
     if joint not in circuit.cylinders:
-        raise InputError(f"'{joint}' has no cylinder, {known(circuit.cylinders, joint)}")
+        raise InputError(f"'{joint}' has no cylinder, {suggest_names(circuit.cylinders, joint)}")
     if circuit.valves[joint].spool_b:
         raise InputError(
             f"the valve of '{joint}' has two spools, which this does not tell apart: fit its "
@@ -69,36 +73,38 @@ def parts(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     return circuit.cylinders[joint], circuit.valves[joint]
 
 
-def needed(joint: str) -> list[tuple[str, ...]]:
+def required_channels(joint: str) -> list[tuple[str, ...]]:
     """Channels of a cylinder: four pressures, and the signal of its valve or the spool."""
     names = [f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply", "pressure_tank"]
     return [*((name,) for name in names), (f"voltage_{joint}", f"spool_{joint}")]
 
 
-def column(recording: Recording, joint: str) -> int:
+def joint_index(recording: Recording, joint: str) -> int:
     """Column of a joint in q, v and tau.
 
     Raises:
         RecordingError: It is not recorded.
     """
     if joint not in recording.joints:
-        raise RecordingError(f"'{joint}' is not recorded, {known(recording.joints, joint)}")
+        raise RecordingError(
+            f"'{joint}' is not recorded, {suggest_names(recording.joints, joint)}"
+        )
     return recording.joints.index(joint)
 
 
-def speed(recording: Recording, joint: str) -> Array:
+def joint_velocity(recording: Recording, joint: str) -> Array:
     """A joint's velocity (N,) as recorded, or from a Kalman smoother of its coordinate.
 
     The latter where the recorded one is noisy, as differences of a measured coordinate are.
     """
-    i = column(recording, joint)
+    i = joint_index(recording, joint)
     v = recording.v[:, i]
-    if noise_level(v) > _NOISY * np.abs(v).max():
+    if noise_std(v) > _NOISE_SHARE * np.abs(v).max():
         return differentiate(recording.time, recording.q[:, [i]]).v[:, 0]
     return v
 
 
-def channel(recording: Recording, name: str, unit: str) -> Array:
+def channel_values(recording: Recording, name: str, unit: str) -> Array:
     """A further column (N,) in SI units.
 
     Raises:
@@ -106,7 +112,7 @@ def channel(recording: Recording, name: str, unit: str) -> Array:
     """
     if name not in recording.channels:
         raise RecordingError(
-            f"channel '{name}' [{unit}] is missing, {known(recording.channels, name)}"
+            f"channel '{name}' [{unit}] is missing, {suggest_names(recording.channels, name)}"
         )
     given = recording.channel_units.get(name, "")
     if given not in ("", unit):
@@ -120,7 +126,7 @@ def cylinder_signals(
     """Signals of one cylinder from the columns of a recording.
 
     The opening comes from `spool_<joint>` where that is recorded, else from `voltage_<joint>`
-    by `opening`. A stroke that leaves its limits by noise is kept.
+    by `valve_opening`. A stroke that leaves its limits by noise is kept.
 
     Args:
         machine: With hydraulics.
@@ -134,29 +140,29 @@ def cylinder_signals(
         RecordingError: A column is missing, in another unit, or out of the stroke; samples are
             not equidistant.
     """
-    _, valve = parts(machine, joint)
-    for text in moved_locks(
+    _, valve = cylinder_and_valve(machine, joint)
+    for text in locked_joint_conflicts(
         machine, recording.columns(), recording.units | recording.channel_units
     ):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
-    q = recording.q[:, column(recording, joint)]
+    q = recording.q[:, joint_index(recording, joint)]
     index = machine.active.index(joint)
     lower, upper = float(machine.lower[index]), float(machine.upper[index])
-    slack = _SLACK * (upper - lower)
+    slack = _STROKE_TOLERANCE * (upper - lower)
     if q.min() < lower - slack or q.max() > upper + slack:
         raise RecordingError(
             f"'{joint}' goes from {q.min():.4g} to {q.max():.4g} {machine.unit(joint)}, its "
             f"limits are {lower:.4g} and {upper:.4g}, check its zero and unit"
         )
-    step = sampling(recording.time)
-    check_there(needed(joint), recording.channels)
-    *names, (signal, spool) = needed(joint)
-    pressures = [channel(recording, name, "Pa") for (name,) in names]
+    step = sampling_step(recording.time)
+    check_columns_present(required_channels(joint), recording.channels)
+    *names, (signal, spool) = required_channels(joint)
+    pressures = [channel_values(recording, name, "Pa") for (name,) in names]
     if spool in recording.channels:
-        y = opening(valve, recording.channels[spool])
+        y = valve_opening(valve, recording.channels[spool])
     else:
-        voltage = channel(recording, signal, "V")
-        y = opening(valve, spool_position(valve, voltage, step))
+        voltage = channel_values(recording, signal, "V")
+        y = valve_opening(valve, spool_position(valve, voltage, step))
     time, columns = recording.time, np.column_stack([q - lower, y, *pressures])
     if period is not None:
         time, columns, _ = average_periods(time, columns, period)
@@ -164,7 +170,7 @@ def cylinder_signals(
     return CylinderSignals(time, x, y, p_a, p_b, p_s, p_r, upper - lower)
 
 
-def opening(valve: Valve, u: Array) -> Array:
+def valve_opening(valve: Valve, u: Array) -> Array:
     """Opening y (N,) of spool positions u (N,), see `Valve`."""
     size = np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0)
     return np.copysign(size, u)
@@ -182,19 +188,19 @@ def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
     """
     from scipy.signal import cont2discrete, dlsim
 
-    asked = (voltage - valve.neutral) / (valve.full - valve.neutral)
+    command = (voltage - valve.neutral) / (valve.full - valve.neutral)
     if valve.delay:
-        samples = np.arange(len(asked), dtype=np.float64)
-        asked = np.interp(samples - valve.delay / step, samples, asked)
+        samples = np.arange(len(command), dtype=np.float64)
+        command = np.interp(samples - valve.delay / step, samples, command)
     if not valve.bandwidth:
-        return np.asarray(asked)
+        return np.asarray(command)
     w = valve.bandwidth
     A = np.array([[0.0, 1.0], [-w * w, -2 * valve.damping * w]])
     system = cont2discrete(
         (A, np.array([[0.0], [w * w]]), np.eye(2), np.zeros((2, 1))), step, "foh"
     )
-    start = asked[0]
-    _, states, _ = dlsim(system, asked - start)
+    start = command[0]
+    _, states, _ = dlsim(system, command - start)
     fastest = float(np.abs(states[:, 1]).max())
     if valve.rate and fastest > valve.rate:
         raise RecordingError(
@@ -204,7 +210,7 @@ def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
     return np.asarray(states[:, 0] + start)
 
 
-def noise_level(x: Array) -> float:
+def noise_std(x: Array) -> float:
     """Standard deviation of white noise on a smooth signal (N,).
 
     Differences of order d have the variance binomial(2 d, d) sigma^2 of the noise and hardly
@@ -219,7 +225,7 @@ def noise_level(x: Array) -> float:
     return min(found)
 
 
-def noise_levels(
+def signal_noise(
     signals: CylinderSignals, given: dict[str, float] | None = None
 ) -> dict[str, float]:
     """Standard deviation of each sensor's noise, estimated where it is not given.
@@ -228,18 +234,18 @@ def noise_levels(
         InputError: A sensor is unknown.
     """
     for name in given or {}:
-        if name not in SENSORS:
-            raise InputError(f"sensor '{name}' is unknown, {known(SENSORS, name)}")
-    return {name: noise_level(getattr(signals, name)) for name in SENSORS} | (given or {})
+        if name not in SIGNAL_NAMES:
+            raise InputError(f"sensor '{name}' is unknown, {suggest_names(SIGNAL_NAMES, name)}")
+    return {name: noise_std(getattr(signals, name)) for name in SIGNAL_NAMES} | (given or {})
 
 
-def shifted(signals: CylinderSignals, name: str, by: float) -> CylinderSignals:
+def shift_signal(signals: CylinderSignals, name: str, offset: float) -> CylinderSignals:
     """The same signals with one of them moved; an opening of zero stays zero."""
     values = {entry.name: getattr(signals, entry.name) for entry in fields(signals)}
     where = values["opening"] != 0 if name == "opening" else 1.0
-    return CylinderSignals(**values | {name: values[name] + by * where})
+    return CylinderSignals(**values | {name: values[name] + offset * where})
 
 
-def regions(y: Array) -> np.ndarray:
+def opening_regions(y: Array) -> np.ndarray:
     """Which smooth piece of the opening each sample (N,) is on: closed, open, or fully open."""
     return np.sign(y) * (1.0 + (np.abs(y) >= 1))

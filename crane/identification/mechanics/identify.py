@@ -8,70 +8,88 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import CraneWarning, InputError, RecordingError, known
+from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
+from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number, as_sample
-from crane.common.threads import on_one_thread
-from crane.common.waiting import telling
+from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation.estimators import (
     Estimate,
     Prior,
-    conditions,
+    condition_numbers,
     huber,
     least_squares,
-    weighted,
+    weighted_least_squares,
 )
-from crane.identification.mechanics.against import (
+from crane.identification.mechanics.base_parameters import BaseParameters, base_parameters
+from crane.identification.mechanics.feasible_estimate import feasible_estimate
+from crane.identification.mechanics.feasible_parameters import load_convex_solver
+from crane.identification.mechanics.force_checks import (
     check_forces,
-    tell_delays,
-    tell_shared,
-    tell_validation,
+    check_shared_samples,
+    warn_delays,
+    warn_validation,
 )
-from crane.identification.mechanics.base import Base, base_parameters
-from crane.identification.mechanics.checks import doubt
-from crane.identification.mechanics.delays import delays
-from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
-from crane.identification.mechanics.equations import Equations, Progress, long_enough
-from crane.identification.mechanics.feasible import convex
-from crane.identification.mechanics.inertias import body_names
-from crane.identification.mechanics.laws import Frictional
-from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.possible import possible
-from crane.identification.mechanics.priors import by_name, check_told, checked, stated
-from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.mechanics.result import Identification
-from crane.identification.mechanics.term import Term
-from crane.identification.mechanics.terms import Changes
-from crane.identification.mechanics.undriven import settled
-from crane.identification.signals.motion import Motion
-from crane.identification.signals.spectrum import below
+from crane.identification.mechanics.force_delays import force_delays
+from crane.identification.mechanics.free_joint_equations import iterate_estimate
+from crane.identification.mechanics.friction_laws import FrictionTerm
+from crane.identification.mechanics.identifiability import (
+    base_magnitudes,
+    motion_advice,
+    parameter_magnitudes,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identification_result import Identification
+from crane.identification.mechanics.inertial_terms import body_names
+from crane.identification.mechanics.model_term import ModelTerm
+from crane.identification.mechanics.priors import (
+    check_identifiable,
+    check_prior,
+    prior_from_names,
+    read_priors,
+)
+from crane.identification.mechanics.recording_checks import reject_unless_trusted
+from crane.identification.mechanics.regression_equations import (
+    Progress,
+    RegressionEquations,
+    is_long_enough,
+)
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
+from crane.identification.mechanics.term_selection import TermChanges
+from crane.identification.signals.signal_processing import Motion
+from crane.identification.signals.spectrum import spectral_edge_frequency
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
-Recorded = Recording | Motion
-METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
-_SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
-_RESTING = {"rad": 1e-2, "m": 1e-3}  # [rad/s], [m/s] where stiction ends that nobody described
-_SETTLED = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
-_MOVING = 0.5  # of a joint's largest velocity, above which rows count always
-_KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
-_TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the filter's least
-_POWER = 0.99
-_FAST = 40.0  # times the frequency below which 99 % of the accelerations are
-_COMPARED = 50  # rows from which on forces are compared with the model's
-_SAMPLES = 500  # at which the speeds of joints are looked at
-_PART = 0.3  # of what is left to do that one pass over a recording is taken for
+RecordingOrMotion = Recording | Motion
+METHODS = {"ols": least_squares, "wls": weighted_least_squares, "huber": huber}
+_SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are left out
+_DEFAULT_STICTION_SPEED = {
+    "rad": 1e-2,
+    "m": 1e-3,
+}  # [rad/s], [m/s] where stiction ends that nobody described
+_SMOOTHING_FACTOR = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
+_MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows count always
+_PASSBAND_SHARE = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
+_MIN_BANDWIDTH_FACTOR = (
+    3.0  # times the frequency below which 99 % of the velocities are, the filter's least
+)
+_POWER_SHARE = 0.99
+_MAX_BANDWIDTH_FACTOR = 40.0  # times the frequency below which 99 % of the accelerations are
+_MIN_COMPARED_ROWS = 50  # rows from which on forces are compared with the model's
+_SPEED_SAMPLES = 500  # at which the speeds of joints are looked at
+_PASS_SHARE = 0.3  # of what is left to do that one pass over a recording is taken for
 
 
-@on_one_thread
+@with_single_threaded_blas
 def identify(
     machine: Machine,
-    recording: Recorded | Sequence[Recorded],
-    validation: Recorded | Sequence[Recorded] | None = None,
+    recording: RecordingOrMotion | Sequence[RecordingOrMotion],
+    validation: RecordingOrMotion | Sequence[RecordingOrMotion] | None = None,
     method: str = "wls",
     prior: float | Mapping[str, object] | Prior | None = None,
     feasible: bool = False,
     *,
-    terms: Sequence[Term] | Changes | None = None,
+    terms: Sequence[ModelTerm] | TermChanges | None = None,
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
     trust: bool = False,
@@ -97,7 +115,7 @@ def identify(
         feasible: Whether the bodies have to be able to exist and friction must not be negative;
             all parameters come out.
         terms: Of the model; or by name what changes of the usual ones, such as
-            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `terms.terms_of`.
+            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `terms.select_terms`.
         bandwidth: [Hz] of the low-pass; if not given, far above the frequencies of the motion,
             but no higher than the motion is known where noise asked for smoothing, as of a coarse
             potentiometer.
@@ -116,90 +134,127 @@ def identify(
         InputError: Arguments that do not fit, or no CVXPY for feasible bodies.
         RecordingError: A recording that cannot serve, and why; one that determines nothing.
     """
-    progress = telling(progress)
+    progress = progress_reporter(progress)
     if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
-    model = Model(machine, terms)
+        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    model = IdentificationModel(machine, terms)
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     if feasible:
-        convex()  # before all the work
-    finished, progress = progress, in_parts(progress)
-    tell_shared(_several(recording), _several(validation), trust)
-    motions = motions_of(machine, recording, trust, progress)
-    rows, told = equations_of(model, motions, bandwidth, slow, progress)
+        load_convex_solver()  # before all the work
+    final_progress, progress = progress, multi_pass_progress(progress)
+    check_shared_samples(_as_list(recording), _as_list(validation), trust)
+    motions = prepare_motions(machine, recording, trust, progress)
+    equations, identifiable = build_equations(model, motions, bandwidth, slow, progress)
     if model.bodies:
-        _check_forces(model, motions, rows, trust)
-    selection = rows.selection(told)
-    columns = rows.columns(selection)
-    sizes = sizes_of(model, told, columns.factors(rows.y, rows.groups))
-    before = _prior(model, prior, rows.base, sizes, feasible)
+        _check_forces(model, motions, equations, trust)
+    selection = equations.column_selection(identifiable)
+    columns = equations.projected_regressor(selection)
+    parameter_sizes = parameter_magnitudes(
+        model, identifiable, columns.triangular_factors(equations.y, equations.groups)
+    )
+    known_prior = _build_prior(model, prior, equations.base, parameter_sizes, feasible)
     parameters = None
-    pull, T = (None, selection) if feasible else (before, selection)
-    if before is None:
-        _check_scale(machine, rows)
+    estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
+    if known_prior is None:
+        _check_mass_scale(machine, equations)
     elif not feasible:
-        T = rows.base.grouping
-        check_told(model.names, np.vstack(list(rows.factors[:, :, :-1] @ T)), before)
+        T = equations.base.grouping
+        check_identifiable(
+            model.names, np.vstack(list(equations.triangular_factors[:, :, :-1] @ T)), known_prior
+        )
 
-    def estimated(values: Array) -> tuple[Estimate, Array]:
-        nonlocal rows
-        rows = rows.at(values) if machine.free else rows
-        found = METHODS[method](rows.columns(T), rows.y, rows.groups, rows.samples, pull)
+    def estimate_at(values: Array) -> tuple[Estimate, Array]:
+        nonlocal equations
+        equations = equations.at_values(values) if machine.free else equations
+        found = METHODS[method](
+            equations.projected_regressor(T),
+            equations.y,
+            equations.groups,
+            equations.samples,
+            estimator_prior,
+        )
         return found, T @ found.values
 
-    start = rows.base.values(model.nominal)
-    estimate = settled(estimated, start) if machine.free else estimated(start)[0]
+    start = equations.base.values(model.nominal)
+    estimate = iterate_estimate(estimate_at, start) if machine.free else estimate_at(start)[0]
     values, covariance = estimate.values, estimate.covariance
     if feasible:
-        estimate = possible(model, told, rows, selection, estimate, before)
-    if feasible or before is not None:
-        plain, scaled = conditions(np.vstack(list(rows.factors[:, :, :-1] @ selection)))
+        estimate = feasible_estimate(
+            model, identifiable, equations, selection, estimate, known_prior
+        )
+    if feasible or known_prior is not None:
+        plain, scaled = condition_numbers(
+            np.vstack(list(equations.triangular_factors[:, :, :-1] @ selection))
+        )
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
-        values = told.values(parameters)
-        covariance = told.grouping @ estimate.covariance @ told.grouping.T
+        values = identifiable.values(parameters)
+        covariance = identifiable.grouping @ estimate.covariance @ identifiable.grouping.T
     # what is known of all parameters predicts another motion better than what this one tells
-    predicting = selection @ values if parameters is None else rows.base.values(parameters)
-    training, judged = rows.compare(predicting), None
-    base, bandwidth, limits, remedy = (
-        rows.base,
-        rows.bandwidth,
-        rows.slow,
-        advice(machine, motions),
+    predicting_values = (
+        selection @ values if parameters is None else equations.base.values(parameters)
     )
-    speeds = _speeds(model, motions, limits)
-    del rows, motions
+    training, validation_comparison = equations.compare(predicting_values), None
+    base, bandwidth, slow_speeds, advice = (
+        equations.base,
+        equations.bandwidth,
+        equations.slow,
+        motion_advice(machine, motions),
+    )
+    speeds = _speed_ranges(model, motions, slow_speeds)
+    del equations, motions
     if validation is not None:
-        others = motions_of(machine, validation, trust, progress, "validation")
-        judging = [motion for motion in others if long_enough(motion, bandwidth)]
-        if judging:
-            judge = Equations(model, base, judging, bandwidth, limits, progress)
-            judged = judge.compare(predicting) if judge.moving.any() else None
-        if judged is None or len(judging) < len(others):
-            _tell_short(others, judging, bandwidth)
-        if judged is not None:
-            tell_validation(training, judged)
-    if finished is not None:
-        finished(1.0)
-    found = Identification(
-        model, told, values, covariance, parameters, estimate, method, feasible, training,
-        magnitudes(told, sizes), remedy, speeds, bandwidth, limits, judged,
-    )  # fmt: skip
-    if all(mark == "not determined" for mark in found.marks):
-        doubt(found.doubt, trust)
-    elif found.doubt:
-        warnings.warn(found.doubt, CraneWarning, stacklevel=3)
-    return found
+        validation_motions = prepare_motions(machine, validation, trust, progress, "validation")
+        long_motions = [
+            motion for motion in validation_motions if is_long_enough(motion, bandwidth)
+        ]
+        if long_motions:
+            validation_equations = RegressionEquations(
+                model, base, long_motions, bandwidth, slow_speeds, progress
+            )
+            validation_comparison = (
+                validation_equations.compare(predicting_values)
+                if validation_equations.is_moving.any()
+                else None
+            )
+        if validation_comparison is None or len(long_motions) < len(validation_motions):
+            _warn_short_validations(validation_motions, long_motions, bandwidth)
+        if validation_comparison is not None:
+            warn_validation(training, validation_comparison)
+    if final_progress is not None:
+        final_progress(1.0)
+    identification = Identification(
+        model,
+        identifiable,
+        values,
+        covariance,
+        parameters,
+        estimate,
+        method,
+        feasible,
+        training,
+        base_magnitudes(identifiable, parameter_sizes),
+        advice,
+        speeds,
+        bandwidth,
+        slow_speeds,
+        validation_comparison,
+    )
+    if all(mark == "not determined" for mark in identification.marks):
+        reject_unless_trusted(identification.warning, trust)
+    elif identification.warning:
+        warnings.warn(identification.warning, CraneWarning, stacklevel=3)
+    return identification
 
 
-def _check_scale(machine: Machine, rows: Equations) -> None:
+def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
     """See that not all forces are known to be zero.
 
     Raises:
         RecordingError: They are.
     """
-    if machine.free and not rows.y.any():
+    if machine.free and not equations.y.any():
         body = body_names(machine)[-1]
         raise RecordingError(
             "nothing drives what moves in this recording: it tells ratios of masses, not masses; "
@@ -208,70 +263,81 @@ def _check_scale(machine: Machine, rows: Equations) -> None:
         )
 
 
-def _tell_short(others: Sequence[Motion], judging: Sequence[Motion], bandwidth: float) -> None:
+def _warn_short_validations(
+    motions: Sequence[Motion], long_motions: Sequence[Motion], bandwidth: float
+) -> None:
     """Warn of validations that judge nothing."""
-    short = len(others) - len(judging)
+    short_count = len(motions) - len(long_motions)
     text = (
-        f"{short} of {len(others)} validations are too short for a low-pass of {bandwidth:g} Hz "
+        f"{short_count} of {len(motions)} validations are too short for a low-pass of "
+        f"{bandwidth:g} Hz "
         "and judge nothing"
-        if short
+        if short_count
         else "no validation moves faster than what counts as standstill, nothing is judged"
     )
     warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
 
 
-def equations_of(
-    model: Model,
+def build_equations(
+    model: IdentificationModel,
     motions: Sequence[Motion],
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
     progress: Progress | None = None,
-) -> tuple[Equations, Base]:
+) -> tuple[RegressionEquations, BaseParameters]:
     """Equations of motions, and what of the base parameters they tell.
 
     Arguments and errors as for `identify`.
     """
     if bandwidth is None:
-        bandwidth = model.machine.estimation.bandwidth or min(map(_bandwidth, motions))
-    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", above=0)
+        bandwidth = model.machine.estimation.bandwidth or min(map(_default_bandwidth, motions))
+    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", greater_than=0)
     fastest = np.max([np.abs(motion.v).max(axis=0) for motion in motions], axis=0)
-    limits = _slow(model.machine, slow, fastest)
-    rows = Equations(model, base_parameters(model), motions, bandwidth, limits, progress)
-    if not rows.moving.any():
+    slow_speeds = _slow_speeds(model.machine, slow, fastest)
+    equations = RegressionEquations(
+        model, base_parameters(model), motions, bandwidth, slow_speeds, progress
+    )
+    if not equations.is_moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
-    for joint, count in zip(model.machine.active, rows.moving.sum(axis=0), strict=True):
+    for joint, count in zip(model.machine.active, equations.is_moving.sum(axis=0), strict=True):
         if count == 1:  # which tells nothing of its noise
             raise RecordingError(
                 f"'{joint}' is in one sample only faster than what counts as standstill, move it "
                 "more, or raise its slow"
             )
     # of columns, the triangular factors tell what all rows tell
-    return rows, rows.base.narrowed(np.vstack(list(rows.factors[:, :, :-1])))
+    return equations, equations.base.identifiable_part(
+        np.vstack(list(equations.triangular_factors[:, :, :-1]))
+    )
 
 
-def _prior(
-    model: Model,
+def _build_prior(
+    model: IdentificationModel,
     given: float | Mapping[str, object] | Prior | None,
-    base: Base,
-    sizes: Array,
+    base: BaseParameters,
+    parameter_sizes: Array,
     feasible: bool,
 ) -> Prior | None:
     """Means and standard deviations (p,) of all parameters; None where nothing is known."""
     known = dict(model.machine.estimation.prior)
     if given is not None:
         if not isinstance(given, Mapping | int | float):
-            return checked(model, base, given, feasible)
-        told = by_name(given)  # after what the machine file says, also of the same name
-        known = {name: what for name, what in known.items() if name not in told} | told
-    return stated(model, known, sizes) if known else None
+            return check_prior(model, base, given, feasible)
+        given_priors = read_priors(
+            given
+        )  # after what the machine file says, also of the same name
+        known = {
+            name: what for name, what in known.items() if name not in given_priors
+        } | given_priors
+    return prior_from_names(model, known, parameter_sizes) if known else None
 
 
-def motions_of(
+def prepare_motions(
     machine: Machine,
-    recorded: Recorded | Sequence[Recorded],
+    recordings: RecordingOrMotion | Sequence[RecordingOrMotion],
     trust: bool,
     progress: Progress | None,
-    what: str = "",
+    role: str = "",
 ) -> list[Motion]:
     """Recordings with velocities and accelerations; motions as they are.
 
@@ -279,57 +345,70 @@ def motions_of(
         InputError: There are none.
         RecordingError: One cannot serve; the message says which, if there are several.
     """
-    several = _several(recorded)
-    if not several:
+    sources = _as_list(recordings)
+    if not sources:
         raise InputError("no recording is given, give at least one")
-    found = []
-    for number, one in enumerate(several, start=1):
+    motions = []
+    for number, one in enumerate(sources, start=1):
         try:
             if not isinstance(one, Motion):
                 one = smoothed_motion(machine, one, trust=trust, progress=progress)
         except RecordingError as error:
-            if not what and len(several) == 1:
+            if not role and len(sources) == 1:
                 raise
-            which = f"{what or 'recording'} {number} of {len(several)}"
+            which = f"{role or 'recording'} {number} of {len(sources)}"
             raise RecordingError(f"{which}: {error}") from None
-        found.append(one)
-    return found
+        motions.append(one)
+    return motions
 
 
-def _several(recorded: Recorded | Sequence[Recorded] | None) -> list[Recorded]:
-    if recorded is None:
+def _as_list(
+    recordings: RecordingOrMotion | Sequence[RecordingOrMotion] | None,
+) -> list[RecordingOrMotion]:
+    if recordings is None:
         return []
-    return [recorded] if isinstance(recorded, Recording | Motion) else list(recorded)
+    return [recordings] if isinstance(recordings, Recording | Motion) else list(recordings)
 
 
-def _check_forces(model: Model, motions: Sequence[Motion], rows: Equations, trust: bool) -> None:
+def _check_forces(
+    model: IdentificationModel,
+    motions: Sequence[Motion],
+    equations: RegressionEquations,
+    trust: bool,
+) -> None:
     """Doubts about the forces of recordings, by what the model can say."""
-    modelled, first = rows.compare(rows.base.values(model.nominal)).modelled, 0
-    for motion, thinned in zip(motions, rows.thinned(), strict=True):
+    modelled, first = equations.compare(equations.base.values(model.nominal)).modelled, 0
+    for motion, thinned in zip(motions, equations.thinned_motions(), strict=True):
         here = modelled[first : first + len(thinned.time)]
-        if len(here) >= _COMPARED:
+        if len(here) >= _MIN_COMPARED_ROWS:
             check_forces(thinned, here, model.machine.active, trust=trust)
-        tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
+        warn_delays(
+            model.machine.active, *force_delays(model, equations.base, motion, equations.slow)
+        )
         first += len(here)
 
 
-def _speeds(
-    model: Model, motions: Sequence[Motion], slow: Array
+def _speed_ranges(
+    model: IdentificationModel, motions: Sequence[Motion], slow: Array
 ) -> dict[str, tuple[float, float]]:
     """Least and largest speed along each direction of friction, of so many samples."""
-    directions = {x.direction.name: x.direction for x in model.terms if isinstance(x, Frictional)}
+    directions = {
+        x.direction.name: x.direction for x in model.terms if isinstance(x, FrictionTerm)
+    }
     fastest = dict.fromkeys(directions, 0.0)
     for motion in motions:
-        some = slice(None, None, max(1, len(motion.time) // _SAMPLES))
-        at = model.samples(motion.q[some], motion.v[some], motion.a[some])
+        sample_slice = slice(None, None, max(1, len(motion.time) // _SPEED_SAMPLES))
+        at = model.samples(motion.q[sample_slice], motion.v[sample_slice], motion.a[sample_slice])
         for name, direction in directions.items():
-            speed = np.einsum("ij,ij->i", direction.rows(model.machine, at), at.v_a)
+            speed = np.einsum("ij,ij->i", direction.jacobian(model.machine, at), at.v_a)
             fastest[name] = max(fastest[name], float(np.abs(speed).max()))
-    least = dict(zip(model.machine.active, slow.tolist(), strict=True))
-    return {name: (least.get(name, _SLOW * most), most) for name, most in fastest.items()}
+    lowest = dict(zip(model.machine.active, slow.tolist(), strict=True))
+    return {
+        name: (lowest.get(name, _SLOW_SPEED_SHARE * most), most) for name, most in fastest.items()
+    }
 
 
-def in_parts(progress: Progress | None) -> Progress | None:
+def multi_pass_progress(progress: Progress | None) -> Progress | None:
     """One bar for passes whose number is not known: each takes a share of what is left."""
     if progress is None:
         return None
@@ -337,7 +416,7 @@ def in_parts(progress: Progress | None) -> Progress | None:
 
     def report(share: float) -> None:
         nonlocal done
-        now = done + _PART * (1 - done) * share
+        now = done + _PASS_SHARE * (1 - done) * share
         progress(now)
         if share >= 1:
             done = now
@@ -345,34 +424,40 @@ def in_parts(progress: Progress | None) -> Progress | None:
     return report
 
 
-def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array) -> Array:
+def _slow_speeds(
+    machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array
+) -> Array:
     """Velocities (n,) below which rows are left out.
 
     If not given, a share of the largest, or where the described friction comes from rest to what
     it is in motion, which it does in reality at velocities that nobody knows better.
     """
-    out = _SLOW * fastest
+    out = _SLOW_SPEED_SHARE * fastest
     for i, joint in enumerate(machine.active):
         law = machine.friction.get(joint)
         if law is not None:
-            turns = law.smoothing or (_RESTING[machine.unit(joint)] if law.sticks else 0.0)
-            near = _SETTLED * (max(law.stribeck, law.smoothing) if law.stiction else turns)
-            out[i] = max(out[i], min(near, _MOVING * fastest[i]))
+            smoothing_speed = law.smoothing or (
+                _DEFAULT_STICTION_SPEED[machine.unit(joint)] if law.has_stick_slip else 0.0
+            )
+            stiction_speed = _SMOOTHING_FACTOR * (
+                max(law.stribeck, law.smoothing) if law.stiction else smoothing_speed
+            )
+            out[i] = max(out[i], min(stiction_speed, _MAX_SLOW_SHARE * fastest[i]))
     if slow is not None and not isinstance(slow, Mapping):
         each = np.full(out.shape, slow) if np.ndim(slow) == 0 else slow
         each = as_sample(each, len(out), "slow", machine.active)
         slow = dict(zip(machine.active, each.tolist(), strict=True))
     for name, value in (*machine.estimation.slow.items(), *(slow or {}).items()):
         joints = fnmatch.filter(machine.active, name)
-        if not joints and name not in machine.locks:
-            raise InputError(f"slow is for '{name}', {known(machine.active, name)}")
+        if not joints and name not in machine.locked_joints:
+            raise InputError(f"slow is for '{name}', {suggest_names(machine.active, name)}")
         if (limit := as_number(value, f"slow of '{name}'", "")) < 0:
             raise InputError(f"slow of '{name}' is {limit:g}, it must not be negative")
         out[[machine.active.index(joint) for joint in joints]] = limit
     return out
 
 
-def _bandwidth(motion: Motion) -> float:
+def _default_bandwidth(motion: Motion) -> float:
     """[Hz] of the low-pass, far above the frequencies of the motion where it is measured well.
 
     What is modelled lies below it; above it is noise, which has to be seen to be known. But what
@@ -381,14 +466,17 @@ def _bandwidth(motion: Motion) -> float:
     hardly above the motion.
     """
     step = float(motion.time[1] - motion.time[0])
-    highest = max(_KNOWN * motion.passed, _TIMES * _fastest(motion.v, step))
-    return min(_FAST * _fastest(motion.a, step), highest, 0.24 / step)
+    highest = max(
+        _PASSBAND_SHARE * motion.passband,
+        _MIN_BANDWIDTH_FACTOR * _highest_frequency(motion.v, step),
+    )
+    return min(_MAX_BANDWIDTH_FACTOR * _highest_frequency(motion.a, step), highest, 0.24 / step)
 
 
-def _fastest(x: Array, step: float) -> float:
+def _highest_frequency(x: Array, step: float) -> float:
     """Frequency [Hz] below which 99 % of the power of each of the signals (N, n) is."""
     found = [
-        below(_POWER, column / max(column.std(), 1e-300), step)
+        spectral_edge_frequency(_POWER_SHARE, column / max(column.std(), 1e-300), step)
         for column in x.T
         if np.ptp(column) > 0
     ]

@@ -8,19 +8,19 @@ import numpy as np
 from scipy.linalg import qr
 
 from crane.common.errors import InputError
-from crane.common.errors import known as known_names
+from crane.common.errors import suggest_names as known_names
 from crane.common.samples import Array, as_number, as_sample
-from crane.description.estimation import Known
+from crane.description.estimation_settings import ParameterPrior
 from crane.identification.estimation.estimators import Prior
-from crane.identification.mechanics.base import Base
-from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.identification_model import IdentificationModel
 
-_DEPENDENT = 1e-10  # relative size of a pivot below which columns say the same
-_LISTED = 8
-_SHARES = 1e-7, 1e6  # above and up to which a relative standard deviation lies
+_RANK_TOLERANCE = 1e-10  # relative size of a pivot below which columns say the same
+_MAX_LISTED = 8
+_RELATIVE_STD_RANGE = 1e-7, 1e6  # above and up to which a relative standard deviation lies
 
 
-def by_name(given: float | Mapping[str, object]) -> dict[str, Known]:
+def read_priors(given: float | Mapping[str, object]) -> dict[str, ParameterPrior]:
     """What is known by name: a share alone is one of everything.
 
     Raises:
@@ -28,14 +28,16 @@ def by_name(given: float | Mapping[str, object]) -> dict[str, Known]:
     """
     if isinstance(given, Mapping):
         return {
-            name: what if isinstance(what, Known) else Known.read(what)
+            name: what if isinstance(what, ParameterPrior) else ParameterPrior.parse(what)
             for name, what in given.items()
         }
-    share = as_number(given, "the prior's relative standard deviation", "", *_SHARES)
-    return {"*": Known(share, relative=True)}
+    share = as_number(given, "the prior's relative standard deviation", "", *_RELATIVE_STD_RANGE)
+    return {"*": ParameterPrior(share, relative=True)}
 
 
-def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
+def prior_from_names(
+    model: IdentificationModel, priors: Mapping[str, ParameterPrior], parameter_sizes: Array
+) -> Prior:
     """Means (p,) and standard deviations (p,) of parameters of which something is known by name.
 
     A name is that of a parameter, of a body for its mass and all moments, "bodies" for all, or a
@@ -47,20 +49,22 @@ def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
 
     Args:
         model: The model.
-        known: By name.
-        sizes: See `determined.sizes_of` (p,).
+        priors: By name.
+        parameter_sizes: See `determined.parameter_magnitudes` (p,).
 
     Raises:
         InputError: A name that nothing has, or a body that more is said of than a share.
     """
-    mean, std = model.nominal.copy(), np.where(sizes > 0, sizes, 1.0)
+    mean, std = model.nominal.copy(), np.where(parameter_sizes > 0, parameter_sizes, 1.0)
     count = 10 * len(model.bodies)
-    for name, what in known.items():
+    for name, what in priors.items():
         everything = name == "*"
         bodies = (
             list(model.bodies)
             if everything or name == "bodies"
-            else _named(model.bodies, name if "." not in name or name in model.bodies else "")
+            else _matching_names(
+                model.bodies, name if "." not in name or name in model.bodies else ""
+            )
         )
         if bodies and (not what.relative or what.mean is not None):
             raise InputError(
@@ -68,35 +72,40 @@ def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
                 f"name one of their parameters, such as {bodies[0]}.m"
             )
         for body in bodies:
-            ten = slice(10 * (at := model.bodies.index(body)), 10 * at + 10)
-            mean[ten], std[ten] = model.nominal[ten], what.std * sizes[ten]
-        others = model.names[count:] if everything else _named(model.names, name)
+            body_slice = slice(10 * (at := model.bodies.index(body)), 10 * at + 10)
+            mean[body_slice], std[body_slice] = (
+                model.nominal[body_slice],
+                what.std * parameter_sizes[body_slice],
+            )
+        others = model.names[count:] if everything else _matching_names(model.names, name)
         for i in map(model.names.index, others):
             mean[i] = model.nominal[i] if what.mean is None else what.mean
-            usual = abs(mean[i]) or _usual(model, i)
-            size = what.std * (usual if what.relative else 1.0)
-            std[i] = size or (sizes[i] or 1.0)
+            reference_value = abs(mean[i]) or _described_friction(model, i)
+            size = what.std * (reference_value if what.relative else 1.0)
+            std[i] = size or (parameter_sizes[i] or 1.0)
         place = name.rpartition(".")[0]
-        if not bodies and not others and not fnmatch.filter(model.machine.locks, place):
+        if not bodies and not others and not fnmatch.filter(model.machine.locked_joints, place):
             names = (*model.bodies, *model.names[count:])
             raise InputError(f"prior '{name}' is unknown, {known_names(names, name)}")
     return mean, std
 
 
-def _usual(model: Model, i: int) -> float:
+def _described_friction(model: IdentificationModel, i: int) -> float:
     """The largest described friction of the same joint and kind as that of a parameter."""
     where, _, kind = model.names[i].rpartition(".")
-    alike = kind.removesuffix("_offset")
+    base_kind = kind.removesuffix("_offset")
     law = model.machine.friction.get(where)
-    return float(getattr(law, alike, 0.0)) if alike != kind else 0.0
+    return float(getattr(law, base_kind, 0.0)) if base_kind != kind else 0.0
 
 
-def _named(names: Sequence[str], pattern: str) -> list[str]:
+def _matching_names(names: Sequence[str], pattern: str) -> list[str]:
     """The name itself, or those that a pattern is about."""
     return [pattern] if pattern in names else fnmatch.filter(names, pattern)
 
 
-def checked(model: Model, base: Base, prior: Any, feasible: bool) -> Prior:
+def check_prior(
+    model: IdentificationModel, base: BaseParameters, prior: Any, feasible: bool
+) -> Prior:
     """Means (p,) and standard deviations (p,) of all parameters of a model.
 
     Args:
@@ -139,7 +148,7 @@ def checked(model: Model, base: Base, prior: Any, feasible: bool) -> Prior:
     return mean, std
 
 
-def check_told(names: Sequence[str], W: Array, prior: Prior) -> None:
+def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
     """Raise for parameters that neither a prior nor a motion tells apart.
 
     Args:
@@ -150,23 +159,29 @@ def check_told(names: Sequence[str], W: Array, prior: Prior) -> None:
     Raises:
         InputError: There are some; a prior of bodies says nothing of friction, say.
     """
-    free = np.flatnonzero(np.isinf(prior[1]))
-    if not len(free):
+    unknown_columns = np.flatnonzero(np.isinf(prior[1]))
+    if not len(unknown_columns):
         return
-    columns = W[:, free]
+    columns = W[:, unknown_columns]
     length = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(length > 0, length, 1.0)
     triangle, pivots = qr(columns, mode="r", pivoting=True)
     pivot = np.abs(np.diag(triangle))
-    rank = int((pivot > _DEPENDENT * max(pivot[0], 1e-300)).sum())
-    if rank == len(free):
+    rank = int((pivot > _RANK_TOLERANCE * max(pivot[0], 1e-300)).sum())
+    if rank == len(unknown_columns):
         return
     # the null space, in which those that depend on each other have shares
     square = triangle[:rank, :rank]
-    rest = np.linalg.solve(square, triangle[:rank, rank:]) if rank else np.zeros((0, len(free)))
-    shares = np.concatenate([np.abs(rest).max(axis=1), np.ones(len(free) - rank)])
-    stuck = sorted(free[pivots[shares > 1e-6]])
-    listed = ", ".join(names[i] for i in stuck[:_LISTED]) + ", ..." * (len(stuck) > _LISTED)
+    rest = (
+        np.linalg.solve(square, triangle[:rank, rank:])
+        if rank
+        else np.zeros((0, len(unknown_columns)))
+    )
+    shares = np.concatenate([np.abs(rest).max(axis=1), np.ones(len(unknown_columns) - rank)])
+    undetermined = sorted(unknown_columns[pivots[shares > 1e-6]])
+    listed = ", ".join(names[i] for i in undetermined[:_MAX_LISTED]) + ", ..." * (
+        len(undetermined) > _MAX_LISTED
+    )
     raise InputError(
         f"the prior says nothing of {listed}, and this motion does not tell them apart: move the "
         "joints both ways and at several speeds, give prior=(means, deviations) with finite ones "

@@ -4,14 +4,16 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_LONGEST = 4  # samples from the first to the last of several outliers
-_NOISE = 8.0  # robust standard deviations by which an outlier is off
-_STEPS = 4.0  # largest steps between its neighbours, likewise
-_BESIDE = 3  # neighbours on either side
-_MAD = 1.482602218505602  # standard deviation over median absolute deviation of normal noise
+_MAX_RUN = 4  # samples from the first to the last of several outliers
+_NOISE_FACTOR = 8.0  # robust standard deviations by which an outlier is off
+_STEP_FACTOR = 4.0  # largest steps between its neighbours, likewise
+_NEIGHBOUR_COUNT = 3  # neighbours on either side
+_MAD_TO_STD = (
+    1.482602218505602  # standard deviation over median absolute deviation of normal noise
+)
 
 
-def outliers(x: Array) -> np.ndarray:
+def outlier_mask(x: Array) -> np.ndarray:
     """Which samples (N,) belong neither to the signal nor to its noise: a mask (N,).
 
     Samples, one or several within four, whose distance from the line through what is beside them
@@ -23,54 +25,56 @@ def outliers(x: Array) -> np.ndarray:
         x: Equidistant samples.
     """
     found = np.zeros(len(x), dtype=bool)
-    if len(x) <= 2 * _BESIDE + _LONGEST:
+    if len(x) <= 2 * _NEIGHBOUR_COUNT + _MAX_RUN:
         return found
-    noise = _noise(x)
+    noise = _neighbour_noise(x)
     while True:  # those that others beside them hid come out when these are bridged
-        bridged, before = repaired(x, found), found.sum()
-        for length in range(1, _LONGEST + 1):
-            found |= _runs(bridged, length, noise)
+        bridged, before = replace_outliers(x, found), found.sum()
+        for length in range(1, _MAX_RUN + 1):
+            found |= _outlier_runs(bridged, length, noise)
         if found.sum() == before:
             return found
 
 
-def repaired(x: Array, bad: np.ndarray) -> Array:
+def replace_outliers(x: Array, mask: np.ndarray) -> Array:
     """The samples (N,) with the line between their neighbours in the place of bad ones."""
-    if not bad.any():
+    if not mask.any():
         return x
-    good = np.flatnonzero(~bad)
+    good = np.flatnonzero(~mask)
     out = x.copy()
-    out[bad] = np.interp(np.flatnonzero(bad), good, x[good])
+    out[mask] = np.interp(np.flatnonzero(mask), good, x[good])
     return out
 
 
-def _noise(x: Array) -> float:
+def _neighbour_noise(x: Array) -> float:
     """Robust standard deviation of a sample from the middle of its neighbours.
 
     Of coarse samples more than half may lie there exactly: at least their usual step.
     """
-    off = _MAD * float(np.median(np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))))
+    deviation = _MAD_TO_STD * float(np.median(np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))))
     steps = np.abs(np.diff(x))
     steps = steps[steps > 0]
-    return max(off, float(np.median(steps)) if len(steps) else 0.0)
+    return max(deviation, float(np.median(steps)) if len(steps) else 0.0)
 
 
-def _runs(x: Array, length: int, noise: float) -> np.ndarray:
+def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
     """Mask of the samples that are off in runs of that length whose ends are."""
-    count = len(x) - length - 2 * _BESIDE + 1  # runs start at _BESIDE + i
+    count = len(x) - length - 2 * _NEIGHBOUR_COUNT + 1  # runs start at _BESIDE + i
     steps = np.abs(np.diff(x))
-    before, after = x[_BESIDE - 1 :][:count], x[_BESIDE + length :][:count]
+    before, after = x[_NEIGHBOUR_COUNT - 1 :][:count], x[_NEIGHBOUR_COUNT + length :][:count]
     largest = np.abs(after - before)
-    for k in range(_BESIDE - 1):
-        for start in (k, _BESIDE + length + k):
+    for k in range(_NEIGHBOUR_COUNT - 1):
+        for start in (k, _NEIGHBOUR_COUNT + length + k):
             np.maximum(largest, steps[start : start + count], out=largest)
-    limit = np.maximum(_NOISE * noise, _STEPS * largest)
-    off = []
+    limit = np.maximum(_NOISE_FACTOR * noise, _STEP_FACTOR * largest)
+    exceeds_limit = []
     for k in range(length):
         share = (k + 1) / (length + 1)
         line = (1 - share) * before + share * after
-        off.append(np.abs(x[_BESIDE + k :][:count] - line) > limit)
+        exceeds_limit.append(np.abs(x[_NEIGHBOUR_COUNT + k :][:count] - line) > limit)
     found = np.zeros(len(x), dtype=bool)
     for k in range(length):
-        found[_BESIDE + k :][:count] |= off[0] & off[-1] & off[k]
+        found[_NEIGHBOUR_COUNT + k :][:count] |= (
+            exceeds_limit[0] & exceeds_limit[-1] & exceeds_limit[k]
+        )
     return found

@@ -5,7 +5,7 @@ import numpy as np
 from crane.common.samples import Array
 
 
-def below(share: float, x: Array, step: float) -> float:
+def spectral_edge_frequency(share: float, x: Array, step: float) -> float:
     """Frequency [Hz] below which a share of the power of a signal is, the lowest at least.
 
     Args:

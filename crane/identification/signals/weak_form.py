@@ -14,13 +14,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from crane.common.errors import RecordingError
 from crane.common.samples import Array
 
-_POWER = 6
-_FEWEST = 32  # steps to either side of a centre, at least
-_HOPS = 8  # windows begin in one
+_EXPONENT = 6
+_MIN_HALF_WIDTH = 32  # steps to either side of a centre, at least
+_WINDOWS_PER_LENGTH = 8  # windows begin in one
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class WeakFormWindows:
     """Test functions around every few samples, twice: on even offsets, and on odd ones.
 
     White noise of the samples of one half is independent of that of the other, so each half is
@@ -29,56 +29,59 @@ class Windows:
     Attributes:
         centres: Their samples (K,).
         phi: Weights (2, 2 n + 1) of a half's mean over a window; their sum is 1.
-        slope: Weights (2, 2 n + 1) of a half's mean derivative [1/s].
+        phi_derivative: Weights (2, 2 n + 1) of a half's mean derivative [1/s].
     """
 
     centres: np.ndarray
     phi: Array
-    slope: Array
+    phi_derivative: Array
 
     @classmethod
-    def over(cls, count: int, step: float, length: float) -> "Windows":
+    def create(cls, count: int, step: float, length: float) -> "WeakFormWindows":
         """Windows of `length` [s], and at least 64 steps, over `count` samples.
 
         Raises:
             RecordingError: Not one window fits.
         """
-        reach = 4 * max(round(length / step / 8), _FEWEST // 4)
-        hop = 2 * max(2 * reach // _HOPS // 2, 1)
-        if count < 2 * reach + 1:
+        half_width = 4 * max(round(length / step / 8), _MIN_HALF_WIDTH // 4)
+        spacing = 2 * max(2 * half_width // _WINDOWS_PER_LENGTH // 2, 1)
+        if count < 2 * half_width + 1:
             raise RecordingError(
-                f"{count} samples are fewer than the {2 * reach + 1} of one window, record longer"
+                f"{count} samples are fewer than the {2 * half_width + 1} of one window, record "
+                f"longer"
             )
-        offsets = np.arange(-reach, reach + 1.0)
-        s = offsets / reach
+        offsets = np.arange(-half_width, half_width + 1.0)
+        s = offsets / half_width
         half = np.stack([offsets % 2 == 0, offsets % 2 == 1])
-        phi = (1 - s**2) ** _POWER * half
-        slope = s * (1 - s**2) ** (_POWER - 1) * half
+        phi = (1 - s**2) ** _EXPONENT * half
+        phi_derivative = s * (1 - s**2) ** (_EXPONENT - 1) * half
         return cls(
-            np.arange(reach, count - reach, hop),
+            np.arange(half_width, count - half_width, spacing),
             phi / phi.sum(axis=1, keepdims=True),
-            slope / (slope @ offsets * step)[:, None],
+            phi_derivative / (phi_derivative @ offsets * step)[:, None],
         )
 
     @property
-    def reach(self) -> int:
+    def half_width(self) -> int:
         """Steps from a centre to either end of its window."""
         return self.phi.shape[1] // 2
 
-    def apply(self, weights: Array, f: Array) -> Array:
+    def integrate(self, weights: Array, f: Array) -> Array:
         """Weighted sums (2, K) of a signal (N,) over all windows."""
-        view = sliding_window_view(f, weights.shape[1])[self.centres - self.reach]
+        view = sliding_window_view(f, weights.shape[1])[self.centres - self.half_width]
         return np.asarray(weights @ view.T)
 
-    def spread(self, weights: Array, rows: Array, count: int) -> Array:
+    def apply_transpose(self, weights: Array, rows: Array, count: int) -> Array:
         """The transpose: what (N, p) of each sample goes to the sums with rows (2, K, p)."""
         out = np.zeros((count, rows.shape[2]))
         for half in range(2):
             for offset in np.flatnonzero(weights[half]):
-                out[self.centres - self.reach + offset] += weights[half, offset] * rows[half]
+                out[self.centres - self.half_width + offset] += weights[half, offset] * rows[half]
         return out
 
-    def within(self, labels: np.ndarray) -> np.ndarray:
+    def are_uniform(self, labels: np.ndarray) -> np.ndarray:
         """Which windows (K,) have one label throughout; labels (N,)."""
         changes = np.append(0, np.cumsum(np.diff(labels) != 0))
-        return np.asarray(changes[self.centres + self.reach] == changes[self.centres - self.reach])
+        return np.asarray(
+            changes[self.centres + self.half_width] == changes[self.centres - self.half_width]
+        )

@@ -1,6 +1,6 @@
 """Where the strokes of a machine take its tip, and where they cannot."""
 
-from crane.motion.workspaces.explore import workspace
-from crane.motion.workspaces.result import Curve, Extreme, Workspace
+from crane.motion.workspaces.workspace_mapping import workspace
+from crane.motion.workspaces.workspace_result import SingularCurve, Workspace, WorkspaceExtreme
 
-__all__ = ["Curve", "Extreme", "Workspace", "workspace"]
+__all__ = ["SingularCurve", "WorkspaceExtreme", "Workspace", "workspace"]

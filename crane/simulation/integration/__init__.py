@@ -1,23 +1,35 @@
 """Motion in time: Runge-Kutta, Radau and Rosenbrock methods in machine code, and scipy's.
 
-Each integrates in one chart (`charts`); `ChartedSteps` goes from one to the next.
+Each integrates in one chart (`charts`); `ChartSwitchingIntegrator` goes from one to the next.
 """
 
-from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
-from crane.simulation.integration.charted import ChartedSteps
+from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled_steps import ControlledSteps
-from crane.simulation.integration.explicit import ExplicitStepper
-from crane.simulation.integration.halt import HaltedError, explained
+from crane.simulation.integration.dormand_prince import DormandPrinceStepper
+from crane.simulation.integration.error_controlled_integrator import ErrorControlledIntegrator
+from crane.simulation.integration.fixed_step_integrator import FixedStepIntegrator
+from crane.simulation.integration.integration_halt import IntegrationHaltError, explain_halt
+from crane.simulation.integration.python_stepper import PythonStepper
 from crane.simulation.integration.radau import RadauStepper
-from crane.simulation.integration.rosenbrock import StiffStepper
-from crane.simulation.integration.runge_kutta import CompiledStepper
-from crane.simulation.integration.state import row_layout, state_layout
-from crane.simulation.integration.steps import Steps
-from crane.simulation.integration.stepwise import PythonStepper
+from crane.simulation.integration.rosenbrock import RosenbrockStepper
+from crane.simulation.integration.runge_kutta import RungeKuttaStepper
+from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIntegrator
+from crane.simulation.integration.state_layouts import row_layout, state_layout
 
 __all__ = [
-    "ADAPTIVE", "AdaptiveSteps", "Chart", "ChartedSteps", "CompiledStepper", "ControlledSteps",
-    "ExplicitStepper", "HaltedError", "PythonStepper", "RadauStepper", "Steps", "StiffStepper",
-    "explained", "row_layout", "state_layout",
-]  # fmt: skip
+    "SCIPY_METHODS",
+    "ScipyIntegrator",
+    "Chart",
+    "ChartSwitchingIntegrator",
+    "RungeKuttaStepper",
+    "ErrorControlledIntegrator",
+    "DormandPrinceStepper",
+    "IntegrationHaltError",
+    "PythonStepper",
+    "RadauStepper",
+    "FixedStepIntegrator",
+    "RosenbrockStepper",
+    "explain_halt",
+    "row_layout",
+    "state_layout",
+]

@@ -16,21 +16,25 @@ from functools import cached_property
 
 import numpy as np
 
-from crane.closure.choice import choose, motions
-from crane.closure.structure import Indices
-from crane.closure.traced import folded
-from crane.codegen.scalar import Expression, Number, dot
+from crane.closure.active_joint_selection import null_space_basis, select_columns
+from crane.closure.constraint_structure import Indices
+from crane.closure.kinematics_formulas import folding_pattern
+from crane.codegen.symbolic import Scalar, SymbolicExpression, dot
 from crane.common.errors import ClosureError, InputError, MechanismError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
-from crane.dynamics.external import AppliedAt, ExternalForces, form_of
+from crane.dynamics.external_forces import ExternalForces, ExternalForceValues, formula_key
 from crane.machine import Machine
-from crane.simulation.integration.sticking import Sticking
+from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
-STEEP = 5.0  # entries of gamma, in shares of the machine's size, from which others are looked for
-_BETTER = 3.0  # times smaller has a condition to be that changes coordinates
-_EDGE = 1e-2  # share of the determinant at home, where the edge of a branch is near
-_SINGULAR = 1e-12  # share of the largest singular value that counts as zero
+MAX_GAMMA_ENTRY = (
+    5.0  # entries of gamma, in shares of the machine's size, from which others are looked for
+)
+_MIN_IMPROVEMENT = 3.0  # times smaller has a condition to be that changes coordinates
+_SINGULAR_DETERMINANT_SHARE = (
+    1e-2  # share of the determinant at home, where the edge of a branch is near
+)
+_RANK_TOLERANCE = 1e-12  # share of the largest singular value that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,21 +43,21 @@ class Chart:
 
     Attributes:
         dynamics: Of the machine in the chart's coordinates.
-        seen: (n,) columns of the joints whose coordinates and forces are the user's.
-        sticking: What the joints do whose friction sticks, the same in all charts of a run.
-        free: Those of the user's joints that nothing drives.
+        user_columns: (n,) columns of the joints whose coordinates and forces are the user's.
+        stick_slip: What the joints do whose friction sticks, the same in all charts of a run.
+        free_joints: Those of the user's joints that nothing drives.
     """
 
     dynamics: Dynamics
-    seen: Indices
-    sticking: Sticking
-    free: tuple[str, ...]
+    user_columns: Indices
+    stick_slip: StickSlipModes
+    free_joints: tuple[str, ...]
 
     @classmethod
-    def of(cls, dynamics: Dynamics) -> "Chart":
+    def from_dynamics(cls, dynamics: Dynamics) -> "Chart":
         """The user's coordinates of a machine."""
         machine = dynamics.machine
-        sticking = Sticking(machine, dynamics.forces.sticking)
+        sticking = StickSlipModes(machine, dynamics.forces.sticking)
         return cls(dynamics, machine.closure.active, sticking, machine.free)
 
     @property
@@ -62,77 +66,101 @@ class Chart:
         return self.dynamics.machine
 
     @cached_property
-    def own(self) -> bool:
+    def has_user_coordinates(self) -> bool:
         """Whether the chart's coordinates are the user's."""
-        return np.array_equal(self.machine.closure.active, self.seen)
+        return np.array_equal(self.machine.closure.active, self.user_columns)
 
     @property
-    def formulas(self) -> tuple:
+    def formula_key(self) -> tuple:
         """What formulas of the chart depend on besides its loops."""
         dynamics = self.dynamics
-        outside = form_of(self.machine)
-        return folded(dynamics.pattern), dynamics.form, tuple(self.seen.tolist()), outside
+        outside = formula_key(self.machine)
+        return (
+            folding_pattern(dynamics.constant_pattern),
+            dynamics.formula_structure,
+            tuple(self.user_columns.tolist()),
+            outside,
+        )
 
-    def check_free(self, tau: Sequence[Number], when: str = "") -> None:
+    def check_free_joints(self, tau: Sequence[Scalar], when: str = "") -> None:
         """See that no free joint gets a force (n,), in numbers or formulas.
 
         Raises:
             InputError: One does.
         """
-        for column, force in zip(self.seen.tolist(), tau, strict=True):
+        for column, force in zip(self.user_columns.tolist(), tau, strict=True):
             joint = self.machine.joints[column]
-            if joint not in self.free or (not isinstance(force, Expression) and force == 0):
+            if joint not in self.free_joints or (
+                not isinstance(force, SymbolicExpression) and force == 0
+            ):
                 continue
-            size = "" if isinstance(force, Expression) else f" of {force:.3g}"
+            size = "" if isinstance(force, SymbolicExpression) else f" of {force:.3g}"
             raise InputError(
                 f"the controller gives the free joint '{joint}' a force{size}{when}: give "
                 "it 0.0, or name it under active if something drives it"
             )
 
-    def turns(self, q: Array) -> Array:
+    def velocity_map(self, q: Array) -> Array:
         """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""
-        rows: Array = self.machine.closure.gamma(q)[..., self.seen, :]
+        rows: Array = self.machine.closure.gamma(q)[..., self.user_columns, :]
         return rows
 
-    def velocities(self, q: Array, v: Array) -> Array:
+    def user_velocities(self, q: Array, v: Array) -> Array:
         """v_A, (n,) or (N, n), of the chart's velocities at closed postures."""
-        return v if self.own else np.einsum("...ij,...j->...i", self.turns(q), v)
+        return (
+            v
+            if self.has_user_coordinates
+            else np.einsum("...ij,...j->...i", self.velocity_map(q), v)
+        )
 
-    def forces(self, q: Array, tau: Array) -> Array:
+    def chart_forces(self, q: Array, tau: Array) -> Array:
         """Forces (n,) along the chart's coordinates of the user's at a closed posture."""
-        return tau if self.own else self.turns(q).T @ tau
+        return tau if self.has_user_coordinates else self.velocity_map(q).T @ tau
 
-    def outside(self, time: float, q: Array, v: Array, states: Array) -> AppliedAt:
+    def external_forces(
+        self, time: float, q: Array, v: Array, contact_states: Array
+    ) -> ExternalForceValues:
         """What forces from outside do along the chart's coordinates.
 
         At a time [s], a closed posture (nq,), velocities (n,) and states of theirs.
         """
-        if not self.machine.external:
-            none: Array = np.zeros(0)
-            return AppliedAt(np.zeros(len(v)), none, none, none)
+        if not self.machine.external_forces:
+            empty: Array = np.zeros(0)
+            return ExternalForceValues(np.zeros(len(v)), empty, empty, empty)
         gamma = self.machine.closure.gamma(q)
-        applied = self._external.along(time, q, gamma @ v, states)
-        return applied._replace(forces=gamma.T @ applied.forces)
+        applied = self._external_forces.generalized_forces(time, q, gamma @ v, contact_states)
+        return applied._replace(generalized_forces=gamma.T @ applied.generalized_forces)
 
     @cached_property
-    def _external(self) -> ExternalForces:
-        return ExternalForces(self.machine, self.machine.external)
+    def _external_forces(self) -> ExternalForces:
+        return ExternalForces(self.machine, self.machine.external_forces)
 
-    def traced_forces(self, gamma: dict[int, list[Number]], tau: Sequence[Number]) -> list[Number]:
-        """`forces` as formulas, with rows of gamma by body."""
-        if self.own:
+    def trace_chart_forces(
+        self, gamma: dict[int, list[Scalar]], tau: Sequence[Scalar]
+    ) -> list[Scalar]:
+        """`chart_forces` as formulas, with rows of gamma by body."""
+        if self.has_user_coordinates:
             return list(tau)
-        rows = [gamma[column + 1] for column in self.seen.tolist()]
+        rows = [gamma[column + 1] for column in self.user_columns.tolist()]
         return [dot(column, tau) for column in zip(*rows, strict=True)]
 
     @cached_property
-    def limits(self) -> Array:
-        """(2,) what is much for `steepest`, and a determinant that is little."""
+    def chart_limits(self) -> Array:
+        """(2,) what is much for `largest_gamma_entry`, and a determinant that is little."""
         closure = self.machine.closure
-        least = closure.fast.edge(closure.home) if closure.compiled else 0.0
-        return np.array([max(STEEP, 2.0 * self.steepest(closure.home)), _EDGE * least])
+        home_determinant = (
+            closure.compiled_closure.least_determinant(closure.home)
+            if closure.is_compiled
+            else 0.0
+        )
+        return np.array(
+            [
+                max(MAX_GAMMA_ENTRY, 2.0 * self.largest_gamma_entry(closure.home)),
+                _SINGULAR_DETERMINANT_SHARE * home_determinant,
+            ]
+        )
 
-    def steepest(self, q: Array) -> float:
+    def largest_gamma_entry(self, q: Array) -> float:
         """The largest entry of gamma at a closed posture (nq,), in rad and the machine's size."""
         closure = self.machine.closure
         try:
@@ -142,15 +170,17 @@ class Chart:
         shares = gamma / closure.units[:, None] * closure.units[closure.active]
         return float(np.abs(shares[closure.passive]).max(initial=0.0))
 
-    def other(self, q: Array, better: float = _BETTER) -> "Chart | None":
+    def find_better_chart(
+        self, q: Array, min_improvement: float = _MIN_IMPROVEMENT
+    ) -> "Chart | None":
         """A chart around a closed posture (nq,) whose condition is that many times smaller.
 
         Joints that are independent and move no other one much stay.
         """
         machine = self.machine
-        closure, scale = machine.closure, machine.closure.equations.scales
+        closure, scale = machine.closure, machine.closure.equations.motion_scales
         jacobian = closure.equations.evaluate(q)[1]
-        basis = motions(jacobian, scale, _SINGULAR)
+        basis = null_space_basis(jacobian, scale, _RANK_TOLERANCE)
         active = closure.active
         if basis.shape[1] != len(active):
             return None
@@ -162,29 +192,33 @@ class Chart:
         now, everything = condition(active), range(machine.model.nv)
         # of the present coordinates those that move the others little
         try:
-            moved = np.abs(basis @ np.linalg.inv(basis[active])).max(axis=0)
+            largest_motions = np.abs(basis @ np.linalg.inv(basis[active])).max(axis=0)
         except np.linalg.LinAlgError:
-            moved = np.full(len(active), np.inf)
-        floating = {c for first in machine.coordinates.floating for c in range(first, first + 6)}
-        kept = [
+            largest_motions = np.full(len(active), np.inf)
+        floating = {
+            c
+            for first in machine.coordinates.floating_base_columns
+            for c in range(first, first + 6)
+        }
+        required = [
             int(column)
-            for column, size in zip(active, moved, strict=True)
-            if column in floating or size < STEEP / 2
+            for column, size in zip(active, largest_motions, strict=True)
+            if column in floating or size < MAX_GAMMA_ENTRY / 2
         ]
-        for stay in (kept, sorted(floating & set(active.tolist()))):
-            found = choose(basis, everything, stay)
-            if found is not None and condition(found) * better < now:
-                return self.moved(q, found)
+        for required_columns in (required, sorted(floating & set(active.tolist()))):
+            chosen_columns = select_columns(basis, everything, required_columns)
+            if chosen_columns is not None and condition(chosen_columns) * min_improvement < now:
+                return self.chart_with_columns(q, chosen_columns)
         return None
 
-    def moved(self, q: Array, columns: Indices) -> "Chart | None":
+    def chart_with_columns(self, q: Array, columns: Indices) -> "Chart | None":
         """The chart of some coordinates around a closed posture (nq,), None where it has none."""
         names = tuple(self.machine.joints[i] for i in columns)
         try:
-            machine = self.machine.seen_from(q, names)
+            machine = self.machine.with_home_configuration(q, names)
         except MechanismError:
             return None
         # cylinders act, and grip, whatever the coordinates
         machine = replace(machine, hydraulics=self.machine.hydraulics)
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
-        return Chart(dynamics, self.seen, self.sticking, self.free)
+        return Chart(dynamics, self.user_columns, self.stick_slip, self.free_joints)

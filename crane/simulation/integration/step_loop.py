@@ -3,47 +3,56 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from crane.codegen import Program, Value, select
-from crane.codegen.representation import Array as Place
-from crane.codegen.representation import Routine
-from crane.simulation.integration.sticking import NEAR
-from crane.simulation.integration.traced import HELD, Stepper, beyond
+from crane.codegen import Program, RoutineValue, select
+from crane.codegen.intermediate_representation import ArrayPointer as Place
+from crane.codegen.intermediate_representation import Routine
+from crane.simulation.integration.machine_formulas import (
+    HELD_INDEX,
+    MachineCodeStepper,
+    exceeds_chart_limits,
+)
+from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 
-SLOWER = 0.2  # least ratio of a step size to the one before
-_FOLLOWED = 0.02  # move of a step beyond whose end the loops may not close: rad, machine's size
-_SHORTEST = 1e-9  # of the output interval: the least step size
-_LEAST, _BISECTED = 0.02, 8  # share of a step that is tried to find an event; trials until halving
-_NEARLY = 1.0 - 2.0**-41  # of what is left: all of it
+MIN_STEP_RATIO = 0.2  # least ratio of a step size to the one before
+_MIN_CLOSABLE_MOVE = (
+    0.02  # move of a step beyond whose end the loops may not close: rad, machine's size
+)
+_MIN_STEP_SHARE = 1e-9  # of the output interval: the least step size
+_MIN_TRIAL_SHARE, _SECANT_TRIALS = (
+    0.02,
+    8,
+)  # share of a step that is tried to find an event; trials until halving
+_END_SHARE = 1.0 - 2.0**-41  # of what is left: all of it
 
-Rate = Callable[..., None]
+FormulaCaller = Callable[..., None]
 """Calls a formula by its name, at a time relative to that of `run`, with a state and arrays."""
 
 
-Way = Callable[[Value, Value], None]
+StepWriter = Callable[[RoutineValue, RoutineValue], None]
 """Adds what happens from a time on, over a length."""
 
 
 @dataclass(frozen=True)
-class Attempt:
+class StepCode:
     """What a step is made of, in machine code.
 
     Attributes:
-        r: What it is added to.
-        call: See `Rate`.
-        first: Rate at its beginning.
-        ending: Rate at its end.
+        routine: What it is added to.
+        call: See `FormulaCaller`.
+        start_rate: Rate at its beginning.
+        end_rate: Rate at its end.
         length: (1,) its length.
-        following: Outputs of the formula `finish`.
-        inside: Outputs of the formula `dense`.
+        step_result: Outputs of the formula `finish`.
+        dense_output: Outputs of the formula `dense`.
     """
 
-    r: Routine
-    call: Rate
-    first: Place
-    ending: Place
+    routine: Routine
+    call: FormulaCaller
+    start_rate: Place
+    end_rate: Place
     length: Place
-    following: Place
-    inside: Place
+    step_result: Place
+    dense_output: Place
 
 
 @dataclass(frozen=True)
@@ -58,11 +67,11 @@ class _StepVariables:
         proposed: The step size that error control proposes.
     """
 
-    length: Value
-    last: Value
-    goal: Value
-    sure: Value
-    proposed: Value
+    length: RoutineValue
+    last: RoutineValue
+    goal: RoutineValue
+    sure: RoutineValue
+    proposed: RoutineValue
 
 
 class StepLoop:
@@ -78,249 +87,346 @@ class StepLoop:
     Args:
         stepper: The method with its machine and controller.
         program: The program with its formulas.
-        r: The routine to write.
-        short: Whether steps end at output instants.
+        routine: The routine to write.
+        steps_end_at_outputs: Whether steps end at output instants.
     """
 
-    def __init__(self, stepper: Stepper, program: Program, r: Routine, short: bool):
-        self._stepper, self._program, self._r, self._short = stepper, program, r, short
-        self._size, self._seen = stepper.state_layout.size, stepper.output_layout.size
-        self._columns, self._sticks = stepper.reference_columns, stepper.sticks
-        self._following = r.array("following", program.outputs("finish"))
-        self._first, self._ending = (
-            r.array(x, program.outputs("rate")) for x in ("first", "ending")
+    def __init__(
+        self,
+        stepper: MachineCodeStepper,
+        program: Program,
+        routine: Routine,
+        steps_end_at_outputs: bool,
+    ):
+        self._stepper, self._program, self._r, self._steps_end_at_outputs = (
+            stepper,
+            program,
+            routine,
+            steps_end_at_outputs,
         )
-        self._looked = r.array("looked", program.outputs("observe"))
-        self._inside = r.array("inside", program.outputs("dense"))
-        self._between = r.array("between", self._size)
-        self._result = r.array("result", stepper.closure_code.outputs("newton"))
-        self._found = r.array("found", stepper.closure_code.outputs("newton"))
-        self._theta, self._part = r.array("theta", 1), r.array("part", 1)
-        self._reference = r.array("reference", max(1, self._columns))
-        self._machine = r.geometry, r.numbers, r.control, self._reference
-        if stepper.asks is not None:
-            self._asked = r.array("asked", program.outputs("asked"))
-            self._outside = self._reference.at(stepper.controller_columns)
-        self._whole, self._pair, self._end = r.let(r.h[0]), r.let(r.h[3]), r.let(r.h[4])
-        self._t = r.let(r.h[2])
-        self._recorded, self._due = r.let(0), r.let(0.0)
+        self._size, self._output_size = stepper.state_layout.size, stepper.output_layout.size
+        self._columns, self._has_stick_slip = stepper.reference_columns, stepper.has_stick_slip
+        self._step_result = routine.local_array("following", program.formula_outputs("finish"))
+        self._start_rate, self._end_rate = (
+            routine.local_array(x, program.formula_outputs("rate")) for x in ("first", "ending")
+        )
+        self._observation = routine.local_array("looked", program.formula_outputs("observe"))
+        self._dense_output = routine.local_array("inside", program.formula_outputs("dense"))
+        self._interpolated = routine.local_array("between", self._size)
+        self._closure_result = routine.local_array(
+            "result", stepper.closure_code.formula_outputs("newton")
+        )
+        self._output_closure_result = routine.local_array(
+            "found", stepper.closure_code.formula_outputs("newton")
+        )
+        self._relative_time, self._step_length = (
+            routine.local_array("theta", 1),
+            routine.local_array("part", 1),
+        )
+        self._reference = routine.local_array("reference", max(1, self._columns))
+        self._machine_arguments = (
+            routine.geometry,
+            routine.numbers,
+            routine.control,
+            self._reference,
+        )
+        if stepper.external_callback is not None:
+            self._callback_inputs = routine.local_array("asked", program.formula_outputs("asked"))
+            self._callback_results = self._reference.element_pointer(stepper.controller_columns)
+        self._output_interval, self._reference_spacing, self._end_time = (
+            routine.new_variable(routine.h[0]),
+            routine.new_variable(routine.h[3]),
+            routine.new_variable(routine.h[4]),
+        )
+        self._time = routine.new_variable(routine.h[2])
+        self._recorded_count, self._output_time = (
+            routine.new_variable(0),
+            routine.new_variable(0.0),
+        )
         # the references that a step begins among
-        self._base, self._before = r.let(0), r.let(self._t)
-        self._edges = program.outputs("rate").parts["edges"]
+        self._reference_index, self._reference_time = (
+            routine.new_variable(0),
+            routine.new_variable(self._time),
+        )
+        self._event_distance_count = program.formula_outputs("rate").parts["edges"]
 
-    def write(self, make_step: Callable[[Program, Attempt], tuple[Way, Way]]) -> None:
+    def write(
+        self, make_step: Callable[[Program, StepCode], tuple[StepWriter, StepWriter]]
+    ) -> None:
         """Write the routine.
 
         Args:
             make_step: Returns what makes a step up to `finish`, and what calls `dense` behind one.
         """
         r = self._r
-        self._attempt, self._interpolate = make_step(
+        self._attempt_step, self._interpolate = make_step(
             self._program,
-            Attempt(
-                r, self._call, self._first, self._ending, self._part, self._following, self._inside
+            StepCode(
+                r,
+                self._call_formula,
+                self._start_rate,
+                self._end_rate,
+                self._step_length,
+                self._step_result,
+                self._dense_output,
             ),
         )
-        self._call("rate", self._t, r.state, self._first)
+        self._call_formula("rate", self._time, r.state, self._start_rate)
         self._begin_location()
-        with r.forever():
+        with r.loop_forever():
             self._write_step()
-        self._stop()
+        self._write_return()
 
     def _begin_location(self) -> None:
         """Variables of event location: how far ahead the event is, margins here and there."""
         r = self._r
-        self._ahead, self._low, self._high = r.let(0.0), r.let(1.0), r.let(0.0)
-        self._tries = r.let(0)
-        self._sides, self._crossed = r.array("sides", max(1, self._edges)), r.array("crossed", 1)
-        if self._edges:
-            r.call("sides", self._first, self._sides)
-        if self._sticks:
-            r.set(self._low, self._first["margin"])
-            with r.when(self._low < -NEAR):
+        self._time_to_event, self._margin_before, self._margin_behind = (
+            r.new_variable(0.0),
+            r.new_variable(1.0),
+            r.new_variable(0.0),
+        )
+        self._trial_count = r.new_variable(0)
+        self._event_signs, self._signed_distance = (
+            r.local_array("sides", max(1, self._event_distance_count)),
+            r.local_array("crossed", 1),
+        )
+        if self._event_distance_count:
+            r.call("sides", self._start_rate, self._event_signs)
+        if self._has_stick_slip:
+            r.assign(self._margin_before, self._start_rate["margin"])
+            with r.if_then(self._margin_before < -EVENT_TOLERANCE):
                 r.store(r.h, 5, 1.0)
-                self._stop()
+                self._write_return()
 
     def _write_step(self) -> None:
         r = self._r
-        step = self._propose()
+        step = self._propose_step()
         if self._columns:
-            self._advance(self._base, self._before, self._t)
-        r.store(self._part, 0, step.length)
-        self._attempt(self._t, step.length)
-        change = self._following["change"]
+            self._advance_references(self._reference_index, self._reference_time, self._time)
+        r.store(self._step_length, 0, step.length)
+        self._attempt_step(self._time, step.length)
+        change = self._step_result["change"]
         # NaN: slower
-        wanted = r.let(step.length * select(change > 0.0, change, SLOWER))
-        with r.when(self._following["error"] <= 1.0):
-            closed = r.call("close", r.geometry, self._following, self._result, r.bounds)
-            with r.when(closed < 1):
+        next_length = r.new_variable(step.length * select(change > 0.0, change, MIN_STEP_RATIO))
+        with r.if_then(self._step_result["error"] <= 1.0):
+            closed = r.call("close", r.geometry, self._step_result, self._closure_result, r.bounds)
+            with r.if_then(closed < 1):
                 # nearer to where the branch ends, if it does
-                r.store(r.h, 1, step.length * SLOWER)
-                with r.when(self._following["move"] < _FOLLOWED):
-                    self._stop()
-            with r.otherwise():
-                self._finish(step, wanted)
-        with r.otherwise():
-            r.store(r.h, 1, wanted)
+                r.store(r.h, 1, step.length * MIN_STEP_RATIO)
+                with r.if_then(self._step_result["move"] < _MIN_CLOSABLE_MOVE):
+                    self._write_return()
+            with r.if_else():
+                self._finish_step(step, next_length)
+        with r.if_else():
+            r.store(r.h, 1, next_length)
 
-    def _propose(self) -> _StepVariables:
+    def _propose_step(self) -> _StepVariables:
         """Size and end of the next step; leaves the loop at the end."""
-        r, whole = self._r, self._whole
-        left, proposed = r.let(self._end - self._t), r.let(r.h[1])
-        with r.when(~(left > whole * _SHORTEST)):
-            r.leave()
-        sure, goal = r.let(0), r.let(self._end)
-        if self._short:
-            due = self._due
-            r.set(goal, select(due > self._t + whole * _SHORTEST, due, due + whole))
-            with r.when(goal > self._end):
-                r.set(goal, self._end)
-            r.set(left, goal - self._t)
-        if self._sticks:
-            with r.when((r.bounds[HELD] > 0.5) & (proposed > whole)):
-                r.set(proposed, whole)  # what is at rest does not tell how soon it starts
-        if self._sticks or self._edges:
-            with r.when(self._ahead > 0.0):
-                self._locate(left, sure)
-        last = r.let(proposed >= left * _NEARLY)
-        length = r.let(select(last, left, proposed))
-        with r.when(~(length >= whole * _SHORTEST) & (self._ahead <= 0.0)):
-            self._stop()
-        return _StepVariables(length, last, goal, sure, proposed)
+        r, output_interval = self._r, self._output_interval
+        time_left, proposed = r.new_variable(self._end_time - self._time), r.new_variable(r.h[1])
+        with r.if_then(~(time_left > output_interval * _MIN_STEP_SHARE)):
+            r.break_loop()
+        is_located, goal = r.new_variable(0), r.new_variable(self._end_time)
+        if self._steps_end_at_outputs:
+            output_time = self._output_time
+            r.assign(
+                goal,
+                select(
+                    output_time > self._time + output_interval * _MIN_STEP_SHARE,
+                    output_time,
+                    output_time + output_interval,
+                ),
+            )
+            with r.if_then(goal > self._end_time):
+                r.assign(goal, self._end_time)
+            r.assign(time_left, goal - self._time)
+        if self._has_stick_slip:
+            with r.if_then((r.bounds[HELD_INDEX] > 0.5) & (proposed > output_interval)):
+                r.assign(
+                    proposed, output_interval
+                )  # what is at rest does not tell how soon it starts
+        if self._has_stick_slip or self._event_distance_count:
+            with r.if_then(self._time_to_event > 0.0):
+                self._locate_event(time_left, is_located)
+        last = r.new_variable(proposed >= time_left * _END_SHARE)
+        length = r.new_variable(select(last, time_left, proposed))
+        with r.if_then(
+            ~(length >= output_interval * _MIN_STEP_SHARE) & (self._time_to_event <= 0.0)
+        ):
+            self._write_return()
+        return _StepVariables(length, last, goal, is_located, proposed)
 
-    def _locate(self, left: Value, sure: Value) -> None:
+    def _locate_event(self, time_left: RoutineValue, is_located: RoutineValue) -> None:
         """Shorten what is left to where the secant method expects the event."""
-        r, ahead = self._r, self._ahead
-        share = r.let((self._low + 1.5 * NEAR) / (self._low - self._high))
-        with r.when(self._tries > _BISECTED):
-            r.set(share, 0.5)
-        with r.when(~(share > _LEAST)):
-            r.set(share, _LEAST)
-        with r.when(share > 1.0 - _LEAST):
-            r.set(share, 1.0 - _LEAST)
-        with r.when(ahead < self._whole * _SHORTEST):  # a margin that jumps
-            r.set(share, 1.0)
-            r.set(sure, 1)
-        r.set(left, ahead * share)
-        r.set(self._tries, self._tries + 1)
+        r, time_to_event = self._r, self._time_to_event
+        share = r.new_variable(
+            (self._margin_before + 1.5 * EVENT_TOLERANCE)
+            / (self._margin_before - self._margin_behind)
+        )
+        with r.if_then(self._trial_count > _SECANT_TRIALS):
+            r.assign(share, 0.5)
+        with r.if_then(~(share > _MIN_TRIAL_SHARE)):
+            r.assign(share, _MIN_TRIAL_SHARE)
+        with r.if_then(share > 1.0 - _MIN_TRIAL_SHARE):
+            r.assign(share, 1.0 - _MIN_TRIAL_SHARE)
+        with r.if_then(
+            time_to_event < self._output_interval * _MIN_STEP_SHARE
+        ):  # a margin that jumps
+            r.assign(share, 1.0)
+            r.assign(is_located, 1)
+        r.assign(time_left, time_to_event * share)
+        r.assign(self._trial_count, self._trial_count + 1)
 
-    def _finish(self, step: _StepVariables, wanted: Value) -> None:
+    def _finish_step(self, step: _StepVariables, next_length: RoutineValue) -> None:
         """Behind a step whose error is small and whose end is closed."""
         r = self._r
-        self._call("rate", self._t + step.length, self._following, self._ending)
-        beyond_it, event = r.let(0), r.let(0)
-        worst = r.let(1.0)
-        self._detect(step, beyond_it, event, worst)
-        self._record(step, beyond_it, event)
-        with r.when(beyond_it < 1):
-            self._accept(step, wanted, event, worst)
+        self._call_formula("rate", self._time + step.length, self._step_result, self._end_rate)
+        is_beyond_event, event = r.new_variable(0), r.new_variable(0)
+        least_margin = r.new_variable(1.0)
+        self._detect_event(step, is_beyond_event, event, least_margin)
+        self._record_outputs(step, is_beyond_event, event)
+        with r.if_then(is_beyond_event < 1):
+            self._accept_step(step, next_length, event, least_margin)
 
-    def _detect(self, step: _StepVariables, beyond_it: Value, event: Value, worst: Value) -> None:
+    def _detect_event(
+        self,
+        step: _StepVariables,
+        is_beyond_event: RoutineValue,
+        event: RoutineValue,
+        least_margin: RoutineValue,
+    ) -> None:
         """Whether an event lies within the step (beyond_it) or at its end."""
         r = self._r
-        if self._sticks:
-            r.set(worst, self._ending["margin"])
-            with r.when(worst < -NEAR):
-                r.set(event, 1)
-        if self._edges:
-            r.call("crossed", self._ending, self._sides, self._crossed)
-            with r.when(self._crossed[0] < worst):
-                r.set(worst, self._crossed[0])
-        if self._sticks or self._edges:
-            with r.when((worst < -2.0 * NEAR) & (step.sure < 1)):
-                r.set(beyond_it, 1)
-                r.set(event, 0)
-                r.set(self._ahead, step.length)
-                r.set(self._high, worst)
+        if self._has_stick_slip:
+            r.assign(least_margin, self._end_rate["margin"])
+            with r.if_then(least_margin < -EVENT_TOLERANCE):
+                r.assign(event, 1)
+        if self._event_distance_count:
+            r.call("crossed", self._end_rate, self._event_signs, self._signed_distance)
+            with r.if_then(self._signed_distance[0] < least_margin):
+                r.assign(least_margin, self._signed_distance[0])
+        if self._has_stick_slip or self._event_distance_count:
+            with r.if_then((least_margin < -2.0 * EVENT_TOLERANCE) & (step.sure < 1)):
+                r.assign(is_beyond_event, 1)
+                r.assign(event, 0)
+                r.assign(self._time_to_event, step.length)
+                r.assign(self._margin_behind, least_margin)
 
-    def _record(self, step: _StepVariables, beyond_it: Value, event: Value) -> None:
+    def _record_outputs(
+        self, step: _StepVariables, is_beyond_event: RoutineValue, event: RoutineValue
+    ) -> None:
         """Write the rows of the output instants within the step."""
-        r, due, length = self._r, self._due, step.length
-        count, since = r.let(self._recorded), r.let(due)
-        with r.when((beyond_it < 1) & (due < (self._t + length) * _NEARLY)):
-            self._interpolate(self._t, length)
-        with r.forever():
-            with r.when((beyond_it > 0) | ~(due < (self._t + length) * _NEARLY)):
-                r.leave()
-            row = r.out.row(self._recorded, self._size + self._seen)
-            r.store(self._theta, 0, (due - self._t) / length)
-            r.call("interpolate", r.state, self._inside, self._theta, self._between)
-            closed = r.call("close", r.geometry, self._between, self._found, r.bounds)
-            with r.when(closed < 1):
-                self._stop()
-            self._call("observe", due, self._between, self._looked)
-            if self._sticks:
-                margin = self._looked["margin"]
-                with r.when((margin < -2.0 * NEAR) & (due > self._t) & (event < 1)):
-                    r.set(beyond_it, 1)
-                    r.set(self._ahead, due - self._t)
-                    r.set(self._high, margin)
-                    r.set(self._recorded, count)
-                    r.set(due, since)
-                    r.leave()
-            r.copy(row.at(self._size), self._looked, self._seen)
-            r.copy(row, self._between, self._size)
-            r.set(self._recorded, self._recorded + 1)
-            r.set(due, due + self._whole)
+        r, output_time, length = self._r, self._output_time, step.length
+        count, output_time_before = (
+            r.new_variable(self._recorded_count),
+            r.new_variable(output_time),
+        )
+        with r.if_then((is_beyond_event < 1) & (output_time < (self._time + length) * _END_SHARE)):
+            self._interpolate(self._time, length)
+        with r.loop_forever():
+            with r.if_then(
+                (is_beyond_event > 0) | ~(output_time < (self._time + length) * _END_SHARE)
+            ):
+                r.break_loop()
+            row = r.out.row_pointer(self._recorded_count, self._size + self._output_size)
+            r.store(self._relative_time, 0, (output_time - self._time) / length)
+            r.call(
+                "interpolate", r.state, self._dense_output, self._relative_time, self._interpolated
+            )
+            closed = r.call(
+                "close", r.geometry, self._interpolated, self._output_closure_result, r.bounds
+            )
+            with r.if_then(closed < 1):
+                self._write_return()
+            self._call_formula("observe", output_time, self._interpolated, self._observation)
+            if self._has_stick_slip:
+                margin = self._observation["margin"]
+                with r.if_then(
+                    (margin < -2.0 * EVENT_TOLERANCE) & (output_time > self._time) & (event < 1)
+                ):
+                    r.assign(is_beyond_event, 1)
+                    r.assign(self._time_to_event, output_time - self._time)
+                    r.assign(self._margin_behind, margin)
+                    r.assign(self._recorded_count, count)
+                    r.assign(output_time, output_time_before)
+                    r.break_loop()
+            r.copy(row.element_pointer(self._size), self._observation, self._output_size)
+            r.copy(row, self._interpolated, self._size)
+            r.assign(self._recorded_count, self._recorded_count + 1)
+            r.assign(output_time, output_time + self._output_interval)
 
-    def _accept(self, step: _StepVariables, wanted: Value, event: Value, worst: Value) -> None:
+    def _accept_step(
+        self,
+        step: _StepVariables,
+        next_length: RoutineValue,
+        event: RoutineValue,
+        least_margin: RoutineValue,
+    ) -> None:
         """Go on from the end of the step."""
-        r, ahead = self._r, self._ahead
+        r, time_to_event = self._r, self._time_to_event
         # a part that was cut short says nothing against the length it was cut from
-        kept = step.last & (step.proposed > wanted)
-        r.store(r.h, 1, select(kept, step.proposed, wanted))
-        at_goal = step.last & (ahead <= 0.0)
-        r.set(self._t, select(at_goal, step.goal, self._t + step.length))
-        if self._stepper.floats:  # other coordinates have other slopes
-            r.call("wrap", self._following, r.state)
-            self._call("rate", self._t, r.state, self._first)
+        keeps_proposal = step.last & (step.proposed > next_length)
+        r.store(r.h, 1, select(keeps_proposal, step.proposed, next_length))
+        at_goal = step.last & (time_to_event <= 0.0)
+        r.assign(self._time, select(at_goal, step.goal, self._time + step.length))
+        if self._stepper.has_floating_base:  # other coordinates have other slopes
+            r.call("wrap", self._step_result, r.state)
+            self._call_formula("rate", self._time, r.state, self._start_rate)
         else:
-            r.copy(r.state, self._following, self._size)
-            r.copy(self._first, self._ending, self._size)
-        with r.when(event > 0):
+            r.copy(r.state, self._step_result, self._size)
+            r.copy(self._start_rate, self._end_rate, self._size)
+        with r.if_then(event > 0):
             r.store(r.h, 5, 1.0)
-            self._stop()
-        with r.when(ahead > 0.0):
-            r.set(ahead, ahead - step.length)
-            r.set(self._low, worst)
-        if self._edges:
-            r.call("sides", self._ending, self._sides)
-            with r.when(worst < -NEAR):  # an edge, behind which it goes on
-                r.set(ahead, 0.0)
-                r.set(self._tries, 0)
-                r.set(self._low, 1.0)
-        with r.when(beyond(r, self._result)):
-            self._stop()
+            self._write_return()
+        with r.if_then(time_to_event > 0.0):
+            r.assign(time_to_event, time_to_event - step.length)
+            r.assign(self._margin_before, least_margin)
+        if self._event_distance_count:
+            r.call("sides", self._end_rate, self._event_signs)
+            with r.if_then(least_margin < -EVENT_TOLERANCE):  # an edge, behind which it goes on
+                r.assign(time_to_event, 0.0)
+                r.assign(self._trial_count, 0)
+                r.assign(self._margin_before, 1.0)
+        with r.if_then(exceeds_chart_limits(r, self._closure_result)):
+            self._write_return()
 
-    def _advance(self, index: Value, begins: Value, time: Value) -> None:
+    def _advance_references(
+        self, index: RoutineValue, start_time: RoutineValue, time: RoutineValue
+    ) -> None:
         """Move the references that are interpolated to those around a time."""
         r = self._r
-        with r.forever():
-            with r.when(
-                ~((time >= begins + self._pair) & (begins + self._pair * 1.5 < self._end))
+        with r.loop_forever():
+            with r.if_then(
+                ~(
+                    (time >= start_time + self._reference_spacing)
+                    & (start_time + self._reference_spacing * 1.5 < self._end_time)
+                )
             ):
-                r.leave()
-            r.set(index, index + 1)
-            r.set(begins, begins + self._pair)
+                r.break_loop()
+            r.assign(index, index + 1)
+            r.assign(start_time, start_time + self._reference_spacing)
 
-    def _refer(self, time: Value) -> None:
+    def _interpolate_references(self, time: RoutineValue) -> None:
         """Put the references at a time behind the step's beginning into `reference`."""
         r = self._r
-        index, begins = r.let(self._base), r.let(self._before)
-        self._advance(index, begins, time)
-        r.store(self._theta, 0, (time - begins) / self._pair)
-        row = r.refs.row(index, 2 * self._columns)
-        r.call("reference", row, self._theta, self._reference)
+        index, start_time = (
+            r.new_variable(self._reference_index),
+            r.new_variable(self._reference_time),
+        )
+        self._advance_references(index, start_time, time)
+        r.store(self._relative_time, 0, (time - start_time) / self._reference_spacing)
+        row = r.refs.row_pointer(index, 2 * self._columns)
+        r.call("reference", row, self._relative_time, self._reference)
 
-    def _call(self, formula: str, time: Value, *arrays: Place) -> None:
+    def _call_formula(self, formula: str, time: RoutineValue, *arrays: Place) -> None:
         r = self._r
         if self._columns:
-            self._refer(time)
-        if self._stepper.asks is not None:
-            r.call("asked", *self._machine, arrays[0], self._asked)
-            r.call("answer", self._asked, self._outside)
-        self._stepper.call_formula(r, formula, *self._machine, *arrays)
+            self._interpolate_references(time)
+        if self._stepper.external_callback is not None:
+            r.call("asked", *self._machine_arguments, arrays[0], self._callback_inputs)
+            r.call("answer", self._callback_inputs, self._callback_results)
+        self._stepper.call_formula(r, formula, *self._machine_arguments, *arrays)
 
-    def _stop(self) -> None:
-        self._r.store(self._r.h, 2, self._t - self._due)
-        self._r.give(self._recorded)
+    def _write_return(self) -> None:
+        self._r.store(self._r.h, 2, self._time - self._output_time)
+        self._r.return_value(self._recorded_count)

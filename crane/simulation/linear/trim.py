@@ -9,17 +9,22 @@ from crane.common.errors import CraneWarning, SimulationError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.recordings.recording import FORCE_UNITS
-from crane.simulation.linear.drive import Drive
+from crane.simulation.linear.linear_drive import LinearizedDrive
 
-_STILL = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
-_HANGS = 1e-6  # the same, of free joints that hang still
-_ROUNDS = 50  # of Newton's method
-_SHORT = 1e-3  # share of its step below which it is taken all the same
-_BAR, _MILLIMETRE, _THIMBLE, _SOON = 1e5, 1e-3, 1e-6, 0.1  # [Pa], [m], [m3], [s]
+_RESIDUAL_TOLERANCE = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
+_FREE_JOINT_TOLERANCE = 1e-6  # the same, of free joints that hang still
+_MAX_ITERATIONS = 50  # of Newton's method
+_MIN_STEP_SHARE = 1e-3  # share of its step below which it is taken all the same
+_PRESSURE_SCALE, _LENGTH_SCALE, _VOLUME_SCALE, _TIME_SCALE = (
+    1e5,
+    1e-3,
+    1e-6,
+    0.1,
+)  # [Pa], [m], [m3], [s]
 
 
-def trimmed(
-    dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array, outside: Array
+def find_trim(
+    dynamics: Dynamics, drive: LinearizedDrive, q_a: Array, v_a: Array, external_forces: Array
 ) -> tuple[Array, Array]:
     """The drive's states and inputs at which velocities and states stay.
 
@@ -28,28 +33,32 @@ def trimmed(
         drive: What acts on it.
         q_a: (n,).
         v_a: (n,).
-        outside: (n,) what forces from outside do along the active joints.
+        external_forces: (n,) what forces from outside do along the active joints.
 
     Raises:
         SimulationError: There are none.
     """
     machine = dynamics.machine
-    forces = dynamics.inverse(q_a, v_a, np.zeros(len(q_a))) + dynamics.friction(q_a, v_a) - outside
+    forces = (
+        dynamics.inverse(q_a, v_a, np.zeros(len(q_a)))
+        + dynamics.friction(q_a, v_a)
+        - external_forces
+    )
     if machine.free:
-        _check_hanging(dynamics, q_a, v_a, forces, outside)
-    if drive.states:
+        _check_free_joints(dynamics, q_a, v_a, forces, external_forces)
+    if drive.state_units:
         for shared in (True, False) if not v_a.any() else (True,):
-            found = _on_valves(_Trim(dynamics, drive, q_a, v_a, outside, shared))
-            if found is not None:
-                return found
+            trim = _trim_valves(_TrimEquations(dynamics, drive, q_a, v_a, external_forces, shared))
+            if trim is not None:
+                return trim
         raise SimulationError(
             "the machine cannot be trimmed there: no pressures and signals keep these velocities"
         )
-    return drive.own, forces[machine.driven]
+    return drive.own, forces[machine.is_driven]
 
 
-def _check_hanging(
-    dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array, outside: Array
+def _check_free_joints(
+    dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array, external_forces: Array
 ) -> None:
     """See that free joints keep their velocities while drives bear their share of forces (n,).
 
@@ -57,11 +66,13 @@ def _check_hanging(
         SimulationError: One does not.
     """
     machine = dynamics.machine
-    held = np.where(machine.driven, forces, 0.0)
-    units = machine.closure.units[machine.closure.active] / machine.closure.pace**2
-    moved = np.abs(dynamics.forward(q_a, v_a, held + outside, friction=True)) / units
-    if moved.max() > _HANGS:
-        worst = int(np.argmax(np.abs(forces - held)))
+    drive_forces = np.where(machine.is_driven, forces, 0.0)
+    units = machine.closure.units[machine.closure.active] / machine.closure.characteristic_time**2
+    accelerations = (
+        np.abs(dynamics.forward(q_a, v_a, drive_forces + external_forces, friction=True)) / units
+    )
+    if accelerations.max() > _FREE_JOINT_TOLERANCE:
+        worst = int(np.argmax(np.abs(forces - drive_forces)))
         joint = machine.active[worst]
         unit = FORCE_UNITS[machine.unit(joint)]
         raise SimulationError(
@@ -70,7 +81,7 @@ def _check_hanging(
         )
 
 
-class _Trim:
+class _TrimEquations:
     """What is left of an equilibrium on valves, over their states and signals z.
 
     Joints at rest have their valves closed: the pressure of the chamber that bears the load holds
@@ -82,125 +93,144 @@ class _Trim:
         drive: The circuit.
         q_a: (n,).
         v_a: (n,).
-        outside: See `trimmed`.
-        shared: Whether states of no joint, of pumps and lines, have to stay what they are, too.
+        external_forces: See `find_trim`.
+        include_shared: Whether states of no joint, of pumps and lines, have to stay what they are,
+            too.
 
     Attributes:
-        start: (k + m,) closed valves.
+        closed_valves: (k + m,) closed valves.
     """
 
     def __init__(
         self,
         dynamics: Dynamics,
-        drive: Drive,
+        drive: LinearizedDrive,
         q_a: Array,
         v_a: Array,
-        outside: Array,
-        shared: bool = True,
+        external_forces: Array,
+        include_shared: bool = True,
     ):
         self._dynamics, self.drive, self._q_a, self.v_a = dynamics, drive, q_a, v_a
-        self._outside = outside
+        self._external_forces = external_forces
         closure = dynamics.machine.closure
-        n, k = len(q_a), len(drive.states)
-        pressure = np.array([unit == "Pa" for unit in drive.states.values()])
-        spring = np.array([name.startswith("spring_") for name in drive.states])
-        volume = np.array([unit == "m3" for unit in drive.states.values()])
-        scales = np.select([pressure, spring, volume], [_BAR, _MILLIMETRE, _THIMBLE], 1.0)
-        moving = drive.moving(v_a, shared)
-        loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)) - outside)
-        self._free = np.flatnonzero(np.concatenate([loaded | spring | moving[:k], moving[k:]]))
-        self._rows = np.concatenate([np.arange(n), n + np.flatnonzero(spring | moving[:k])])
-        self._scales = np.concatenate([scales, np.ones(len(drive.u))])
+        n, k = len(q_a), len(drive.state_units)
+        pressure = np.array([unit == "Pa" for unit in drive.state_units.values()])
+        spring = np.array([name.startswith("spring_") for name in drive.state_units])
+        volume = np.array([unit == "m3" for unit in drive.state_units.values()])
+        scales = np.select(
+            [pressure, spring, volume], [_PRESSURE_SCALE, _LENGTH_SCALE, _VOLUME_SCALE], 1.0
+        )
+        moving = drive.moving_mask(v_a, include_shared)
+        loaded = drive.load_bearing_mask(dynamics.inverse(q_a, v_a, np.zeros(n)) - external_forces)
+        self._free_indices = np.flatnonzero(
+            np.concatenate([loaded | spring | moving[:k], moving[k:]])
+        )
+        self._equation_rows = np.concatenate(
+            [np.arange(n), n + np.flatnonzero(spring | moving[:k])]
+        )
+        self._variable_scales = np.concatenate([scales, np.ones(len(drive.u))])
         # pressures of bars within tenths of a second are as much as such accelerations
-        accelerations = closure.units[closure.active] / closure.pace**2
-        self._units = np.concatenate([accelerations, scales / _SOON])[self._rows]
+        accelerations = closure.units[closure.active] / closure.characteristic_time**2
+        self._equation_scales = np.concatenate([accelerations, scales / _TIME_SCALE])[
+            self._equation_rows
+        ]
         self.start = np.concatenate([drive.own, drive.u])
 
-    def rates(self, z: Array) -> Array:
+    def state_rates(self, z: Array) -> Array:
         """(k,) of the states."""
-        n, k = len(self._q_a), len(self.drive.states)
-        return self.drive.at(self._q_a, self.v_a, z[:k], z[k:])[0][n : n + k]
+        n, k = len(self._q_a), len(self.drive.state_units)
+        return self.drive.evaluate(self._q_a, self.v_a, z[:k], z[k:])[0][n : n + k]
 
-    def left(self, z: Array) -> tuple[Array, Array]:
+    def residual(self, z: Array) -> tuple[Array, Array]:
         """Accelerations and rates in their units, and their derivatives by z."""
-        drive, n, k = self.drive, len(self._q_a), len(self.drive.states)
-        values, slopes = drive.at(self._q_a, self.v_a, z[:k], z[k:])
-        state = self._q_a, self.v_a, values[:n] + self._outside
+        drive, n, k = self.drive, len(self._q_a), len(self.drive.state_units)
+        values, drive_jacobian = drive.evaluate(self._q_a, self.v_a, z[:k], z[k:])
+        state = self._q_a, self.v_a, values[:n] + self._external_forces
         a_a = self._dynamics.forward(*state, friction=True)
         found = self._dynamics.derivatives("forward", *state, friction=True, by=["tau_a"])
-        by = slopes[:, 2 * n :]
-        rows = np.vstack([found["tau_a"] @ by[:n], by[n : n + k]])
+        variable_derivatives = drive_jacobian[:, 2 * n :]
+        rows = np.vstack(
+            [found["tau_a"] @ variable_derivatives[:n], variable_derivatives[n : n + k]]
+        )
         left = np.concatenate([a_a, values[n : n + k]])
-        return left[self._rows] / self._units, rows[self._rows] / self._units[:, None]
+        return left[self._equation_rows] / self._equation_scales, rows[
+            self._equation_rows
+        ] / self._equation_scales[:, None]
 
-    def polished(self, z: Array, damped: bool = False) -> Array | None:
+    def solve_newton(self, z: Array, damped: bool = False) -> Array | None:
         """The nearest z at which nothing is left, by Newton's method; None if there is none.
 
         Damped, its steps are halved until less is left: over a throttle between two nodes it goes
         back and forth else, root(x) having its zero half the step ahead.
         """
-        z, free = z.copy(), self._free
-        for _ in range(_ROUNDS):
-            left, slopes = self.left(z)
-            if np.abs(left).max() < _STILL:
+        z, free = z.copy(), self._free_indices
+        for _ in range(_MAX_ITERATIONS):
+            residual, jacobian = self.residual(z)
+            if np.abs(residual).max() < _RESIDUAL_TOLERANCE:
                 return z
-            rows = (slopes * self._scales)[:, free]
-            step = np.linalg.lstsq(rows, left, rcond=1e-10)[0]
+            rows = (jacobian * self._variable_scales)[:, free]
+            step = np.linalg.lstsq(rows, residual, rcond=1e-10)[0]
             if not np.isfinite(step).all():
                 return None
-            way = np.zeros(len(z))
-            way[free] = step * self._scales[free]
+            direction = np.zeros(len(z))
+            direction[free] = step * self._variable_scales[free]
             share = 1.0
-            while damped and share > _SHORT and not self._less(z - share * way, left):
+            while (
+                damped
+                and share > _MIN_STEP_SHARE
+                and not self._reduces_residual(z - share * direction, residual)
+            ):
                 share *= 0.5
-            z -= share * way
+            z -= share * direction
         return None
 
-    def _less(self, z: Array, left: Array) -> bool:
+    def _reduces_residual(self, z: Array, residual: Array) -> bool:
         """Whether less is left at another z."""
-        return bool(np.linalg.norm(self.left(z)[0]) < np.linalg.norm(left))
+        return bool(np.linalg.norm(self.residual(z)[0]) < np.linalg.norm(residual))
 
-    def searched(self, share: float) -> Array:
+    def search_from_opening(self, share: float) -> Array:
         """The best z from valves that are open by a share of their stroke, and stay open."""
         from scipy.optimize import least_squares
 
-        z, ways, lower, upper = self.drive.opened(self.v_a, share)
+        z, directions, lower, upper = self.drive.opened_valves(self.v_a, share)
 
-        def left(x: Array) -> Array:
-            return self.left(z + ways @ x)[0]
+        def residual(x: Array) -> Array:
+            return self.residual(z + directions @ x)[0]
 
         def slopes(x: Array) -> Array:
-            found: Array = self.left(z + ways @ x)[1] @ ways
+            found: Array = self.residual(z + directions @ x)[1] @ directions
             return found
 
-        scales = 1.0 / (np.abs(ways) / self._scales[:, None]).max(axis=0)
-        start = np.zeros(len(lower))
-        found = least_squares(left, start, slopes, (lower, upper), x_scale=scales)
-        return z + ways @ found.x
+        scales = 1.0 / (np.abs(directions) / self._variable_scales[:, None]).max(axis=0)
+        closed_valves = np.zeros(len(lower))
+        solution = least_squares(residual, closed_valves, slopes, (lower, upper), x_scale=scales)
+        return z + directions @ solution.x
 
 
-def _on_valves(trim: _Trim) -> tuple[Array, Array] | None:
-    drive, k = trim.drive, len(trim.drive.states)
-    starts = (trim.searched(share) for share in (0.2, 0.5, 0.8)) if trim.v_a.any() else ()
-    done = next(
+def _trim_valves(trim: _TrimEquations) -> tuple[Array, Array] | None:
+    drive, k = trim.drive, len(trim.drive.state_units)
+    starts = (
+        (trim.search_from_opening(share) for share in (0.2, 0.5, 0.8)) if trim.v_a.any() else ()
+    )
+    trimmed_values = next(
         (
             z
             for start in itertools.chain(starts, [trim.start])
             for damped in (False, True)
-            if (z := trim.polished(start, damped)) is not None
+            if (z := trim.solve_newton(start, damped)) is not None
         ),
         None,
     )
-    if done is None:
+    if trimmed_values is None:
         return None
-    rates = np.abs(trim.rates(done))
+    rates = np.abs(trim.state_rates(trimmed_values))
     worst = int(np.argmax(np.where(rates > 1e-3 * drive.scales, rates / drive.scales, 0.0)))
-    if rates[worst] > _BAR * _STILL:
-        name, unit = list(drive.states.items())[worst]
+    if rates[worst] > _PRESSURE_SCALE * _RESIDUAL_TOLERANCE:
+        name, unit = list(drive.state_units.items())[worst]
         warnings.warn(
             f"linearized where it does not stay: {name} changes by {rates[worst]:.3g} {unit}/s "
             "with closed valves, through leakage or relief valves",
             CraneWarning,
             stacklevel=4,
         )
-    return done[:k], done[k:]
+    return trimmed_values[:k], trimmed_values[k:]

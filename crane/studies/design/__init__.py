@@ -1,5 +1,5 @@
 """Numbers of a machine that are best for measures of it."""
 
-from crane.studies.design.optimum import Design, Solution, design
+from crane.studies.design.design_optimization import Design, DesignSolution, design
 
-__all__ = ["Design", "Solution", "design"]
+__all__ = ["Design", "DesignSolution", "design"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crane.common.errors import RecordingError, known
+from crane.common.errors import RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -18,7 +18,7 @@ class Playback:
     Attributes:
         start: Time of the first sample [s].
         end: Time of the last sample [s].
-        q: (N, nq) closed postures of all samples [m], [rad].
+        configurations: (N, nq) closed postures of all samples [m], [rad].
 
     Raises:
         RecordingError: It lacks an active joint of the machine.
@@ -31,25 +31,31 @@ class Playback:
             if joint not in recording.joints:
                 raise RecordingError(
                     f"the recording has no joint '{joint}', which drives {machine.name}, "
-                    f"{known(recording.joints, joint)}"
+                    f"{suggest_names(recording.joints, joint)}"
                 )
             columns.append(recording.joints.index(joint))
         self._time = recording.time
-        self._n = len(columns)
-        self._values = np.hstack([recording.q[:, columns], recording.tau[:, columns]])
+        self._active_count = len(columns)
+        self._coordinates_and_forces = np.hstack(
+            [recording.q[:, columns], recording.tau[:, columns]]
+        )
         self.start, self.end = float(self._time[0]), float(self._time[-1])
-        self.q = machine.closure.solve(self._values[:, : self._n])
+        self.configurations = machine.closure.solve(
+            self._coordinates_and_forces[:, : self._active_count]
+        )
 
-    def at(self, time: float) -> tuple[Array, Array]:
+    def interpolate(self, time: float) -> tuple[Array, Array]:
         """Active coordinates (n,) [m], [rad] and forces (n,) [N], [N m] at a time [s].
 
         They run straight from sample to sample.
         """
-        after = int(np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1)))
-        rows = self._values[after - 1 : after + 1]
-        if len(rows) == 1:
-            return rows[0, : self._n], rows[0, self._n :]
-        begin, end = self._time[after - 1 : after + 1]
-        share = np.clip((time - begin) / (end - begin), 0.0, 1.0)
-        values = rows[0] + share * (rows[1] - rows[0])
-        return values[: self._n], values[self._n :]
+        next_index = int(
+            np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
+        )
+        adjacent_rows = self._coordinates_and_forces[next_index - 1 : next_index + 1]
+        if len(adjacent_rows) == 1:
+            return adjacent_rows[0, : self._active_count], adjacent_rows[0, self._active_count :]
+        start_time, end_time = self._time[next_index - 1 : next_index + 1]
+        share = np.clip((time - start_time) / (end_time - start_time), 0.0, 1.0)
+        values = adjacent_rows[0] + share * (adjacent_rows[1] - adjacent_rows[0])
+        return values[: self._active_count], values[self._active_count :]

@@ -1,6 +1,6 @@
 """One offline page with the machine, its forces and its numbers."""
 
-from crane.view.page.build import open_in_browser, report
+from crane.view.page.report_page import open_in_browser, report
 from crane.view.page.scene import Scene, build_scene
 
 __all__ = ["Scene", "build_scene", "open_in_browser", "report"]

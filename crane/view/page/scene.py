@@ -9,18 +9,18 @@ import pinocchio as pin
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.formats.visuals.visuals import Visual
+from crane.formats.visuals.urdf_shapes import Visual
 from crane.machine import Machine
-from crane.view.page.drawing import Recorder, draw_surroundings, draw_visuals
-from crane.view.page.motion import frame_rows, postures
-from crane.view.page.visuals import read_visuals
+from crane.view.page.machine_visuals import read_visuals
+from crane.view.page.meshcat_commands import CommandRecorder, draw_surroundings, draw_visuals
+from crane.view.page.page_motion import frame_rows, recorded_configurations
 
 if TYPE_CHECKING:
     from crane.recordings.recording import Recording
 
-_LOOKED_AT = 300  # frames that tell how large the scene is
-_FLAT = 1e-3  # share of a scene's size that each side has at least
-_SMALLEST = 1e-3  # [m], of a scene in which everything is a point
+_SAMPLED_FRAMES = 300  # frames that tell how large the scene is
+_MIN_SIDE_SHARE = 1e-3  # share of a scene's size that each side has at least
+_MIN_SIZE = 1e-3  # [m], of a scene in which everything is a point
 
 
 @dataclass(frozen=True)
@@ -30,28 +30,28 @@ class Scene:
     Attributes:
         commands: Commands of the meshcat viewer, in their order. Each link that has visuals is
             the group machine/<link>, its pose in the first frame that group's transform.
-        rows: (N,) samples of the recording that are frames; one 0 for a still posture.
+        frame_rows: (N,) samples of the recording that are frames; one 0 for a still posture.
         time: (N,) their times [s].
-        q: (N, nq) their postures.
+        configurations: (N, nq) their postures.
         lower: (3,) lowest corner of what is drawn [m].
         upper: (3,) highest corner [m].
-        ground: Height that the machine stands at [m].
+        ground_height: Height that the machine stands at [m].
         heading: Angle about z from the x axis to where the tip points in the first frame, seen
             from the first joint that moves it [rad]; 0 without a tip, or with one on that axis.
     """
 
     commands: Sequence[dict[str, Any]]
-    rows: np.ndarray
+    frame_rows: np.ndarray
     time: Array
-    q: Array
+    configurations: Array
     lower: Array
     upper: Array
-    ground: float
+    ground_height: float
     heading: float
 
 
 def build_scene(
-    machine: Machine, recording: "Recording | None" = None, share: float = 1.0
+    machine: Machine, recording: "Recording | None" = None, frame_share: float = 1.0
 ) -> Scene:
     """The machine in its home posture, or moving as recorded.
 
@@ -59,7 +59,7 @@ def build_scene(
         machine: The machine.
         recording: Its motion. Where it lacks the channel of a passive joint, the loops are closed
             at its active coordinates.
-        share: See `frame_rows`.
+        frame_share: See `frame_rows`.
 
     Raises:
         RecordingError: The recording is of a machine with other joints.
@@ -68,33 +68,41 @@ def build_scene(
     """
     import meshcat
 
-    rows = np.zeros(1, dtype=int) if recording is None else frame_rows(recording.time, share)
-    time = np.zeros(1) if recording is None else recording.time[rows]
-    q = machine.home[None] if recording is None else postures(machine, recording, rows)
+    sample_rows = (
+        np.zeros(1, dtype=int) if recording is None else frame_rows(recording.time, frame_share)
+    )
+    time = np.zeros(1) if recording is None else recording.time[sample_rows]
+    configurations = (
+        machine.home[None]
+        if recording is None
+        else recorded_configurations(machine, recording, sample_rows)
+    )
     visuals = read_visuals(machine)
     links = tuple(dict.fromkeys(visual.link for visual in visuals))
-    some = np.unique(np.linspace(0, len(q) - 1, _LOOKED_AT).astype(int))
-    poses = link_poses(machine, q[some], links)
-    between = {link for item in machine.elements for link in item.between or ()}
-    lower, upper = _bounds(visuals, poses, link_poses(machine, q[some], between))
-    floor = ground(machine, visuals)
-    lower[2], upper[2] = min(lower[2], floor), max(upper[2], floor)
+    sampled_rows = np.unique(np.linspace(0, len(configurations) - 1, _SAMPLED_FRAMES).astype(int))
+    poses = link_poses(machine, configurations[sampled_rows], links)
+    element_links = {link for item in machine.force_elements for link in item.between or ()}
+    lower, upper = _scene_bounds(
+        visuals, poses, link_poses(machine, configurations[sampled_rows], element_links)
+    )
+    floor_height = ground_height(machine, visuals)
+    lower[2], upper[2] = min(lower[2], floor_height), max(upper[2], floor_height)
 
-    recorder = Recorder()
+    recorder = CommandRecorder()
     viewer = meshcat.Visualizer(window=recorder)
-    draw_surroundings(viewer["ground"], lower, upper, floor)
+    draw_surroundings(viewer["ground"], lower, upper, floor_height)
     draw_visuals(viewer["machine"], visuals)
     for link, pose in poses.items():
         viewer["machine"][link].set_transform(pose[0])
     return Scene(
         commands=recorder.commands,
-        rows=rows,
+        frame_rows=sample_rows,
         time=time,
-        q=q,
+        configurations=configurations,
         lower=lower,
         upper=upper,
-        ground=floor,
-        heading=_heading(machine, q[0], float(np.linalg.norm(upper - lower))),
+        ground_height=floor_height,
+        heading=_tip_heading(machine, configurations[0], float(np.linalg.norm(upper - lower))),
     )
 
 
@@ -107,9 +115,9 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
     data = machine.model.createData()
     frames = {link: machine.frame(link) for link in links}
     poses = {link: np.empty((len(q), 4, 4)) for link in frames}
-    for i, posture in enumerate(q):
-        at = machine.coordinates.configuration(posture)
-        pin.framesForwardKinematics(machine.model, data, at)
+    for i, configuration in enumerate(q):
+        pinocchio_configuration = machine.coordinates.configuration(configuration)
+        pin.framesForwardKinematics(machine.model, data, pinocchio_configuration)
         for link, frame in frames.items():
             poses[link][i] = data.oMf[frame].homogeneous
     for link, pose in poses.items():
@@ -118,22 +126,22 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
     return poses
 
 
-def ground(machine: Machine, visuals: Sequence[Visual]) -> float:
+def ground_height(machine: Machine, visuals: Sequence[Visual]) -> float:
     """Height that the machine stands at [m]: the lowest point of what cannot move.
 
     The origin's height where nothing of what is drawn stands still: how low the tip reaches says
     nothing about the ground.
     """
     heights = [
-        float((place.placement * corner)[2])
+        float((frame.placement * corner)[2])
         for visual in visuals
-        if not (place := machine.model.frames[machine.frame(visual.link)]).parentJoint
-        for corner in visual.corners()
+        if not (frame := machine.model.frames[machine.frame(visual.link)]).parentJoint
+        for corner in visual.bounding_corners()
     ]
     return min(heights, default=0.0)
 
 
-def _heading(machine: Machine, q: Array, size: float) -> float:
+def _tip_heading(machine: Machine, q: Array, size: float) -> float:
     if machine.tip is None:
         return 0.0
     data = machine.model.createData()
@@ -146,16 +154,16 @@ def _heading(machine: Machine, q: Array, size: float) -> float:
     return float(np.arctan2(y, x)) if np.hypot(x, y) > 1e-3 * size else 0.0
 
 
-def _bounds(
-    visuals: Sequence[Visual], poses: Mapping[str, Array], ends: Mapping[str, Array]
+def _scene_bounds(
+    visuals: Sequence[Visual], poses: Mapping[str, Array], element_end_poses: Mapping[str, Array]
 ) -> tuple[Array, Array]:
     """Lowest and highest corner of everything in all frames, ends of springs included."""
-    points = [pose[:, :3, 3] for pose in ends.values()]
+    points = [pose[:, :3, 3] for pose in element_end_poses.values()]
     for visual in visuals:
-        pose, corners = poses[visual.link], visual.corners()
-        moved = corners @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
-        points.append(moved.reshape(-1, 3))
-    everything = np.concatenate(points)
-    lower, upper = everything.min(axis=0), everything.max(axis=0)
+        pose, corners = poses[visual.link], visual.bounding_corners()
+        world_corners = corners @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
+        points.append(world_corners.reshape(-1, 3))
+    all_points = np.concatenate(points)
+    lower, upper = all_points.min(axis=0), all_points.max(axis=0)
     size = float((upper - lower).max())
-    return lower, np.maximum(upper, lower + (_FLAT * size or _SMALLEST))
+    return lower, np.maximum(upper, lower + (_MIN_SIDE_SHARE * size or _MIN_SIZE))

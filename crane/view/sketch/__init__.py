@@ -1,6 +1,6 @@
 """Drawings of a machine: its mechanism with dimensions, its hydraulic circuit."""
 
-from crane.view.sketch.circuit.figure import sketch_circuit
-from crane.view.sketch.draw import sketch
+from crane.view.sketch.circuit.circuit_drawing import sketch_circuit
+from crane.view.sketch.sketch_figure import sketch
 
 __all__ = ["sketch", "sketch_circuit"]

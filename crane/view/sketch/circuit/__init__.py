@@ -1,5 +1,5 @@
 """The hydraulic circuit as a drawing of graphic symbols (ISO 1219-1)."""
 
-from crane.view.sketch.circuit.figure import circuit_figure, sketch_circuit
+from crane.view.sketch.circuit.circuit_drawing import circuit_figure, sketch_circuit
 
 __all__ = ["circuit_figure", "sketch_circuit"]

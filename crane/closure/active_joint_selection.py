@@ -1,0 +1,253 @@
+"""Which joints to drive: how well a choice of active joints determines the others.
+
+With J the Jacobian of the loop equations at a closed posture, D = diag(scales) and N (nv, n) an
+orthonormal basis of the null space of J D, the motions of the machine are v = D N y. A choice A of
+n joints has v_A = D_A N_A y, so that the scaled Jacobian of all joints by the chosen ones is
+
+    D^-1 gamma D_A = N N_A^-1,    condition = ||D^-1 gamma D_A||_2 = 1 / sigma_min(N_A),
+
+which is 1 where no other joint moves, and infinite at a dead centre: sigma_min(N_A) is also the
+least singular value of J_P once the rows of J D are made orthonormal. It does not depend on how
+equations are written, nor on units: see `motion_scales`.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from crane.closure.coordinates import Coordinates
+from crane.common.samples import Array
+
+Indices = NDArray[np.intp]
+
+# sigma_min of a choice that drives nothing at home, see `crane.closure.constraint_structure`
+DEAD_CENTRE_TOLERANCE = 1e-5
+_UNDRIVEN_NAME = re.compile("passive|free", re.IGNORECASE)  # names of joints that nothing drives
+_MAX_ACTUATOR_CONDITION = (
+    100.0  # condition up to which actuators are proposed before better joints
+)
+_MAX_EXCHANGES = 200
+_ROUNDING_TOLERANCE = 1e-9  # share by which what differs only by rounding does
+
+
+@dataclass(frozen=True)
+class ActiveJointSelection:
+    """Active joints, and how well they drive the machine at home.
+
+    Attributes:
+        joints: Their names, in the order of the tree.
+        condition_number: See the module.
+    """
+
+    joints: tuple[str, ...]
+    condition_number: float
+
+    def __str__(self) -> str:
+        return f"[{', '.join(self.joints)}] (condition {self.condition_number:.3g})"
+
+
+def translational_coordinates(model: pin.Model) -> NDArray[np.bool_]:
+    """(nv,) whether a coordinate is a length."""
+    return Coordinates(model).is_translation
+
+
+def characteristic_length(model: pin.Model) -> float:
+    """The size of a machine: the largest distance between neighbouring joints [m].
+
+    Where all joints are in one place, that of a link from its joint, or else the farthest limit of
+    a slide; 1 m for a machine without any length.
+    """
+    joints = (place.translation for place in list(model.jointPlacements)[1:])
+    links = (frame.placement.translation for frame in model.frames)
+    coordinates = Coordinates(model)
+    limits = np.abs(np.stack([coordinates.lower, coordinates.upper]))[
+        :, coordinates.is_translation
+    ]
+    distances = (float(np.abs(list(places)).max(initial=0.0)) for places in (joints, links))
+    return (
+        next(filter(None, distances), float(limits[np.isfinite(limits)].max(initial=0.0))) or 1.0
+    )
+
+
+def coordinate_units(model: pin.Model) -> Array:
+    """(nv,) units of coordinates that compare: 1 rad, and the size of the machine."""
+    return np.where(translational_coordinates(model), characteristic_length(model), 1.0)
+
+
+def motion_scales(model: pin.Model) -> Array:
+    """(nv,) ways of the joints that compare: their ranges, of at most 1 rad or the machine's size.
+
+    Those also stand for the ranges of joints without limits.
+    """
+    units_of_coordinates = coordinate_units(model)
+    coordinates = Coordinates(model)
+    ranges = coordinates.upper - coordinates.lower
+    return np.where(ranges > 0, np.minimum(ranges, units_of_coordinates), units_of_coordinates)
+
+
+def null_space_basis(jacobian: Array, scales_of_motion: Array, tolerance: float) -> Array:
+    """N (nv, n): an orthonormal basis of the scaled motions that equations allow to first order.
+
+    Args:
+        jacobian: (m, nv).
+        scales_of_motion: (nv,).
+        tolerance: Singular values below this share of the largest count as zero.
+    """
+    if not jacobian.size:
+        return np.eye(len(scales_of_motion))
+    _, values, right = np.linalg.svd(jacobian * scales_of_motion)
+    return np.asarray(right[int((values > tolerance * values[0]).sum()) :].T)
+
+
+def condition_number(gamma: Array, scales_of_motion: Array, active: Indices) -> Array:
+    """Condition numbers of a drive.
+
+    Args:
+        gamma: (nv, n) or (N, nv, n) of closed postures.
+        scales_of_motion: (nv,), see `motion_scales`.
+        active: (n,) columns of the active joints.
+
+    Returns:
+        () or (N,), at least 1.
+    """
+    scaled_gamma = gamma * scales_of_motion[active] / scales_of_motion[:, None]
+    return np.asarray(np.linalg.norm(scaled_gamma, 2, axis=(-2, -1)))
+
+
+def select_columns(
+    basis: Array, candidates: Sequence[int], required: Sequence[int] = ()
+) -> Indices | None:
+    """Joints of the largest |det N_A|, or near it.
+
+    A QR factorisation with column pivoting of N^T starts; then a chosen joint i gives way to any
+    other j that it moves by more than itself, |N N_A^-1|_ji > 1, which multiplies |det N_A| by
+    that (Goreinov and Tyrtyshnikov 2001). At the end no joint is moved by more than its scale when
+    one of the chosen ones moves by its own, so condition <= sqrt(1 + n (nv - n)).
+
+    Args:
+        basis: N (nv, n).
+        candidates: Columns to choose from.
+        required: Columns that are chosen in any case.
+
+    Returns:
+        (n,) columns in ascending order; None where no choice drives the machine.
+    """
+    count = basis.shape[1]
+    free = [i for i in candidates if i not in required]
+    rows = basis[free]
+    if len(required):
+        if np.linalg.matrix_rank(basis[list(required)], DEAD_CENTRE_TOLERANCE) < len(required):
+            return None
+        _, _, right = np.linalg.svd(basis[list(required)])
+        rows = rows @ right[len(required) :].T  # what the kept ones leave free
+    missing = count - len(required)
+    if len(free) < missing:
+        return None
+    chosen = list(required)
+    if missing:
+        chosen += [free[i] for i in _pivot_rows(rows, missing)]
+    if np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) < DEAD_CENTRE_TOLERANCE:
+        return None
+    for _ in range(_MAX_EXCHANGES if missing else 0):
+        gains = np.abs(np.linalg.solve(basis[chosen].T, basis[free].T)).T  # (free, n)
+        gains[:, : len(required)] = 0.0
+        j, i = np.unravel_index(_argmax_up_to_rounding(gains.ravel()), gains.shape)
+        if gains[j, i] <= 1.0 + _ROUNDING_TOLERANCE:
+            break
+        chosen[int(i)] = free[int(j)]
+    return np.sort(np.array(chosen, dtype=np.intp))
+
+
+def _pivot_rows(rows: Array, count: int) -> list[int]:
+    """Of a QR factorisation of rows^T with column pivoting."""
+    remaining, found = rows.copy(), []
+    for _ in range(count):
+        sizes = np.linalg.norm(remaining, axis=1)
+        found.append(at := _argmax_up_to_rounding(sizes))
+        direction = remaining[at] / max(float(sizes[at]), 1e-300)
+        remaining -= np.outer(remaining @ direction, direction)
+    return found
+
+
+def _argmax_up_to_rounding(values: Array) -> int:
+    """Index of the largest, of equal ones the first: rounding does not choose."""
+    return int(np.argmax(values >= (1.0 - _ROUNDING_TOLERANCE) * values.max()))
+
+
+def propose_active_joints(
+    model: pin.Model,
+    jacobian: Array,
+    coupled: Sequence[int] = (),
+    candidates: Sequence[int] | None = None,
+    required: Sequence[int] = (),
+) -> list[ActiveJointSelection]:
+    """Choices of active joints for a machine at a posture, at most two.
+
+    Actuators come first where their condition is below 100: joints that slide, and those whose
+    effort is limited; pins that only hold parts together usually have no limits. Those whose names
+    say that nothing drives them are left out if the others are enough. Second comes the
+    best-conditioned choice of any joints, or what is best without the joint of the first that the
+    others need least.
+
+    Args:
+        model: The spanning tree.
+        jacobian: (m, nv) of all loop equations.
+        coupled: Columns of joints that follow others by a coupling, which are taken last.
+        candidates: Columns to choose from; all if not given.
+        required: Columns that are chosen in any case.
+    """
+    scale = motion_scales(model)
+    basis = null_space_basis(jacobian, scale, DEAD_CENTRE_TOLERANCE)
+    coordinates = Coordinates(model)
+    names = coordinates.names
+    columns = range(model.nv) if candidates is None else candidates
+    free = [i for i in columns if i not in coupled]
+    effort = np.asarray(model.effortLimit)
+    looks_actuated = translational_coordinates(model) | (np.isfinite(effort) & (effort > 0))
+    actuators = [i for i in free if looks_actuated[i]]
+    if basis.shape[1] == 0:
+        return []
+
+    def valued(found: Indices | None) -> ActiveJointSelection | None:
+        if found is None:
+            return None
+        least = float(np.linalg.svd(basis[found], compute_uv=False)[-1])
+        return ActiveJointSelection(tuple(names[i] for i in found), 1.0 / least)
+
+    best = valued(select_columns(basis, free, required)) or valued(
+        select_columns(basis, columns, required)
+    )
+    if best is None:
+        return []
+    not_idle_by_name = [i for i in actuators if not _UNDRIVEN_NAME.search(names[i])]
+    driven = valued(select_columns(basis, not_idle_by_name, required)) or valued(
+        select_columns(basis, actuators, required)
+    )
+    first = (
+        driven
+        if driven is not None and driven.condition_number < _MAX_ACTUATOR_CONDITION
+        else best
+    )
+    out = [first]
+    if first.joints != best.joints:
+        return [first, best]
+    others = [
+        valued(select_columns(basis, [i for i in free if names[i] != name], required))
+        for name in first.joints
+        if names.index(name) not in required
+    ]
+    acceptable = [
+        choice
+        for choice in others
+        if choice is not None and choice.condition_number < _MAX_ACTUATOR_CONDITION
+    ]
+    return out + sorted(acceptable, key=lambda choice: choice.condition_number)[:1]
+
+
+def format_selections(selections: Sequence[ActiveJointSelection]) -> str:
+    """Choices as an error proposes them."""
+    return ", or ".join(str(choice) for choice in selections)

@@ -1,0 +1,392 @@
+"""Other assemblies: postures that close the loops at the same active coordinates.
+
+Equations that solve one after the other (see `crane.closure.block_triangular_form`) have their
+alternatives one after the other, too: a triangle or a four-bar linkage has two, mirror images of
+each other. So each block is solved anew from starts all over its unknowns, with what was solved
+before it as at home; what comes after it follows, from where the guess has it.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.closure import Closure
+from crane.closure.constraint_structure import Indices
+from crane.closure.constraint_tolerances import FILE_PRECISION
+from crane.closure.home_search import within_limits
+from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import MultiStartSearch
+from crane.common.samples import Array, solve_linear
+from crane.common.threads import single_threaded_blas
+
+_CLOSED_TOLERANCE = 1e-9  # residual, in shares of the machine's size
+_SAME_CONFIGURATION_TOLERANCE = (
+    1e-3  # [rad], or share of the machine's size: postures that are not different
+)
+_MAX_STEP = 1.0  # the same, of an iteration at most
+_MAX_ITERATIONS = 15
+_CERTAIN_DEVIATION = 0.05  # the same, off the guess: other assemblies are farther
+_LARGE_DEVIATION = 0.5  # the same: a guess that is farther says little
+_DISTANCE_RATIO, _LOOSE_DISTANCE_RATIO = (
+    2.0,
+    5.0,
+)  # of distances from the guess, up to which it does not decide
+_STARTS_PER_UNKNOWN = 8  # for each unknown of a block
+
+
+@dataclass(frozen=True)
+class AssemblyMode:
+    """Another way to assemble a machine, which the guess does not rule out.
+
+    Attributes:
+        q: (nq,) the posture.
+        loops: Names of the loops that are assembled the other way.
+        changed_columns: Joints that are elsewhere than at home.
+        largest_deviation: The joint that is farthest from the guess, and by how much [m], [rad].
+        home_deviation: The same of the home posture.
+        home_outside_limits: Whether the home posture is outside of limits that this one keeps.
+    """
+
+    q: Array
+    loops: tuple[str, ...]
+    changed_columns: Indices
+    largest_deviation: tuple[int, float]
+    home_deviation: tuple[int, float]
+    home_outside_limits: bool
+
+
+def find_alternative_assembly_modes(
+    closure: Closure, initial_guess: Array, specified: Indices, max_starts: int
+) -> list[AssemblyMode]:
+    """Assemblies that a guess leaves open, at most one for each block of equations.
+
+    Distances from the guess are compared at the joints that differ from home, at those that the
+    file names if it names one of them. An assembly is told where it is less than twice as far as
+    home; five times where none is named, or home is 0.5 rad off; or where it keeps limits that
+    home does not.
+
+    Args:
+        closure: The loops, closed at home.
+        initial_guess: (nq,) what they were closed from.
+        specified: Columns for which it is the file that says so.
+        max_starts: Starts in one block, which bounds the work; an assembly that is not found from
+            there is not told.
+    """
+    with single_threaded_blas(closure.model.nv):
+        return _find_alternatives(
+            _AssemblyModeSearch(closure, initial_guess, specified), max_starts
+        )
+
+
+def _find_alternatives(search: "_AssemblyModeSearch", max_starts: int) -> list[AssemblyMode]:
+    closure = search.closure
+    found: list[AssemblyMode] = []
+    for index, (_, columns) in enumerate(closure.structure.blocks):
+        block = closure.passive[columns]
+        home_within_limits = search.are_within_limits(closure.home, block)
+        if (
+            home_within_limits
+            and search.distance_from_guess(closure.home, search.specified_among(block))
+            < _CERTAIN_DEVIATION
+        ):
+            continue
+        alternatives = sorted(
+            search.find_block_solutions(index, max_starts),
+            key=lambda q: search.distance_from_guess(q, block),
+        )
+        candidates = (
+            one
+            for q in alternatives
+            if (one := search.assess_block_solution(q, index)) is not None
+        )
+        found += itertools.islice(candidates, 1)
+    for columns in search.passive_groups() if closure.home_search is not None else ():
+        group_candidates = (
+            one
+            for q in search.find_group_solutions(columns, max_starts)
+            if (one := search.assess_assembly_mode(q, search.independent_rows_of(columns)))
+            is not None
+            and not any(search.is_same_for_masses(q, other.q) for other in found)
+        )
+        found += itertools.islice(group_candidates, 1)
+    return found
+
+
+class _AssemblyModeSearch:
+    """Solutions of the blocks of one machine."""
+
+    def __init__(self, closure: Closure, initial_guess: Array, specified: Indices):
+        self.closure, self.guess, self.specified_columns = closure, initial_guess, specified
+        self.model, self.equations = closure.model, closure.equations
+        self.home, self.blocks = closure.home, closure.structure.blocks
+        self._coordinate_units = self.equations.coordinate_units
+        self._is_rotation = ~self.equations.coordinates.is_translation
+        self._loop_subsets: dict[tuple[int, ...], LoopEquations] = {}
+        self._body_placements: dict[bytes, Array] = {}
+        self._massless = not any(inertia.mass > 0 for inertia in list(self.model.inertias)[1:])
+
+    def coordinate_differences(self, first: Array, second: Array) -> Array:
+        """(nq,) how far apart two postures are, in units of 1 rad or the machine's size."""
+        difference = first - second
+        angle_difference = np.remainder(difference + np.pi, 2 * np.pi) - np.pi
+        return np.asarray(
+            np.where(
+                self._is_rotation,
+                np.abs(angle_difference),
+                np.abs(difference) / self._coordinate_units,
+            )
+        )
+
+    def distance_from_guess(self, q: Array, columns: Indices) -> float:
+        """How far some joints are from the guess."""
+        return float(self.coordinate_differences(q, self.guess)[columns].max(initial=0.0))
+
+    def specified_among(self, columns: Indices) -> Indices:
+        """Those of some joints that the file names; all where it names none."""
+        specified = columns[np.isin(columns, self.specified_columns)]
+        return specified if len(specified) else columns
+
+    def are_within_limits(self, q: Array, columns: Indices) -> bool:
+        """Whether some joints are."""
+        return bool(within_limits(self.equations, q)[columns].all())
+
+    def find_block_solutions(self, block: int, max_starts: int) -> list[Array]:
+        """Solutions of a block with what is before it as at home, without that of home."""
+        rows, columns = self._block_indices(block)
+        found = [self.home]
+        sign = self._determinant_sign(self.home, rows, columns)
+        two_solutions = len(columns) <= 2 and self._is_dyad(block)
+        starts = [
+            *self._starts_across_home(rows, columns),
+            *self._starting_points(columns, _STARTS_PER_UNKNOWN * len(columns)),
+        ]
+        for start in starts[:max_starts]:
+            q = self._solve_newton(start, rows, columns, found)
+            if q is None or any(
+                self.coordinate_differences(q, x)[columns].max() < _SAME_CONFIGURATION_TOLERANCE
+                for x in found
+            ):
+                continue
+            found.append(q)
+            if two_solutions and self._determinant_sign(q, rows, columns) != sign:
+                break  # mirror images, of which there are two
+        return found[1:]
+
+    def passive_groups(self) -> list[Indices]:
+        """Columns of passive joints that loops tie together, directly or through others."""
+        passive = self.closure.passive
+        group, group_of_row = self.equations.coupled_groups(passive)
+        return [passive[group == i] for i in np.unique(group_of_row[group_of_row >= 0])]
+
+    def independent_rows_of(self, columns: Indices) -> Indices:
+        """Independent rows of the loops that some joints are in."""
+        involved = (
+            np.vstack([self.equations.sign, self.equations.coupling_factors])[:, columns] != 0
+        ).any(1)
+        rows = self.closure.structure.independent_rows
+        return rows[involved[self.equations.loop_of_row[rows]]]
+
+    def find_group_solutions(self, columns: Indices, max_starts: int) -> list[Array]:
+        """Closed postures with all joints but some as at home, the nearest to the guess first."""
+        initial_guess = self.home.copy()
+        initial_guess[columns] = self.guess[columns]
+        rows = self.independent_rows_of(columns)
+        search = MultiStartSearch(
+            self._equations_of_rows(rows)[0], initial_guess, self.specified_columns, max_starts
+        )
+        candidates = search.find_configurations(
+            columns, np.zeros(0, dtype=np.intp), FILE_PRECISION
+        )
+        closed = (self._solve_newton(q, rows, columns) for q in candidates)
+        return [q for q in closed if q is not None]
+
+    def _equations_of_rows(self, rows: Indices) -> tuple[LoopEquations, Indices]:
+        """The equations of the loops that some rows belong to alone, and these rows in them."""
+        loop_of_row = self.equations.loop_of_row
+        loop_indices = tuple(np.unique(loop_of_row[rows]).tolist())
+        if loop_indices not in self._loop_subsets:
+            names = self.equations.names
+            self._loop_subsets[loop_indices] = self.equations.subset(
+                [names[i] for i in loop_indices]
+            )
+        subset_rows = np.flatnonzero(np.isin(loop_of_row, loop_indices))
+        return self._loop_subsets[loop_indices], np.searchsorted(subset_rows, rows)
+
+    def _block_indices(self, block: int) -> tuple[Indices, Indices]:
+        rows, columns = self.blocks[block]
+        return self.closure.structure.independent_rows[rows], self.closure.passive[columns]
+
+    def _is_dyad(self, block: int) -> bool:
+        """Whether a block is about translations of one loop: two circles or lines that cross."""
+        rows, _ = self._block_indices(block)
+        loops = set(self.equations.loop_of_row[rows].tolist())
+        return len(loops) == 1 and bool(self.equations.is_translation[rows].all())
+
+    def _starts_across_home(self, rows: Indices, columns: Indices) -> Array:
+        """(4, nq) postures on both sides of home, where its equations determine least."""
+        jacobian = self.equations.evaluate_scaled(self.home)[1][np.ix_(rows, columns)]
+        least_determined_direction = np.linalg.svd(jacobian)[2][-1]
+        out = np.tile(self.home, (4, 1))
+        out[:, columns] += np.outer(
+            [0.5, -0.5, 1.5, -1.5], least_determined_direction * self._coordinate_units[columns]
+        )
+        return out
+
+    def _starting_points(self, columns: Indices, count: int) -> Array:
+        """(count, nq) postures all over the unknowns: a low-discrepancy sequence about the guess.
+
+        Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018),
+        over a turn, the limits of a slide, or the machine's size.
+        """
+        size = len(columns)
+        phi = 2.0
+        for _ in range(40):
+            phi = (1 + phi) ** (1 / (size + 1))
+        fractions = np.outer(np.arange(count), phi ** -np.arange(1.0, size + 1)) + 0.5
+        fractions = np.remainder(fractions, 1.0) - 0.5
+        coordinates = self.equations.coordinates
+        lower, upper = coordinates.lower, coordinates.upper
+        ranges = np.where(self._is_rotation, 2 * np.pi, 2 * self._coordinate_units)
+        centre = self.guess.copy()
+        limited = ~self._is_rotation & np.isfinite(lower) & np.isfinite(upper)
+        centre[limited] = (lower[limited] + upper[limited]) / 2
+        ranges[limited] = upper[limited] - lower[limited]
+        out = np.tile(self.home, (count, 1))
+        out[:, columns] = centre[columns] + fractions * ranges[columns]
+        return out
+
+    def _solve_newton(
+        self, q: Array, rows: Indices, columns: Indices, known_solutions: Sequence[Array] = ()
+    ) -> Array | None:
+        """Newton's method on some rows for some columns, None where it does not converge.
+
+        Solutions that are known are deflated (Farrell, Birkisson, Funke 2015): for m phi instead
+        of phi, m = prod 1 / r^2 + 1 with r the distance from one of them, it is the Newton step d
+        divided by 1 - (grad m . d) / m, which turns round near them.
+        """
+        q = q.copy()
+        equations, rows = self._equations_of_rows(rows)
+        for _ in range(_MAX_ITERATIONS):
+            phi, jacobian = equations.evaluate_scaled(q)
+            residual = np.abs(phi[rows]).max(initial=0.0)
+            if residual < 1e-13:
+                break
+            try:
+                step = solve_linear(jacobian[np.ix_(rows, columns)], -phi[rows])
+            except np.linalg.LinAlgError:
+                return None
+            deflation = 0.0
+            for other in known_solutions:
+                difference = (q - other)[columns] / self._coordinate_units[columns]
+                is_rotation = self._is_rotation[columns]
+                square = np.where(is_rotation, 2 - 2 * np.cos(difference), difference**2).sum()
+                distance_gradient = np.where(is_rotation, 2 * np.sin(difference), 2 * difference)
+                deflation -= float(distance_gradient @ step) / max(square * (1 + square), 1e-12)
+            step = step / (1 - deflation if abs(1 - deflation) > 1e-6 else 1e-6)
+            largest = float(np.abs(step).max())
+            if not largest < np.inf:
+                return None
+            q[columns] += (
+                self._coordinate_units[columns] * step * min(1.0, _MAX_STEP / max(largest, 1e-300))
+            )
+        if not np.abs(equations.evaluate_scaled(q)[0][rows]).max(initial=0.0) < _CLOSED_TOLERANCE:
+            return None
+        angles = columns[self._is_rotation[columns]]
+        q[angles] = np.remainder(q[angles] + np.pi, 2 * np.pi) - np.pi
+        return q
+
+    def _determinant_sign(self, q: Array, rows: Indices, columns: Indices) -> float:
+        jacobian = self.equations.evaluate(q)[1][np.ix_(rows, columns)]
+        return float(np.linalg.slogdet(jacobian)[0])
+
+    def _block_solutions_from_guesses(self, q: Array, block: int) -> list[Array]:
+        """Solutions of a block with all else as it is, from where it was guessed and at home."""
+        rows, columns = self._block_indices(block)
+        found = []
+        for start in (self.guess, self.home):
+            start_configuration = q.copy()
+            start_configuration[columns] = start[columns]
+            if (solution := self._solve_newton(start_configuration, rows, columns)) is not None:
+                found.append(solution)
+        return found
+
+    def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
+        """An assembly with a block elsewhere, None where it is none or the guess rules it out."""
+        for later_block in range(block + 1, len(self.blocks)):
+            solutions, (_, columns) = (
+                self._block_solutions_from_guesses(q, later_block),
+                self._block_indices(later_block),
+            )
+            if not solutions:
+                return None
+            q = min(solutions, key=lambda way: self.distance_from_guess(way, columns))
+        return self.assess_assembly_mode(q, self._block_indices(block)[0])
+
+    def assess_assembly_mode(self, q: Array, rows: Indices) -> AssemblyMode | None:
+        """Likewise of a whole posture, in which some rows are solved another way."""
+        passive = self.closure.passive
+        if (
+            np.abs(self.equations.evaluate_scaled(q)[0]).max()
+            > self.closure.structure.redundancy.tolerance
+        ):
+            return None
+        if self.equations.find_opposed_loop(q) is not None or not self.are_within_limits(
+            q, passive
+        ):
+            return None
+        columns = np.flatnonzero(
+            self.coordinate_differences(q, self.home) > _SAME_CONFIGURATION_TOLERANCE
+        )
+        if not len(columns) or self.is_same_for_masses(q, self.home):
+            return None
+        compared = self.specified_among(columns)
+        distance, home_distance = (
+            self.distance_from_guess(q, compared),
+            self.distance_from_guess(self.home, compared),
+        )
+        home_outside_limits = not self.are_within_limits(self.home, passive)
+        is_decisive = (
+            home_distance < _LARGE_DEVIATION and np.isin(compared, self.specified_columns).all()
+        )
+        ratio = _DISTANCE_RATIO if is_decisive else _LOOSE_DISTANCE_RATIO
+        if distance > ratio * home_distance and not home_outside_limits:
+            return None
+        loops = sorted(set(self.equations.loop_of_row[rows].tolist()))
+        names = tuple(self.equations.names[i] for i in loops)
+        largest_deviation, home_deviation = (
+            self._largest_deviation(q, compared),
+            self._largest_deviation(self.home, compared),
+        )
+        return AssemblyMode(
+            q, names, columns, largest_deviation, home_deviation, home_outside_limits
+        )
+
+    def _largest_deviation(self, q: Array, columns: Indices) -> tuple[int, float]:
+        differences = self.coordinate_differences(q, self.guess)[columns]
+        column = int(columns[differences.argmax()])
+        return column, float(differences.max() * self._coordinate_units[column])
+
+    def is_same_for_masses(self, first: Array, second: Array) -> bool:
+        """Whether all that has a mass is in one place in both: other angles of a ball, say."""
+        difference = np.abs(self._placements_of_masses(first) - self._placements_of_masses(second))
+        return bool(difference.max(initial=0.0) < _SAME_CONFIGURATION_TOLERANCE)
+
+    def _placements_of_masses(self, q: Array) -> Array:
+        """Rotations and origins (b, 3, 4) of the bodies that have a mass."""
+        key = q.tobytes()
+        if key not in self._body_placements:
+            data = self.equations.data
+            pin.forwardKinematics(self.model, data, self.equations.coordinates.configuration(q))
+            self._body_placements[key] = np.array(
+                [
+                    np.column_stack(
+                        [place.rotation, place.translation / self.equations.characteristic_length]
+                    )
+                    for place, inertia in zip(data.oMi, self.model.inertias, strict=True)
+                    if inertia.mass > 0 or self._massless
+                ]
+            )
+        return self._body_placements[key]

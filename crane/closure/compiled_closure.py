@@ -1,0 +1,499 @@
+"""Closing loops in machine code made for one machine."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from crane.closure.clusters import Cluster, find_clusters
+from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.kinematics_formulas import (
+    FormulaConstants,
+    LoopFormulas,
+    PositionKinematics,
+    folding_pattern,
+    largest_scaled_value,
+    tree_geometry,
+)
+from crane.closure.loop_equations import LoopEquations
+from crane.closure.newton_continuation import ClosedConfiguration
+from crane.codegen import Layout, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen.symbolic import minimum
+from crane.common.samples import Array
+
+# All in rad and shares of the machine's size, as `Branch` has them.
+_LARGE_GAMMA = 1e3  # an entry of gamma above this is looked at closely by `NewtonContinuation`
+_NEARLY_CLOSED_TOLERANCE = 1e-6  # residual of a guess that is as good as closed
+_MAX_NEWTON_ITERATIONS = 8  # of Newton's method, which doubles its digits
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuationCursor:
+    """Where following a stack has got to; every thread and every formula has its own.
+
+    Attributes:
+        state: (nq + entries,) posture and entries of gamma that the next sample starts from.
+        gamma_entries: Rows (passive joints) and columns of these entries; the others are zero.
+    """
+
+    state: Array
+    gamma_entries: tuple[Indices, Indices]
+
+    def start_from(self, configuration: ClosedConfiguration) -> None:
+        """Let the next sample start from a posture."""
+        self.state[: len(configuration.q)] = configuration.q
+        self.state[len(configuration.q) :] = configuration.passive_gamma[self.gamma_entries]
+
+
+class _SharedCode:
+    """Machine code of all machines whose formulas are the same.
+
+    Attributes:
+        closure_program: What closes loops.
+        programs: Further machine code, by what it depends on.
+    """
+
+    def __init__(self, closure_program: Program):
+        self.closure_program = closure_program
+        self.programs: dict[tuple, Program] = {}
+
+
+# As long as one of these machines is in use. Two threads may both make one; either serves.
+_SHARED_CODE: WeakValueDictionary[tuple, _SharedCode] = WeakValueDictionary()
+
+
+class CompiledClosure:
+    """Machine code for the loops of one machine.
+
+    Machines with the same formulas, which may have different numbers in them, share it.
+
+    Args:
+        equations: All equations.
+        structure: Which of them count.
+        active: Columns of the active joints.
+        passive: Columns of the others.
+        home: The home posture, whose branch is followed.
+        rounding_scale: How much larger than the machine's size is what rounds, see
+            `NewtonContinuation.rounding_scale`.
+
+    Attributes:
+        geometry: What the formulas were traced from.
+        programs: Further machine code for this machine, by what it depends on.
+        tolerances: Residuals that count as rounding, and as closed if they no longer fall; a small
+            change.
+        follow_address: Of the function `follow_targets`, for other machine code to call.
+        close_address: Likewise of `close`.
+    """
+
+    def __init__(
+        self,
+        equations: LoopEquations,
+        structure: ConstraintStructure,
+        active: Indices,
+        passive: Indices,
+        home: ClosedConfiguration,
+        rounding_scale: float,
+    ):
+        self.geometry = tree_geometry(equations)
+        self._equations, self._structure = equations, structure
+        self._active_columns, self._passive_columns = active, passive
+        self._nq, self._n = equations.model.nv, len(active)
+        self._gamma_entries = self._find_gamma_entries()
+        signs = self._determinant_signs(home)
+        key = self._cache_key(signs)
+        shared = _SHARED_CODE.get(key)
+        if shared is None:
+            loops = Program.from_cache(("loops", key), lambda program: self._build(program, signs))
+            shared = _SHARED_CODE[key] = _SharedCode(loops)
+        self._shared_code = shared  # the functions live as long as it
+        self._formula_key = key
+        program, self.programs = shared.closure_program, shared.programs
+        self._closure_program = program
+        self.follow_address = program.function_address("follow")
+        self.close_address = program.function_address("close")
+        self._home = home
+        self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
+
+    def _find_gamma_entries(self) -> tuple[Indices, Indices]:
+        """Passive joints and active ones that move them: others of their cluster."""
+        rows, columns = [], []
+        for cluster in self.clusters:
+            joints = np.array(cluster.joints) - 1
+            passive = np.flatnonzero(np.isin(self._passive_columns, joints))
+            active = np.flatnonzero(np.isin(self._active_columns, joints))
+            rows.append(np.repeat(passive, len(active)))
+            columns.append(np.tile(active, len(passive)))
+        return np.concatenate(rows), np.concatenate(columns)
+
+    @cached_property
+    def clusters(self) -> list[Cluster]:
+        """Of its joints, each behind the one that carries it."""
+        return find_clusters(self._equations)
+
+    @property
+    def _gamma_entry_pairs(self) -> list[tuple[int, int]]:
+        """The same, one by one."""
+        rows, columns = self._gamma_entries
+        return list(zip(rows.tolist(), columns.tolist(), strict=True))
+
+    def _cache_key(self, signs: Array) -> tuple:
+        """All that the formulas depend on."""
+        geometry, equations, structure = self.geometry, self._equations, self._structure
+        arrays = (
+            geometry.body_rotations,
+            equations.axis_of_frame1,
+            equations.axis_of_frame2,
+            equations.is_translation,
+            equations.loop_of_row,
+            equations.sign,
+            equations.coupling_factors,
+            equations.coupling_offsets,
+            structure.independent_rows,
+            structure.redundant_rows,
+            self._active_columns,
+            self._passive_columns,
+            signs,
+        )
+        return (
+            geometry.parents,
+            geometry.is_revolute,
+            geometry.floating_bases,
+            geometry.frame_bodies,
+            folding_pattern(geometry.constants),
+            tuple(loop.type for loop in equations.loops),
+            structure.redundancy.tolerance,
+            tuple((tuple(rows), tuple(columns)) for rows, columns in structure.blocks),
+            *(np.asarray(array).tobytes() for array in arrays),
+        )
+
+    def _build(self, program: Program, signs: Array) -> None:
+        self.add_newton_formula(program, signs)
+        self._add_predictor(program)
+        self._add_close(program)
+        self._add_follow(program)
+        self._add_close_in_place(program)
+        self._add_gamma(program)
+
+    def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
+        """Further machine code for this machine, see `Program.cached_program`.
+
+        Args:
+            key: What it depends on besides the loops.
+            build: Adds formulas and routines.
+
+        Raises:
+            TooLongError: It would take too long to compile.
+        """
+        return Program.from_cache((self._formula_key, key), build)
+
+    def formula_outputs(self, formula: str) -> Layout:
+        """Parts of what a formula of the loops' own program writes."""
+        return self._closure_program.formula_outputs(formula)
+
+    def new_cursor(self) -> "ContinuationCursor":
+        """A place to follow stacks from, at home."""
+        cursor = ContinuationCursor(
+            np.empty(self._nq + len(self._gamma_entries[0])), self._gamma_entries
+        )
+        cursor.start_from(self._home)
+        return cursor
+
+    def start_cursor_at(self, cursor: "ContinuationCursor", q: Array) -> bool:
+        """Put a cursor on a posture (nq,) that is closed to 1e-6 or better.
+
+        Returns:
+            Whether it is, and on the home branch.
+        """
+        q = np.ascontiguousarray(q)
+        layout = self.formula_outputs("newton")
+        result = np.empty(layout.size)
+        self._closure_program.call("newton", self.geometry.constants, q, result)
+        found = layout.view(result)
+        if not (found.residual[0] <= _NEARLY_CLOSED_TOLERANCE and found.regular[0] > 0):
+            return False
+        cursor.state[: self._nq] = q
+        cursor.state[self._nq :] = found.gamma
+        return True
+
+    def least_determinant(self, q: Array) -> float:
+        """The least determinant at a posture (nq,), positive on the home branch."""
+        layout = self.formula_outputs("newton")
+        result = np.empty(layout.size)
+        self._closure_program.call(
+            "newton", self.geometry.constants, np.ascontiguousarray(q), result
+        )
+        return float(layout.view(result).edge[0])
+
+    def follow_targets(self, cursor: "ContinuationCursor", targets: Array, out: Array) -> int:
+        """Close the loops at targets (N, n) into out (N, nq) until one needs more than a step.
+
+        Returns:
+            How many were closed.
+        """
+        targets = np.ascontiguousarray(targets)
+        arrays = (self.geometry.constants, targets, cursor.state, out, self.tolerances)
+        return self._closure_program.call("follow", len(targets), *arrays)
+
+    def close_in_place(self, q: Array) -> int:
+        """Close the loops of postures (N, nq) in place, each from itself, until one does not.
+
+        Returns:
+            How many were closed.
+        """
+        return self._closure_program.call(
+            "settle", len(q), self.geometry.constants, q, self.tolerances
+        )
+
+    def evaluate_gamma(self, q: Array, out: Array) -> int:
+        """Evaluate gamma at closed postures (N, nq) into out (N, nv, n), while they are regular.
+
+        Returns:
+            How many were done.
+        """
+        q = np.ascontiguousarray(q)
+        return self._closure_program.call("gammas", len(q), self.geometry.constants, q, out)
+
+    def trace_kinematics(
+        self,
+        tape: Tape,
+        geometry_argument: int,
+        q_argument: int,
+        folded_constants: Array | None = None,
+    ) -> tuple[list[Scalar], PositionKinematics, LoopFormulas]:
+        """Coordinates, bodies and loops, read from two arguments of a function to be.
+
+        Args:
+            tape: Where to.
+            geometry_argument: Which argument has the geometry's numbers.
+            q_argument: Which has the coordinates.
+            folded_constants: The geometry's numbers, NaN where none may become part of the
+                formulas.
+        """
+        coordinates = tape.load_vector(q_argument, 0, self._nq)
+        numbers = self.geometry.constants if folded_constants is None else folded_constants
+        constants = FormulaConstants(tape, geometry_argument, numbers)
+        kinematics = PositionKinematics(self.geometry, constants, coordinates)
+        loops = LoopFormulas(
+            self._equations,
+            self._structure,
+            self._active_columns,
+            self._passive_columns,
+            kinematics,
+        )
+        return coordinates, kinematics, loops
+
+    def add_newton_formula(self, program: Program, signs: Array) -> None:
+        """newton(numbers, q) -> residual, change, regular, steepest, edge, corrected q, gamma.
+
+        regular is positive on the home branch away from its edge, with surplus equations closed;
+        steepest is the largest entry of gamma, whose rows are those of passive joints; edge the
+        least determinant of a block, with its sign on the home branch.
+        """
+        q, kinematics, loops = self.trace_kinematics(Tape(), 0, 1)
+        steps = loops.newton_step
+        is_translation = [not kinematics.geometry.is_revolute[joint] for joint in steps]
+        corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
+        rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._gamma_entry_pairs]
+        steepest = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
+        worst = maximum(
+            steepest - _LARGE_GAMMA,
+            loops.largest_redundant_residual - self._structure.redundancy.tolerance,
+        )
+        least_determinant: Scalar = 1.0
+        for sign, determinant in zip(signs, loops.determinants, strict=True):
+            least_determinant = minimum(least_determinant, float(sign) * determinant)
+        worst = maximum(worst, -1.0 * least_determinant)
+        for alignment in loops.alignments:
+            worst = maximum(worst, -1.0 * alignment)
+        program.add_formula(
+            "newton",
+            2,
+            {
+                "residual": [loops.largest_residual],
+                "change": [
+                    largest_scaled_value(
+                        list(steps.values()),
+                        is_translation,
+                        kinematics.inverse_characteristic_length,
+                    )
+                ],
+                "regular": [-1.0 * worst],
+                "steepest": [steepest],
+                "edge": [least_determinant],
+                "q": corrected,
+                "gamma": rows,
+            },
+        )
+
+    def _largest_gamma_entry(self, rows: Sequence[Scalar], inverse_length: Scalar) -> Scalar:
+        """The largest entry of gamma."""
+        turns = self.geometry.is_revolute
+        powers: dict[int, list[Scalar]] = {0: [], 1: [], -1: []}  # of a length in an entry
+        for (row, k), entry in zip(self._gamma_entry_pairs, rows, strict=True):
+            one, two = turns[self._passive_columns[row] + 1], turns[self._active_columns[k] + 1]
+            powers[int(two) - int(one)].append(entry)
+        worst = max_abs(powers[0])
+        if powers[1]:
+            worst = maximum(worst, inverse_length * max_abs(powers[1]))
+        if powers[-1]:
+            worst = maximum(worst, max_abs(powers[-1]) / inverse_length)
+        return worst
+
+    def _add_close(self, program: Program) -> None:
+        """Newton's method in place: 1 where it closes the loops on the home branch, else 0.
+
+        A change so small that its square is rounding is the last one.
+        """
+        arrays = {
+            "numbers": None,
+            "q": None,
+            "result": program.formula_outputs("newton"),
+            "bounds": None,
+        }
+        with program.add_routine("close", arrays=arrays) as r:
+            q, result = r.q, r.result
+            rounded, closed, small = (r.new_variable(r.bounds[i]) for i in range(3))
+            before = r.new_variable(np.inf)
+            evaluations = r.new_variable(0)
+            with r.loop_forever():
+                r.call("newton", r.numbers, q, result)
+                residual, change = (
+                    r.new_variable(result["residual"]),
+                    r.new_variable(result["change"]),
+                )
+                stalled = (residual <= closed) & (residual > before * 0.25)
+                with r.if_then((residual <= rounded) | stalled):
+                    r.break_loop()
+                r.assign(evaluations, evaluations + 1)
+                with r.if_then(~((change < 1.0) & (evaluations < _MAX_NEWTON_ITERATIONS))):
+                    r.return_value(0)
+                r.copy(q, result.element_pointer("q"), self._nq)
+                with r.if_then(change <= small):
+                    r.break_loop()
+                r.assign(before, residual)
+            with r.if_then(result["regular"] > 0.0):
+                r.return_value(1)
+            r.return_value(0)
+
+    def _add_follow(self, program: Program) -> None:
+        """Follow a stack of targets by one Newton continuation step each.
+
+        Stops where it does not: `NewtonContinuation` takes that sample. `at` holds [q, gamma] of
+            the last
+        sample.
+        """
+        nq, n = self._nq, self._n
+        at = Layout(q=nq, gamma=len(self._gamma_entry_pairs))
+        arrays = {"numbers": None, "targets": None, "at": at, "out": None, "bounds": None}
+        with program.add_routine("follow", counts=("count",), arrays=arrays) as r:
+            guess, verdict = (
+                r.local_array("guess", nq),
+                r.local_array("verdict", program.formula_outputs("distance")),
+            )
+            first = r.local_array("first", program.formula_outputs("predict"))
+            result = r.local_array("result", program.formula_outputs("newton"))
+            with r.loop(r.count) as i:
+                r.call("predict", r.numbers, r.at, r.targets.row_pointer(i, n), first)
+                move = r.new_variable(first["move"])
+                with r.if_then(~(move < 1.0)):
+                    r.return_value(i)
+                r.copy(guess, first.element_pointer("q"), nq)
+                closed = r.call("close", r.numbers, guess, result, r.bounds)
+                with r.if_then(closed < 1):
+                    r.return_value(i)
+                r.call("distance", r.numbers, first, guess, verdict)
+                with r.if_then(~(verdict["all"] <= move * 0.5 + 0.02)):
+                    r.return_value(i)
+                r.copy(r.at, guess, nq)
+                r.copy(
+                    r.at.element_pointer("gamma"),
+                    result.element_pointer("gamma"),
+                    at.parts["gamma"],
+                )
+                r.copy(r.out.row_pointer(i, nq), guess, nq)
+            r.return_value(r.count)
+
+    def _add_close_in_place(self, program: Program) -> None:
+        """Close one posture after the other in place, each from itself."""
+        arrays = ("numbers", "q", "bounds")
+        with program.add_routine("settle", counts=("count",), arrays=arrays) as r:
+            result = r.local_array("result", program.formula_outputs("newton"))
+            with r.loop(r.count) as i:
+                closed = r.call("close", r.numbers, r.q.row_pointer(i, self._nq), result, r.bounds)
+                with r.if_then(closed < 1):
+                    r.return_value(i)
+            r.return_value(r.count)
+
+    def _add_gamma(self, program: Program) -> None:
+        """whole(result of newton) -> gamma of all joints, and `gammas` over postures."""
+        tape, n, result = Tape(), self._n, program.formula_outputs("newton")
+        at = {
+            pair: result.start_index("gamma") + i for i, pair in enumerate(self._gamma_entry_pairs)
+        }
+        rows: list[list[Scalar]] = [[0.0] * n for _ in range(self._nq)]
+        for k, column in enumerate(self._active_columns):
+            rows[column][k] = 1.0
+        for row, column in enumerate(self._passive_columns):
+            for k in range(n):
+                if (row, k) in at:
+                    rows[column][k] = tape.load(0, at[row, k])
+        program.add_formula("whole", 1, [entry for row in rows for entry in row])
+        arrays = ("numbers", "q", "out")
+        with program.add_routine("gammas", counts=("count",), arrays=arrays) as r:
+            work = r.local_array("work", result)
+            with r.loop(r.count) as sample:
+                r.call("newton", r.numbers, r.q.row_pointer(sample, self._nq), work)
+                with r.if_then(~(work["regular"] > 0.0)):
+                    r.return_value(sample)
+                r.call("whole", work, r.out.row_pointer(sample, self._nq * n))
+            r.return_value(r.count)
+
+    def _determinant_signs(self, home: ClosedConfiguration) -> Array:
+        """Of the blocks' determinants on the home branch."""
+        blocks = (
+            home.jacobian[np.ix_(rows, self._passive_columns[columns])]
+            for rows, columns in self._structure.blocks
+        )
+        return np.array([np.linalg.slogdet(block)[0] for block in blocks])
+
+    def _add_predictor(self, program: Program) -> None:
+        """predict(numbers, at, target) -> q, largest move of a passive joint; distance likewise.
+
+        distance(numbers, q, q').
+        """
+        is_translation = [
+            not self.geometry.is_revolute[column + 1] for column in self._passive_columns
+        ]
+        tape = Tape()
+        q, n = tape.load_vector(1, 0, self._nq), self._n
+        target = tape.load_vector(2, 0, n)
+        change = [target[k] - q[column] for k, column in enumerate(self._active_columns)]
+        moves: list[Scalar] = [0.0] * len(self._passive_columns)
+        for i, (row, k) in enumerate(self._gamma_entry_pairs):
+            moves[row] = moves[row] + tape.load(1, self._nq + i) * change[k]
+        for column, move in zip(self._passive_columns, moves, strict=True):
+            q[column] = q[column] + move
+        for column, value in zip(self._active_columns, target, strict=True):
+            q[column] = value
+        move = largest_scaled_value(
+            moves, is_translation, self.inverse_characteristic_length(tape)
+        )
+        program.add_formula("predict", 3, {"q": q, "move": [move]})
+        tape = Tape()
+        one, two = tape.load_vector(1, 0, self._nq), tape.load_vector(2, 0, self._nq)
+        differences = [one[i] - two[i] for i in self._passive_columns]
+        program.add_formula(
+            "distance",
+            3,
+            [
+                largest_scaled_value(
+                    differences, is_translation, self.inverse_characteristic_length(tape)
+                )
+            ],
+        )
+
+    def inverse_characteristic_length(self, tape: Tape) -> Scalar:
+        """One over the machine's size, from the numbers as the first argument."""
+        return FormulaConstants(tape, 0, self.geometry.constants)[len(self.geometry.constants) - 1]

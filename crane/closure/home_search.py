@@ -1,0 +1,296 @@
+"""The home posture of a machine: from what its file says of it, or from anywhere.
+
+Where the loops do not close from the guess, they are closed from anywhere
+(see `crane.closure.multi_start_search`):
+
+1. with the driven joints held, all others within their limits;
+2. with active joints free, too, whose home the file does not say, within their limits;
+3. the same two with passive joints beyond their limits.
+
+So are they where the active joints are too few or too many where it closes, and where home as it
+closes from the guess is outside of limits or more than 0.5 rad (or half of the machine's size)
+from what the file says. Then home is kept where none that is found is nearer, and told if it is
+far off.
+
+The first of these that closes counts, and of the postures that it finds the one that is nearest to
+the guess, see `Search.postures`.
+
+Whether a posture is what the file says shows in its links: in how far those that are in loops turn
+or slide on what carries them, see `Search.off_said`, and in the orientation of the loops. In a
+plane the determinant of the two equations of a loop for its two passive joints is
+
+    det dphi / d(q_1, q_2) = l_1 l_2 sin(angle between the links),
+
+whose sign is the side on which their pin lies: it changes where the loop is assembled the other
+way round.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.closure.constraint_structure import (
+    ActiveJointError,
+    ConstraintStructure,
+    HomeError,
+    Indices,
+    analyse_constraints,
+)
+from crane.closure.constraint_tolerances import (
+    CLOSED_TOLERANCE,
+    FILE_PRECISION,
+    ExactConstraints,
+    RoundedConstraints,
+)
+from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import MultiStartSearch
+from crane.common.errors import MechanismError
+from crane.common.samples import Array
+
+_MAX_CANDIDATES = 4  # of the postures that are found
+_SAME_CONFIGURATION_TOLERANCE = (
+    1e-3  # difference of postures that is none [rad], or share of the machine's size
+)
+FAR = 0.5  # [rad], or share of the machine's size: a home that is farther off is doubted
+
+
+@dataclass(frozen=True)
+class HomeSearchResult:
+    """How a home posture was found that did not follow from the guess.
+
+    Attributes:
+        reason: Why it did not.
+        configuration_count: How many postures were found.
+        moved_columns: Columns of joints that are elsewhere than guessed.
+        largest_deviation: The joint that is farthest from the guess, and by how much [m], [rad].
+        off_said: The joint that is farthest from what the file says, and by how much [rad], in
+            shares of the machine's size; see `Search.off_said`.
+        reversed: Names of loops that are the other way round than in the guess.
+    """
+
+    reason: str
+    configuration_count: int
+    moved_columns: Indices
+    largest_deviation: tuple[int, float]
+    off_said: tuple[int, float]
+    reversed: tuple[str, ...]
+
+    @property
+    def is_far(self) -> bool:
+        """Whether home is another posture than what the file says."""
+        return self.off_said[1] > FAR
+
+
+def find_home(
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    initial_guess: Array,
+    specified: Collection[int] | None,
+    movable: Collection[int] = (),
+) -> tuple[ConstraintStructure, HomeSearchResult | None]:
+    """Structure and home of a machine, and how home was found if not from the guess.
+
+    Args:
+        equations: All loop equations.
+        active: Columns of the active joints.
+        passive: Columns of the others.
+        initial_guess: (nq,) what is known of the home posture.
+        specified: Columns for which it is the file that says so; None: home follows from the guess
+            or not at all.
+        movable: Columns of active joints that move like passive ones while home is sought.
+
+    Raises:
+        MechanismError: There is no home posture, or see `analyse`.
+    """
+    search = MultiStartSearch(
+        equations, initial_guess, np.array(sorted(specified or ()), dtype=np.intp)
+    )
+    first: ConstraintStructure | None = None
+    try:
+        first = _analyse_to_file_precision(equations, active, passive, initial_guess)
+    except HomeError as error:
+        rejection: MechanismError = error
+        reason = error.reason
+    except ActiveJointError as error:  # or it is where the linkage collapses
+        rejection, reason = error, "the joints have other freedoms where it closes"
+        if not len(active) or ExactConstraints(equations).is_closed(initial_guess):
+            raise
+    if first is not None:
+        reason = _home_problem(search, equations, passive, first.home)
+        if specified is None or not reason:
+            return first, None
+    elif specified is None:
+        raise rejection
+    alternative_count = 0
+    for found in _search_by_stages(
+        search, equations, active, passive, specified, movable, first is None
+    ):
+        if first is not None:
+            alternative_count += sum(
+                search.coordinate_differences(q, first.home).max() > _SAME_CONFIGURATION_TOLERANCE
+                for q in found
+            )
+            found = _configurations_nearer_than_home(search, equations, passive, found, first.home)
+        usable = _first_usable(equations, active, passive, found[:_MAX_CANDIDATES])
+        if isinstance(usable, ConstraintStructure):
+            count = len(found) if first is None else alternative_count + 1
+            return usable, _search_result(search, equations, reason, count, passive, usable)
+        if usable is not None and first is None:
+            raise rejection if isinstance(rejection, ActiveJointError) else usable
+    if first is None:
+        raise rejection
+    if search.largest_specified_deviation(first.home)[1] <= FAR:
+        return first, None
+    return first, _search_result(search, equations, reason, alternative_count + 1, passive, first)
+
+
+def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
+    """(nv,) whether the joints of a posture (nq,) are within their limits, but for rounding."""
+    coordinates, slack = equations.coordinates, CLOSED_TOLERANCE * equations.coordinate_units
+    inside: NDArray[np.bool_] = (q >= coordinates.lower - slack) & (q <= coordinates.upper + slack)
+    return inside
+
+
+def _home_problem(
+    search: MultiStartSearch, equations: LoopEquations, passive: Indices, home: Array
+) -> str:
+    """What speaks against home as it closes from the guess, nothing where all is well."""
+    names = equations.coordinates.names
+    columns = passive[~within_limits(equations, home)[passive]]
+    if len(columns):
+        return f"{names[int(columns[0])]} closes outside of its limits"
+    joint, deviation = search.largest_specified_deviation(home)
+    return f"{names[joint]} closes far off" if deviation > FAR else ""
+
+
+def _configurations_nearer_than_home(
+    search: MultiStartSearch,
+    equations: LoopEquations,
+    passive: Indices,
+    found: list[Array],
+    home: Array,
+) -> list[Array]:
+    """Of some postures those that are nearer to what is said than home is, if it is in limits."""
+    if not within_limits(equations, home)[passive].all():
+        return found
+    return [
+        q
+        for q in found
+        if search.distance_from_guess(q)[:2] < search.distance_from_guess(home)[:2]
+    ]
+
+
+def _search_result(
+    search: MultiStartSearch,
+    equations: LoopEquations,
+    reason: str,
+    count: int,
+    passive: Indices,
+    structure: ConstraintStructure,
+) -> HomeSearchResult:
+    home = structure.home
+    moved = np.flatnonzero(
+        search.coordinate_differences(home, search.initial_guess) > CLOSED_TOLERANCE
+    )
+    return HomeSearchResult(
+        reason,
+        count,
+        moved,
+        search.largest_deviation(home),
+        search.largest_specified_deviation(home),
+        _reversed(search, equations, passive, structure),
+    )
+
+
+def _reversed(
+    search: MultiStartSearch,
+    equations: LoopEquations,
+    passive: Indices,
+    structure: ConstraintStructure,
+) -> tuple[str, ...]:
+    """Loops that home has the other way round than what the file says, see the module."""
+    jacobians = [equations.evaluate_scaled(q)[1] for q in (structure.home, search.initial_guess)]
+    found: list[int] = []
+    for rows, columns in structure.blocks:
+        block, joints = structure.independent_rows[rows], passive[columns]
+        if not np.isin(joints, search.said).all():
+            continue
+        home, said = (np.linalg.slogdet(slope[np.ix_(block, joints)])[0] for slope in jacobians)
+        if home * said < 0:
+            found += [int(i) for i in equations.loop_of_row[block]]
+    return tuple(equations.names[i] for i in dict.fromkeys(found))
+
+
+def _first_usable(
+    equations: LoopEquations, active: Indices, passive: Indices, found: list[Array]
+) -> ConstraintStructure | ActiveJointError | None:
+    """The first of some closed postures that can be home; else why it has other freedoms."""
+    rejection: ActiveJointError | None = None
+    for q in found:
+        try:
+            return _analyse_to_file_precision(equations, active, passive, q)
+        except ActiveJointError as error:
+            rejection = rejection or error
+        except MechanismError:
+            continue
+    return rejection
+
+
+def _analyse_to_file_precision(
+    equations: LoopEquations, active: Indices, passive: Indices, initial_guess: Array
+) -> ConstraintStructure:
+    """See `analyse`; to the digits of the file where equations contradict each other."""
+    try:
+        return analyse_constraints(
+            equations, active, passive, initial_guess, ExactConstraints(equations)
+        )
+    except MechanismError as error:
+        exact_error = error
+    rounded = RoundedConstraints(equations)
+    try:
+        return analyse_constraints(equations, active, passive, initial_guess, rounded)
+    except ActiveJointError as error:
+        if str(error) == str(exact_error) or not error.selections:
+            raise exact_error from None
+        active_joint_error = error
+    except MechanismError:
+        raise exact_error from None
+    # other active joints are told where the machine moves with them
+    names = equations.coordinates.names
+    others = np.array(
+        [names.index(joint) for joint in active_joint_error.selections[0].joints], dtype=np.intp
+    )
+    rest = np.setdiff1d(np.arange(equations.model.nv), others)
+    try:
+        analyse_constraints(equations, others, rest, initial_guess, rounded)
+    except MechanismError:
+        raise exact_error from None
+    raise active_joint_error
+
+
+def _search_by_stages(
+    search: MultiStartSearch,
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    specified: Collection[int],
+    movable: Collection[int],
+    beyond_limits: bool,
+) -> Iterator[list[Array]]:
+    """Closed postures, one list for each of the steps above; the last only where it may go on."""
+    movable_columns = np.union1d(passive, np.array(list(movable), dtype=np.intp))
+    all_movable = np.union1d(movable_columns, np.setdiff1d(active, list(specified)))
+    column_sets = (
+        [movable_columns, all_movable]
+        if len(all_movable) > len(movable_columns)
+        else [movable_columns]
+    )
+    has_limits = np.isfinite(equations.coordinates.lower[passive]).any()
+    has_limits |= np.isfinite(equations.coordinates.upper[passive]).any()
+    nothing = np.zeros(0, dtype=np.intp)
+    for unlimited in (nothing, passive) if has_limits and beyond_limits else (nothing,):
+        for columns in column_sets:
+            yield search.find_configurations(columns, unlimited, FILE_PRECISION)

@@ -1,0 +1,308 @@
+"""The loop equations phi(q) = 0, their Jacobian and its time derivative."""
+
+import threading
+from collections.abc import Collection, Sequence
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.active_joint_selection import Indices, characteristic_length, motion_scales
+from crane.closure.coordinates import Coordinates
+from crane.common.errors import MechanismError
+from crane.common.samples import Array
+from crane.description import LOOP_TYPES, Coupling, LoopSpec
+
+
+def frame_id(model: pin.Model, link: str) -> int:
+    """Index of the frame of a URDF link."""
+    index: int = model.getFrameId(link, pin.FrameType.BODY)
+    if index >= model.nframes:
+        raise MechanismError(f"frame '{link}' is not in the assembled model, name a link")
+    return index
+
+
+def rotation_with_z_axis(axis: Sequence[float]) -> Array:
+    """A rotation (3, 3) whose third column is the axis."""
+    z_axis = np.array([axis])
+    x_axis = _cross(np.eye(3)[[np.argmin(np.abs(z_axis))]], z_axis)
+    x_axis /= np.linalg.norm(x_axis)
+    return np.column_stack([x_axis[0], _cross(z_axis, x_axis)[0], z_axis[0]])
+
+
+def _as_jacobian(jacobian: Array) -> Array:
+    """(6, nv) also of one joint, for which Pinocchio gives (6,)."""
+    return jacobian.reshape(6, -1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Row-wise cross product; numpy's own costs several times more on a few rows."""
+    out = np.empty_like(a)
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def _supporting_columns(model: pin.Model, joint: int) -> list[int]:
+    """Columns of the joints that move a joint's body."""
+    supports = [model.joints[i] for i in model.supports[joint] if i > 0]
+    return [column for x in supports for column in range(x.idx_v, x.idx_v + x.nv)]
+
+
+def aligned_axes(loop_type: str) -> list[int]:
+    """Axes of the two frames of a loop that point the same way when it is closed."""
+    locked = LOOP_TYPES[loop_type][3:]
+    if all(locked):
+        return [0, 1, 2]
+    return [k for k in range(3) if any(locked) and not locked[k]]
+
+
+class LoopEquations:
+    """All equations of all loops and couplings of a machine.
+
+    A loop joins frame 1 (predecessor) and frame 2 (successor), both turned so that the loop's
+    axis is their z. With their axes a_i, b_k and origins p_1, p_2 in the world, its equations are
+
+        a_i . (p_2 - p_1) = 0    for every locked translation i,
+        a_i . b_k = 0            for locked rotations: two rows with b_k the free axis, or
+                                 (x, y), (y, z), (z, x) where all three are locked.
+
+    Row by row there is a wrench w = [a_i; p_2 x a_i] or [0; b_k x a_i] at the world's origin, so
+    that phi' = w . (V_2 - V_1) with the spatial velocities V. Columns of joints that carry both
+    frames therefore cancel exactly. Couplings of joints follow, sum c_j q_j - offset = 0 each.
+
+    Args:
+        model: The spanning tree.
+        loops: The loops.
+        couplings: Linear constraints of joints.
+
+    Attributes:
+        coordinates: Of the tree.
+        names: Of what the equations belong to: loops, then couplings.
+        loop_of_row: (m,) index in `names` of every equation.
+        is_translation: (m,) whether it is about a length.
+        characteristic_length: Of the machine [m], see
+            `crane.closure.active_joint_selection.characteristic_length`.
+        coordinate_units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size
+            [m].
+        residual_units: (m,) of the equations, likewise.
+    """
+
+    def __init__(
+        self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling] = ()
+    ):
+        self.model = model
+        self.coordinates = Coordinates(model)
+        self._thread_local = threading.local()  # a machine may be used by several threads
+        self.loops = tuple(loops)
+        self.frames: list[tuple[int, pin.SE3]] = []  # (joint, placement), two per loop
+        joint_signs = np.zeros((len(loops), model.nv))
+        rows: list[tuple[int, bool, int, int]] = []  # loop, is translation, axis of 1, axis of 2
+        for index, loop in enumerate(loops):
+            rotation = pin.SE3(rotation_with_z_axis(loop.axis), np.zeros(3))
+            for side, name in ((-1.0, loop.predecessor), (1.0, loop.successor)):
+                frame = model.frames[frame_id(model, name)]
+                self.frames.append((frame.parentJoint, frame.placement * rotation))
+                joint_signs[index, _supporting_columns(model, frame.parentJoint)] += side
+            locked = LOOP_TYPES[loop.type]
+            rows += [(index, True, i, 0) for i in range(3) if locked[i]]
+            free = [k for k in range(3) if not locked[3 + k]]
+            if not free:
+                rows += [(index, False, 0, 1), (index, False, 1, 2), (index, False, 2, 0)]
+            elif len(free) == 1:
+                rows += [(index, False, i, free[0]) for i in range(3) if i != free[0]]
+        self._loop_index = np.array([row[0] for row in rows], dtype=np.intp)
+        self._is_loop_translation = np.array([row[1] for row in rows], dtype=bool)
+        self.axis_of_frame1 = np.array([row[2] for row in rows], dtype=np.intp)
+        self.axis_of_frame2 = np.array([row[3] for row in rows], dtype=np.intp)
+        self.sign = joint_signs
+        self._row_joint_signs = joint_signs[self._loop_index]
+        self.couplings = tuple(couplings)
+        self.coupling_factors = np.zeros((len(self.couplings), model.nv))
+        self.coupling_offsets = np.array([coupling.offset for coupling in self.couplings])
+        is_length = []
+        for row, coupling in zip(self.coupling_factors, self.couplings, strict=True):
+            for name, factor in coupling.factors.items():
+                column = self.coordinates.column(name)
+                row[column] = factor
+            is_length.append(bool(self.coordinates.is_translation[column]))
+        self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
+        coupling_indices = len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)
+        self.loop_of_row = np.concatenate([self._loop_index, coupling_indices])
+        self.is_translation = np.concatenate(
+            [self._is_loop_translation, np.array(is_length, dtype=bool)]
+        )
+        self.characteristic_length = characteristic_length(model)
+        self.coordinate_units = np.where(
+            self.coordinates.is_translation, self.characteristic_length, 1.0
+        )
+        self.residual_units = np.where(self.is_translation, self.characteristic_length, 1.0)
+
+    def coupled_groups(self, columns: Indices) -> tuple[Indices, Indices]:
+        """Joints that equations tie together, directly or through others, as groups by number.
+
+        Args:
+            columns: (k,) the joints.
+
+        Returns:
+            The groups of the joints (k,) and of the rows (m,), -1 of a row without such joints.
+        """
+        involved = np.vstack([self.sign, self.coupling_factors])[:, columns] != 0
+        group = np.arange(len(columns), dtype=np.intp)
+        for row in involved:
+            connected = np.isin(group, group[row])
+            group[connected] = group[connected].min(initial=len(group))
+        group = np.unique(group, return_inverse=True)[1]
+        of_name = [int(group[tie][0]) if tie.any() else -1 for tie in involved]
+        return group, np.array(of_name, dtype=np.intp)[self.loop_of_row]
+
+    def subset(self, names: Collection[str]) -> "LoopEquations":
+        """The equations of some loops and couplings alone, in the same coordinates."""
+        found = LoopEquations(
+            self.model,
+            [loop for loop in self.loops if loop.name in names],
+            [coupling for coupling in self.couplings if coupling.name in names],
+        )
+        found._thread_local.data = self.data  # which takes longer to make than all else
+        return found
+
+    @cached_property
+    def motion_scales(self) -> Array:
+        """(nv,) comparable displacements of the joints, see `motion_scales`."""
+        return motion_scales(self.model)
+
+    @property
+    def data(self) -> pin.Data:
+        """Pinocchio's memory of this thread."""
+        try:
+            return self._thread_local.data
+        except AttributeError:
+            self._thread_local.data = self.model.createData()
+            return self._thread_local.data
+
+    def _frame_geometry(self) -> tuple[Array, Array, Array, Array]:
+        """Of every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
+        bodies = self.data.oMi
+        placements = [bodies[joint] * local for joint, local in self.frames]
+        rotations = np.array([placement.rotation for placement in placements])
+        origins = np.array([placement.translation for placement in placements])
+        return self._row_geometry(rotations, origins)
+
+    def _row_geometry(self, rotations: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
+        """The same (..., m, 3) of frames with turns (..., 2 l, 3, 3), origins (..., 2 l, 3)."""
+        axes, one = np.swapaxes(rotations, -1, -2), 2 * self._loop_index
+        return (
+            axes[..., one, self.axis_of_frame1, :],
+            axes[..., one + 1, self.axis_of_frame2, :],
+            origins[..., one, :],
+            origins[..., one + 1, :],
+        )
+
+    def constraint_wrenches(self, rotations: Array, origins: Array) -> Array:
+        """The loops' rows w as wrenches, by which frame 2 is held, at the world's origin.
+
+        Args:
+            rotations: (..., 2 l, 3, 3) of `frames`, in the world.
+            origins: (..., 2 l, 3) likewise [m].
+
+        Returns:
+            (..., m, 6) without the couplings' rows.
+        """
+        a, b, _, p2 = self._row_geometry(rotations, origins)
+        return self._assemble_wrenches(a, b, p2)
+
+    def _assemble_wrenches(self, a: Array, b: Array, p2: Array) -> Array:
+        wrenches = np.zeros((*a.shape[:-1], 6))
+        is_translation = self._is_loop_translation
+        wrenches[..., is_translation, :3] = a[..., is_translation, :]
+        wrenches[..., 3:] = _cross(np.where(is_translation[:, None], p2, b), a)
+        return wrenches
+
+    def evaluate(self, q: Array) -> tuple[Array, Array]:
+        """Residuals and Jacobian.
+
+        Args:
+            q: (nq,) [m], [rad].
+
+        Returns:
+            phi (m,) [m] for translations, [1] for rotations, and dphi/dq (m, nv).
+        """
+        coupling_residuals = self.coupling_factors @ q - self.coupling_offsets
+        if not self.loops:
+            return coupling_residuals, self.coupling_factors.copy()
+        configuration = self.coordinates.configuration(q)
+        jacobian = _as_jacobian(pin.computeJointJacobians(self.model, self.data, configuration))
+        self._thread_local.last = a, b, p1, p2 = self._frame_geometry()
+        phi = np.einsum("ij,ij->i", a, np.where(self._is_loop_translation[:, None], p2 - p1, b))
+        loop_jacobian = self._row_joint_signs * (self._assemble_wrenches(a, b, p2) @ jacobian)
+        if not self.couplings:
+            return phi, loop_jacobian
+        return np.concatenate([phi, coupling_residuals]), np.vstack(
+            [loop_jacobian, self.coupling_factors]
+        )
+
+    def evaluate_scaled(self, q: Array) -> tuple[Array, Array]:
+        """`evaluate` in shares of the machine's size: the same whatever its scale.
+
+        Args:
+            q: (nq,) [m], [rad].
+
+        Returns:
+            E^-1 phi (m,) and E^-1 dphi/dq D (m, nv), E = diag(row_units), D = diag(units).
+        """
+        phi, jacobian = self.evaluate(q)
+        return phi / self.residual_units, jacobian / self.residual_units[
+            :, None
+        ] * self.coordinate_units
+
+    def find_opposed_loop(self, q: Array) -> str | None:
+        """Name of a loop whose axes are antiparallel, which also solves its equations."""
+        if not self.loops:
+            return None
+        pin.forwardKinematics(self.model, self.data, self.coordinates.configuration(q))
+        for index, loop in enumerate(self.loops):
+            aligned = aligned_axes(loop.type)
+            if not aligned:
+                continue
+            (j1, local1), (j2, local2) = self.frames[2 * index : 2 * index + 2]
+            turn1 = (self.data.oMi[j1] * local1).rotation
+            turn2 = (self.data.oMi[j2] * local2).rotation
+            cosines = np.einsum("ik,ik->k", turn1, turn2)
+            if any(cosines[k] < 0 for k in aligned):
+                return loop.name
+        return None
+
+    def acceleration_bias(self, q: Array, v: Array) -> Array:
+        """Second derivative of phi at zero joint acceleration, (d/dt dphi/dq) v.
+
+        Args:
+            q: (nq,) [m], [rad], the posture this thread last called `evaluate` with.
+            v: (nv,) [m/s], [rad/s].
+
+        Returns:
+            (m,).
+        """
+        if not self.loops:
+            return np.zeros(len(self.couplings))
+        a, b, _, p2 = self._thread_local.last
+        configuration = self.coordinates.configuration(q)
+        rate = _as_jacobian(
+            pin.computeJointJacobiansTimeVariation(self.model, self.data, configuration, v)
+        )
+        velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
+        one = 2 * self._loop_index
+        v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
+        is_translation = self._is_loop_translation[:, None]
+        arm = np.where(is_translation, p2, b)
+        arm_rate = _cross(w2, arm) + np.where(is_translation, v2, 0.0)
+        a_rate = _cross(w1, a)
+        wrench_rate = np.zeros((len(a), 6))
+        wrench_rate[self._is_loop_translation, :3] = a_rate[self._is_loop_translation]
+        wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
+        split = self._row_joint_signs * v  # (m, nv): v of frame 2 minus v of frame 1
+        relative, bias = split @ _as_jacobian(self.data.J).T, split @ rate.T
+        loop_bias = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
+            "ij,ij->i", self._assemble_wrenches(a, b, p2), bias
+        )
+        return np.concatenate([loop_bias, np.zeros(len(self.couplings))])

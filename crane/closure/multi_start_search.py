@@ -1,0 +1,358 @@
+"""Closing the loops from anywhere: for machines whose files say little of their home posture.
+
+The residual of a loop is what it locks of log(M_1^-1 M_2), M_i the placements of its frames:
+rotations [rad], and translations in shares of the machine's size; where it locks no rotation, the
+distance of the origins. Unlike the loop equations it is zero only where axes point the same way,
+and grows all the way to half a turn. Damped least squares go downhill from any start (Levenberg
+1944; a damping that falls with the square of the residual keeps the convergence quadratic,
+Yamashita and Fukushima 2001), with a line search along the path that limits bend. Starts lie
+around the guess, farther and farther off.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from crane.closure.active_joint_selection import Indices
+from crane.closure.loop_equations import LoopEquations
+from crane.common.samples import Array
+from crane.description import LOOP_TYPES
+
+_RESIDUAL_TOLERANCE = 1e-11  # in shares
+_MAX_ITERATIONS = 80
+_MAX_STEP = 1.0  # [rad], or share of the machine's size: of an iteration at most
+_MAX_HALVINGS = 12
+_DAMPING = 1e-3
+_SLOW_PROGRESS_RATIO, _MAX_SLOW_ITERATIONS = (
+    0.99,
+    6,
+)  # ratio of residuals that is no progress, and how often it is borne
+_MAX_STARTS_UNTIL_CLOSED, _EXTRA_STARTS_RANGE = (
+    24,
+    (5, 24),
+)  # until one closes, and at least and at most from then on
+_MAX_STARTS_TIMES_JOINTS, _EXTRA_STARTS_TIMES_JOINTS = (
+    2000,
+    120,
+)  # starts times joints at most: in all, and after one closes
+_START_RADII = (0.3, 1.0, 2.0, np.pi)  # of the starts [rad], or shares of the machine's size
+_SAME_CONFIGURATION_TOLERANCE = 1e-3  # difference of postures that is none, likewise
+
+
+class ClosureResidual:
+    """How far loops and couplings are from closed.
+
+    Args:
+        equations: The loops.
+    """
+
+    def __init__(self, equations: LoopEquations):
+        self._equations = equations
+        self._length_scales = np.where(np.arange(6) < 3, equations.characteristic_length, 1.0)
+        self._locked_components = [
+            np.flatnonzero(LOOP_TYPES[loop.type]) for loop in equations.loops
+        ]
+        is_coupling = equations.loop_of_row >= len(equations.loops)
+        self._coupling_units = equations.residual_units[is_coupling]
+
+    def evaluate(self, q: Array) -> tuple[Array, Array]:
+        """Residuals (m,) and their slopes (m, nv)."""
+        equations = self._equations
+        model, data = equations.model, equations.data
+        configuration = equations.coordinates.configuration(q)
+        joint_jacobians = pin.computeJointJacobians(model, data, configuration).reshape(6, -1)
+        residuals = [
+            (equations.coupling_factors @ q - equations.coupling_offsets) / self._coupling_units
+        ]
+        jacobians = [equations.coupling_factors / self._coupling_units[:, None]]
+        for index, locked in enumerate(self._locked_components):
+            one, two = (
+                data.oMi[joint] * place for joint, place in equations.frames[2 * index :][:2]
+            )
+            relative_placement = one.actInv(two)
+            relative_jacobian = two.toActionMatrixInverse() @ (
+                equations.sign[index] * joint_jacobians
+            )  # as 2 sees them
+            if locked.max() < 3:
+                residual, jacobian = (
+                    relative_placement.translation,
+                    relative_placement.rotation @ relative_jacobian[:3],
+                )
+            else:
+                residual, jacobian = (
+                    pin.log6(relative_placement).vector,
+                    pin.Jlog6(relative_placement) @ relative_jacobian,
+                )
+            residuals.append(residual[locked] / self._length_scales[locked])
+            jacobians.append(jacobian[locked] / self._length_scales[locked, None])
+        return np.concatenate(residuals), np.vstack(jacobians)
+
+
+def periodic_coordinates(equations: LoopEquations) -> NDArray[np.bool_]:
+    """(nv,) joints that a whole turn leaves where they are: no slides, couplings and flyers."""
+    coordinates = equations.coordinates
+    periodic = ~coordinates.is_translation & ~(equations.coupling_factors != 0).any(axis=0)
+    for column in coordinates.floating_base_columns:
+        periodic[column : column + 6] = False
+    return np.asarray(periodic)
+
+
+def remove_revolutions(
+    q: Array, nearby: Array, periodic: NDArray[np.bool_], lower: Array, upper: Array
+) -> Array:
+    """The same posture with whole turns so that joints are in limits, and near another one.
+
+    Args:
+        q: (nq,).
+        nearby: (nq,) the other one.
+        periodic: (nq,) joints that may wind, see `periodic_coordinates`.
+        lower: (nq,) limits.
+        upper: (nq,) likewise.
+
+    Returns:
+        (nq,), joints within half a turn of the other posture; where limits do not allow that, by
+        whole turns nearer to them, and where they allow none as it was.
+    """
+    turn = 2 * np.pi
+    turned = np.where(periodic, nearby + np.remainder(q - nearby + np.pi, turn) - np.pi, q)
+    slack = 1e-12
+    turned += np.where(
+        periodic & (turned < lower), turn * np.ceil((lower - slack - turned) / turn), 0
+    )
+    turned -= np.where(
+        periodic & (turned > upper), turn * np.ceil((turned - upper - slack) / turn), 0
+    )
+    within_limits = (turned >= lower - slack) & (turned <= upper + slack)
+    return np.where(periodic & within_limits, turned, q)
+
+
+class MultiStartSearch:
+    """Closed postures of a machine, from anywhere.
+
+    Args:
+        equations: The loops.
+        initial_guess: (nq,) what is said of the posture.
+        specified: Columns for which it is the file that says so.
+        extra_starts: Starts from the first closed posture on; if not given, more for smaller
+            machines.
+    """
+
+    def __init__(
+        self,
+        equations: LoopEquations,
+        initial_guess: Array,
+        specified: Indices,
+        extra_starts: int | None = None,
+    ):
+        extra_starts = (
+            min(
+                max(
+                    _EXTRA_STARTS_TIMES_JOINTS // max(len(initial_guess), 1),
+                    _EXTRA_STARTS_RANGE[0],
+                ),
+                _EXTRA_STARTS_RANGE[1],
+            )
+            if extra_starts is None
+            else extra_starts
+        )
+        self._residual, self.initial_guess = ClosureResidual(equations), initial_guess
+        self._coordinate_units = equations.coordinate_units
+        self._lower_limits, self._upper_limits = (
+            equations.coordinates.lower,
+            equations.coordinates.upper,
+        )
+        self.said, self._extra_starts = specified, extra_starts
+        self._coordinate_derivatives = equations.coordinates.coordinate_derivatives
+        self._in_loops = (equations.sign != 0).any(axis=0)
+        self._turns = ~equations.coordinates.is_translation
+        self._periodic = periodic_coordinates(equations)
+        self._unlimited_periodic = (
+            self._periodic & np.isinf(self._upper_limits) & np.isinf(self._lower_limits)
+        )
+
+    def find_configurations(
+        self, movable: Indices, unlimited: Indices, tolerance: float
+    ) -> list[Array]:
+        """Closed postures, the nearest to the guess first.
+
+        Nearest where the farthest of the joints that are said is nearest [rad], [machine's size];
+        if that is equal, by their sum of squares, then by all joints.
+
+        Args:
+            movable: Columns of the joints that may move.
+            unlimited: Columns of those that may leave their limits.
+            tolerance: Residual that counts as closed.
+        """
+        found: list[Array] = []
+        max_starts = max(2, _MAX_STARTS_TIMES_JOINTS // len(self.initial_guess))
+        last_start = min(_MAX_STARTS_UNTIL_CLOSED, max_starts)
+        for count, start in enumerate(self._starting_points(movable)):
+            if count >= last_start:
+                break
+            q = self._search_from(start, movable, unlimited, tolerance)
+            if q is None:
+                continue
+            if not found:
+                last_start = min(max_starts, count + 1 + self._extra_starts)
+            if all(
+                self.coordinate_differences(q, other).max() > _SAME_CONFIGURATION_TOLERANCE
+                for other in found
+            ):
+                found.append(q)
+        return sorted(found, key=self.distance_from_guess)
+
+    def _search_from(
+        self, start: Array, movable: Indices, unlimited: Indices, tolerance: float
+    ) -> Array | None:
+        """Along the limits from one start; else across them, where whole turns lead back."""
+        for without_limits in (unlimited, movable):
+            q, residual = self.minimize_residual(start, movable, without_limits)
+            limited = np.setdiff1d(movable, unlimited)
+            slack = _RESIDUAL_TOLERANCE * self._coordinate_units
+            within_limits = (q >= self._lower_limits - slack) & (q <= self._upper_limits + slack)
+            if residual <= tolerance and within_limits[limited].all():
+                return q
+            if not np.isfinite([self._lower_limits[limited], self._upper_limits[limited]]).any():
+                return None
+        return None
+
+    def distance_from_guess(self, q: Array) -> tuple[float, float, float]:
+        """How far a posture is from the guess: what is said, its sum of squares, all joints."""
+        differences = self.coordinate_differences(q, self.initial_guess)
+        specified = differences[self.said]
+        return (
+            round(float(specified.max(initial=0.0)), 3),
+            round(float(np.linalg.norm(specified)), 3),
+            float(differences.max(initial=0.0)),
+        )
+
+    def largest_specified_deviation(self, q: Array) -> tuple[int, float]:
+        """The joint whose link is farthest from where it is said to be on what carries it.
+
+        Whole turns leave it there. Links that no loop goes through, rotors on gears for one, are
+        where couplings put them, and are no matter of how loops are assembled.
+
+        Args:
+            q: (nq,).
+
+        Returns:
+            Its column, and by how much [rad], [machine's size].
+        """
+        joints = self.said[self._in_loops[self.said]]
+        if not len(joints):
+            return 0, 0.0
+        off = (q - self.initial_guess) / self._coordinate_units
+        turned = np.remainder(off + np.pi, 2 * np.pi) - np.pi
+        differences = np.abs(np.where(self._turns, turned, off))[joints]
+        return int(joints[differences.argmax()]), float(differences.max())
+
+    def largest_deviation(self, q: Array) -> tuple[int, float]:
+        """The joint that is farthest from the guess, and by how much [m], [rad]."""
+        differences = self.coordinate_differences(q, self.initial_guess)
+        return int(differences.argmax()), float(
+            (differences * self._coordinate_units)[differences.argmax()]
+        )
+
+    def coordinate_differences(self, first: Array, second: Array) -> Array:
+        """(nq,) how far apart the joints of two postures are [rad], [machine's size]."""
+        angle_differences = np.abs(np.remainder(first - second + np.pi, 2 * np.pi) - np.pi)
+        return np.asarray(
+            np.where(
+                self._unlimited_periodic,
+                angle_differences,
+                np.abs(first - second) / self._coordinate_units,
+            )
+        )
+
+    def _starting_points(self, movable: Indices) -> Iterator[Array]:
+        """The guess, and low-discrepancy points of boxes around it that grow.
+
+        Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018).
+        """
+        yield self.initial_guess.copy()
+        phi = 2.0
+        for _ in range(40):
+            phi = (1 + phi) ** (1 / (len(movable) + 1))
+        steps = phi ** -np.arange(1.0, len(movable) + 1)
+        for count in itertools.count(1):
+            share = 2 * np.remainder(0.5 + count * steps, 1.0) - 1
+            start = self.initial_guess.copy()
+            start[movable] += (
+                _START_RADII[count % len(_START_RADII)] * self._coordinate_units[movable] * share
+            )
+            yield start
+
+    def minimize_residual(
+        self, q: Array, movable: Indices, unlimited: Indices
+    ) -> tuple[Array, float]:
+        """Least squares from one start.
+
+        Args:
+            q: (nq,) the start.
+            movable: Columns of the joints that may move.
+            unlimited: Columns of those that may leave their limits.
+
+        Returns:
+            The posture, whole turns as `remove_revolutions` has them, and its largest residual.
+        """
+        lower, upper = self._lower_limits.copy(), self._upper_limits.copy()
+        lower[unlimited], upper[unlimited] = -np.inf, np.inf
+        q = q.copy()
+        q[movable] = np.clip(q, lower, upper)[movable]
+        residual, jacobian = self._residual.evaluate(q)
+        slow_iterations = 0
+        for _ in range(_MAX_ITERATIONS):
+            cost = float(residual @ residual)
+            if (
+                np.abs(residual).max(initial=0.0) < _RESIDUAL_TOLERANCE
+                or slow_iterations >= _MAX_SLOW_ITERATIONS
+            ):
+                break
+            descent_direction = -jacobian.T @ residual
+            at_limit = ((q <= lower) & (descent_direction < 0)) | (
+                (q >= upper) & (descent_direction > 0)
+            )
+            free_columns = movable[~at_limit[movable]]
+            if not len(free_columns):
+                break
+            step = np.zeros(len(q))
+            step[free_columns] = (
+                self._levenberg_marquardt_step(
+                    jacobian[:, free_columns] * self._coordinate_units[free_columns], residual
+                )
+                * self._coordinate_units[free_columns]
+            )
+            step = self._coordinate_derivatives(q, step)
+            accepted = self._line_search(q, step, cost, lambda way: np.clip(way, lower, upper))
+            if accepted is None:
+                break
+            q, residual, jacobian = accepted
+            slow_iterations += int(residual @ residual > _SLOW_PROGRESS_RATIO * cost)
+        periodic = self._periodic.copy()
+        periodic[np.setdiff1d(np.arange(len(q)), movable)] = False
+        q = remove_revolutions(
+            q, self.initial_guess, periodic, self._lower_limits, self._upper_limits
+        )
+        return q, float(np.abs(residual).max(initial=0.0))
+
+    @staticmethod
+    def _levenberg_marquardt_step(jacobian: Array, residual: Array) -> Array:
+        gram = jacobian.T @ jacobian
+        rounding = 1e-14 + 1e-15 * float(gram.diagonal().max(initial=0.0))
+        damping = _DAMPING * min(1.0, float(residual @ residual)) + rounding
+        step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ residual)
+        return np.asarray(step * min(1.0, _MAX_STEP / max(np.abs(step).max(initial=0.0), 1e-300)))
+
+    def _line_search(
+        self, q: Array, step: Array, cost: float, clip_to_limits: Callable[[Array], Array]
+    ) -> tuple[Array, Array, Array] | None:
+        """The longest of halved steps that gets downhill, None where none does."""
+        for halvings in range(_MAX_HALVINGS):
+            trial = clip_to_limits(q + step / 2**halvings)
+            residual, jacobian = self._residual.evaluate(trial)
+            if residual @ residual < cost * (1 - 1e-4 / 2**halvings):
+                return trial, residual, jacobian
+        return None

@@ -1,0 +1,202 @@
+"""Derivatives of traced formulas, as formulas."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from crane.codegen.symbolic import (
+    Scalar,
+    SymbolicExpression,
+    Tape,
+    apply_function,
+    copysign,
+    dot,
+    where_positive,
+)  # fmt: skip
+
+# Of functions of one number: f'(x) by x and y = f(x).
+_UNARY_DERIVATIVES: dict[str, Callable[[SymbolicExpression, SymbolicExpression], Scalar]] = {
+    "sin": lambda x, y: apply_function("cos", x),
+    "cos": lambda x, y: -apply_function("sin", x),
+    "exp": lambda x, y: y,
+    "log": lambda x, y: 1.0 / x,
+    "tanh": lambda x, y: 1.0 - y * y,
+    "sqrt": lambda x, y: 0.5 / y,
+    "abs": lambda x, y: copysign(1.0, x),
+}
+
+
+def differentiate(
+    outputs: Sequence[Scalar], variables: Sequence[SymbolicExpression]
+) -> list[list[Scalar]]:
+    """Jacobian of formulas, the derivative that is not there being the number 0.
+
+    At a kink it is that of one of the two sides.
+
+    Args:
+        outputs: (m,) formulas on one tape.
+        variables: (n,) what was loaded, or any expressions on the tape that count as independent.
+
+    Returns:
+        (m, n) formulas on the same tape.
+    """
+    if not variables:
+        return [[] for _ in outputs]
+    columns = [directional_derivative(outputs, {variable.index: 1.0}) for variable in variables]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def directional_derivative(outputs: Sequence[Scalar], seeds: Mapping[int, Scalar]) -> list[Scalar]:
+    """Derivatives of formulas along a direction; see `differentiate`.
+
+    Args:
+        outputs: (m,) formulas on one tape.
+        seeds: How expressions on it change that count as independent, by their index.
+
+    Returns:
+        (m,) formulas on the same tape.
+    """
+    found = [x for x in outputs if isinstance(x, SymbolicExpression)]
+    tangents = {i: change for i, change in seeds.items() if not _is_zero(change)}
+    if not found or not tangents:
+        return [0.0] * len(outputs)
+    tape, last = found[0].tape, max(x.index for x in found)
+    for index in range(min(tangents) + 1, last + 1):
+        kind, *operands = tape.operations[index]
+        if kind == "load" or index in seeds:
+            continue
+        if not any(type(x) is int and x in tangents for x in operands):
+            continue
+        tangent = _forward_rule(tape, index, kind, operands, tangents)
+        if not _is_zero(tangent):
+            tangents[index] = tangent
+    return [
+        tangents.get(x.index, 0.0) if isinstance(x, SymbolicExpression) else 0.0 for x in outputs
+    ]
+
+
+def weighted_gradient(
+    outputs: Sequence[Scalar], weights: Sequence[Scalar], variables: Sequence[SymbolicExpression]
+) -> list[Scalar]:
+    """Gradient of a weighted sum of formulas, in one pass against their order.
+
+    It takes a small multiple of the formulas' own operations, however many variables there are
+    (Griewank and Walther, Evaluating Derivatives, 2008, section 3.2).
+
+    Args:
+        outputs: (m,) formulas on one tape.
+        weights: (m,) numbers or expressions on it, which count as constant.
+        variables: (n,) what was loaded, or any expressions on the tape that count as independent.
+
+    Returns:
+        (n,) formulas on the same tape, the sum over i of weights_i d outputs_i / d by.
+    """
+    gradient: dict[int, Scalar] = {}
+
+    def accumulate(operand: object, change: Scalar) -> None:
+        if type(operand) is int and operand in dependent and not _is_zero(change):
+            gradient[operand] = gradient.get(operand, 0.0) + change
+
+    found = [x.index for x in outputs if isinstance(x, SymbolicExpression)]
+    variable_indices = {variable.index for variable in variables}
+    if not found or not variable_indices:
+        return [0.0] * len(variables)
+    tape = variables[0].tape
+    dependent = _dependent_operations(tape, variable_indices, max(found))
+    for output, weight in zip(outputs, weights, strict=True):
+        accumulate(output.index if isinstance(output, SymbolicExpression) else None, weight)
+    for index in sorted(dependent - variable_indices, reverse=True):
+        if index in gradient:
+            kind, *operands = tape.operations[index]
+            adjoints = _reverse_rule(tape, index, kind, operands, gradient[index])
+            for operand, change in zip(operands, adjoints, strict=True):
+                accumulate(operand, change)
+    return [gradient.get(variable.index, 0.0) for variable in variables]
+
+
+def _dependent_operations(tape: Tape, variable_indices: set[int], last: int) -> set[int]:
+    """Indices up to the last of what depends on independent ones, which are among them."""
+    dependent = set(variable_indices)
+    for index in range(min(variable_indices) + 1, last + 1):
+        kind, *operands = tape.operations[index]
+        if kind != "load" and any(type(x) is int and x in dependent for x in operands):
+            dependent.add(index)
+    return dependent
+
+
+def _is_zero(change: Scalar) -> bool:
+    return not isinstance(change, SymbolicExpression) and change == 0
+
+
+def _forward_rule(
+    tape: Tape, index: int, kind: str, operands: list, tangents: dict[int, Scalar]
+) -> Scalar:
+    value: list[Scalar] = [SymbolicExpression(tape, x) if type(x) is int else x for x in operands]
+    operand_tangents: list[Scalar] = [
+        tangents.get(x, 0.0) if type(x) is int else 0.0 for x in operands
+    ]
+    a, da = value[0], operand_tangents[0]
+    if kind == "negate":
+        return -da
+    if kind in _UNARY_DERIVATIVES:
+        assert isinstance(a, SymbolicExpression)
+        return da * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index))
+    if kind == "dot":
+        half = len(value) // 2
+        return dot(operand_tangents[:half], value[half:]) + dot(
+            value[:half], operand_tangents[half:]
+        )
+    b, db = value[1], operand_tangents[1]
+    if kind == "add":
+        return da + db
+    if kind == "subtract":
+        return da - db
+    if kind == "multiply":
+        return da * b + a * db
+    if kind == "divide":
+        return (da - SymbolicExpression(tape, index) * db) / b
+    if kind == "maximum":
+        return where_positive(a - b, da, db)
+    if kind == "copysign":
+        # |a| with the sign of b: as a changes while both have one sign, else against it
+        assert isinstance(b, SymbolicExpression)
+        flipped = copysign(1.0, b)
+        if isinstance(a, SymbolicExpression):
+            flipped = flipped * copysign(1.0, a)
+        return da * flipped
+    assert kind == "positive"
+    return where_positive(a, db, operand_tangents[2])
+
+
+def _reverse_rule(
+    tape: Tape, index: int, kind: str, operands: list, adjoint: Scalar
+) -> tuple[Scalar, ...]:
+    """What a weight of an operation gives its operands: the transpose of `_forward_rule`."""
+    value: list[Scalar] = [SymbolicExpression(tape, x) if type(x) is int else x for x in operands]
+    a = value[0]
+    if kind == "negate":
+        return (-adjoint,)
+    if kind in _UNARY_DERIVATIVES:
+        assert isinstance(a, SymbolicExpression)
+        return (adjoint * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index)),)
+    if kind == "dot":
+        half = len(value) // 2
+        return tuple(adjoint * x for x in (*value[half:], *value[:half]))
+    b = value[1]
+    if kind == "add":
+        return adjoint, adjoint
+    if kind == "subtract":
+        return adjoint, -adjoint
+    if kind == "multiply":
+        return adjoint * b, adjoint * a
+    if kind == "divide":
+        share = adjoint / b
+        return share, -(SymbolicExpression(tape, index) * share)
+    if kind == "maximum":
+        return where_positive(a - b, adjoint, 0.0), where_positive(a - b, 0.0, adjoint)
+    if kind == "copysign":
+        assert isinstance(b, SymbolicExpression)
+        flipped = copysign(1.0, b)
+        if isinstance(a, SymbolicExpression):
+            flipped = flipped * copysign(1.0, a)
+        return adjoint * flipped, 0.0
+    assert kind == "positive"
+    return 0.0, where_positive(a, adjoint, 0.0), where_positive(a, 0.0, adjoint)

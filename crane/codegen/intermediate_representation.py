@@ -1,0 +1,384 @@
+"""Formulas, which go straight on, and routines: loops, conditions that stop, own arrays.
+
+Nothing here is written in a machine's language; an emitter translates.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from crane.codegen.layout import Layout
+from crane.codegen.symbolic import Scalar
+
+ValueKind = Literal["real", "integer", "truth"]
+ArgumentKind = Literal["count", "function", "array"]
+
+
+@dataclass(frozen=True, eq=False)
+class RoutineValue:
+    """A number or a truth that a routine computes, evaluated where a statement uses it.
+
+    Comparisons are false where a number is NaN; `~` turns them round.
+
+    Attributes:
+        kind: What it is.
+        operation: "constant", "variable", "argument", "element", "select", or an operator.
+        operands: Values, an `ArrayPointer` and an index, a number or a name.
+    """
+
+    kind: ValueKind
+    operation: str
+    operands: tuple
+
+    @property
+    def _is_zero(self) -> bool:
+        return self.kind == "integer" and self.operation == "constant" and not self.operands[0]
+
+    def __add__(self, other: "Operand") -> "RoutineValue":
+        return self._arithmetic_operation("+", other)
+
+    def __sub__(self, other: "Operand") -> "RoutineValue":
+        return self._arithmetic_operation("-", other)
+
+    def __mul__(self, other: "Operand") -> "RoutineValue":
+        return self._arithmetic_operation("*", other)
+
+    def __truediv__(self, other: "Operand") -> "RoutineValue":
+        return self._arithmetic_operation("/", other)
+
+    def __lt__(self, other: "Operand") -> "RoutineValue":
+        return self._comparison_operation("<", other)
+
+    def __le__(self, other: "Operand") -> "RoutineValue":
+        return self._comparison_operation("<=", other)
+
+    def __gt__(self, other: "Operand") -> "RoutineValue":
+        return self._comparison_operation(">", other)
+
+    def __ge__(self, other: "Operand") -> "RoutineValue":
+        return self._comparison_operation(">=", other)
+
+    def __and__(self, other: "RoutineValue") -> "RoutineValue":
+        return RoutineValue("truth", "and", (self, other))
+
+    def __or__(self, other: "RoutineValue") -> "RoutineValue":
+        return RoutineValue("truth", "or", (self, other))
+
+    def __invert__(self) -> "RoutineValue":
+        return RoutineValue("truth", "not", (self,))
+
+    def _arithmetic_operation(self, operator: str, other: "Operand") -> "RoutineValue":
+        second = as_value(other, self.kind)
+        if self.kind == "integer" and self.operation == second.operation == "constant":
+            a, b = self.operands[0], second.operands[0]
+            return as_value({"+": a + b, "-": a - b, "*": a * b}[operator], "integer")
+        if operator == "+" and self._is_zero:
+            return second
+        return RoutineValue(self.kind, operator, (self, second))
+
+    def _comparison_operation(self, operator: str, other: "Operand") -> "RoutineValue":
+        return RoutineValue("truth", operator, (self, as_value(other, self.kind)))
+
+
+Operand = RoutineValue | float | int
+
+
+def as_value(value: Operand, kind: ValueKind) -> RoutineValue:
+    """A number of this kind."""
+    if isinstance(value, RoutineValue):
+        if value.kind != kind:
+            raise TypeError(f"{value.kind} where {kind} is needed")
+        return value
+    return RoutineValue(kind, "constant", (float(value) if kind == "real" else int(value),))
+
+
+def select(condition: RoutineValue, if_true: Operand, if_false: Operand) -> RoutineValue:
+    """One of two numbers."""
+    return RoutineValue(
+        "real", "select", (condition, as_value(if_true, "real"), as_value(if_false, "real"))
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayPointer:
+    """Numbers in memory, from some element of an argument or of a routine's own array on.
+
+    Attributes:
+        name: Of the argument or the own array.
+        offset: Elements before the first one.
+        layout: Its parts, where they have names.
+    """
+
+    name: str
+    offset: RoutineValue = field(default_factory=lambda: as_value(0, "integer"))
+    layout: Layout | None = None
+
+    def __getitem__(self, index: "int | RoutineValue | str") -> RoutineValue:
+        """An element, or the first one of a part."""
+        return RoutineValue("real", "element", (self, self._element_index(index)))
+
+    def element_pointer(
+        self, index: "int | RoutineValue | str", layout: Layout | None = None
+    ) -> "ArrayPointer":
+        """What begins at an element or a part."""
+        return ArrayPointer(self.name, self.offset + self._element_index(index), layout)
+
+    def row_pointer(
+        self, index: "int | RoutineValue", width: int, layout: Layout | None = None
+    ) -> "ArrayPointer":
+        """One of many rows."""
+        return self.element_pointer(as_value(index, "integer") * width, layout)
+
+    def _element_index(self, index: "int | RoutineValue | str") -> RoutineValue:
+        if isinstance(index, str):
+            assert self.layout is not None
+            index = self.layout.start_index(index)
+        return as_value(index, "integer")
+
+
+@dataclass(frozen=True)
+class FunctionArgument:
+    """A function that is an argument of a routine."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Assign:
+    """variable = value."""
+
+    variable: RoutineValue
+    value: RoutineValue
+
+
+@dataclass(frozen=True)
+class Store:
+    """array[0] = value."""
+
+    target: ArrayPointer
+    value: RoutineValue
+
+
+@dataclass(frozen=True)
+class Copy:
+    """Some elements from one array to another; they do not overlap."""
+
+    target: ArrayPointer
+    source: ArrayPointer
+    count: int
+
+
+@dataclass(frozen=True)
+class Call:
+    """A formula, a routine, or a function that is an argument; `variable` takes its answer."""
+
+    function: str
+    arguments: tuple["RoutineValue | ArrayPointer | FunctionArgument", ...]
+    variable: RoutineValue | None
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Without end, or `variable` from 0 to below `count`."""
+
+    body: list["Statement"]
+    variable: RoutineValue | None = None
+    count: RoutineValue | None = None
+
+
+@dataclass(frozen=True)
+class If:
+    """One of two sequences."""
+
+    condition: RoutineValue
+    then_body: list["Statement"]
+    else_body: list["Statement"]
+
+
+@dataclass(frozen=True)
+class Break:
+    """Go on behind the innermost loop."""
+
+
+@dataclass(frozen=True)
+class Return:
+    """Return an integer."""
+
+    value: RoutineValue
+
+
+Statement = Assign | Store | Copy | Call | Loop | If | Break | Return
+
+
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """f(in_0, in_1, ..., out), straight on.
+
+    Attributes:
+        name: Its name.
+        input_count: Number of arguments that are read.
+        outputs: What it writes, (m,).
+        layout: The outputs' parts.
+    """
+
+    name: str
+    input_count: int
+    outputs: Sequence[Scalar]
+    layout: Layout
+
+    @property
+    def argument_kinds(self) -> tuple[ArgumentKind, ...]:
+        """Of the arguments."""
+        return tuple("array" for _ in range(self.input_count + 1))
+
+
+class Routine:
+    """f(counts, functions, arrays) -> integer, built by its methods; see the module's text.
+
+    The arguments are attributes. Arrays of its own (`local_array`) hold nothing at first and are
+    gone when it returns, so any number of threads may be in it.
+
+    Attributes:
+        name: Its name.
+        counts: Names of arguments that are integers.
+        functions: Names of arguments that are functions.
+        arrays: Names of arguments that are arrays.
+        local_arrays: Length of each array of its own.
+        body: Statements.
+        variables: Values whose operation is "variable".
+    """
+
+    def __init__(
+        self,
+        name: str,
+        callees: Mapping[str, "Formula | Routine"],
+        counts: Sequence[str],
+        functions: Sequence[str],
+        arrays: Mapping[str, Layout | None],
+    ):
+        self.name, self._callees = name, callees
+        self.counts, self.functions, self.arrays = tuple(counts), tuple(functions), tuple(arrays)
+        self.local_arrays: dict[str, int] = {}
+        self.body: list[Statement] = []
+        self.variables: list[RoutineValue] = []
+        self._open_blocks = [self.body]
+        self._arguments: dict[str, RoutineValue | ArrayPointer | FunctionArgument] = {
+            **{function: FunctionArgument(function) for function in functions},
+            **{count: RoutineValue("integer", "argument", (count,)) for count in counts},
+            **{array: ArrayPointer(array, layout=layout) for array, layout in arrays.items()},
+        }
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self.__dict__["_arguments"][name]
+        except KeyError:
+            raise AttributeError(f"'{self.name}' has no argument '{name}'") from None
+
+    @property
+    def argument_kinds(self) -> tuple[ArgumentKind, ...]:
+        """Of the arguments, in their order."""
+        kinds: list[ArgumentKind] = ["count" for _ in self.counts]
+        kinds += ["function" for _ in self.functions]
+        kinds += ["array" for _ in self.arrays]
+        return tuple(kinds)
+
+    def local_array(self, name: str, layout: Layout | int) -> ArrayPointer:
+        """An array of its own."""
+        size = layout if isinstance(layout, int) else layout.size
+        if name in self.local_arrays or name in self._arguments:
+            raise ValueError(f"'{self.name}' has two arrays '{name}'")
+        self.local_arrays[name] = size
+        return ArrayPointer(name, layout=layout if isinstance(layout, Layout) else None)
+
+    def new_variable(self, value: Operand) -> RoutineValue:
+        """A variable with the value that something has now, an integer if it is an int."""
+        kind: ValueKind = "integer" if isinstance(value, int) else "real"
+        value = as_value(value, value.kind if isinstance(value, RoutineValue) else kind)
+        variable = self._add_variable(value.kind)
+        self.assign(variable, value)
+        return variable
+
+    def assign(self, variable: RoutineValue, value: Operand) -> None:
+        """Give a variable another value."""
+        self._append_statement(Assign(variable, as_value(value, variable.kind)))
+
+    def store(self, array: ArrayPointer, index: int | RoutineValue | str, value: Operand) -> None:
+        """array[index] = value."""
+        self._append_statement(Store(array.element_pointer(index), as_value(value, "real")))
+
+    def copy(self, target: ArrayPointer, source: ArrayPointer, count: int) -> None:
+        """target[:count] = source[:count]."""
+        self._append_statement(Copy(target, source, count))
+
+    def call(
+        self, function: str, *arguments: "RoutineValue | ArrayPointer | FunctionArgument | int"
+    ) -> RoutineValue:
+        """Call a formula, an earlier routine, or a function argument; the integer it returns."""
+        ready = tuple(as_value(x, "integer") if isinstance(x, int) else x for x in arguments)
+        callee = self._callees.get(function)
+        if callee is None and function not in self.functions:
+            raise ValueError(f"'{self.name}' calls '{function}', which is not there yet")
+        if callee is not None and len(ready) != len(callee.argument_kinds):
+            raise ValueError(f"'{function}' takes {len(callee.argument_kinds)} arguments")
+        if isinstance(callee, Formula):
+            self._append_statement(Call(function, ready, None))
+            return as_value(0, "integer")
+        answer = self._add_variable("integer")
+        self._append_statement(Call(function, ready, answer))
+        return answer
+
+    @contextmanager
+    def loop(self, count: RoutineValue) -> Iterator[RoutineValue]:
+        """The statements inside for an index from 0 to below a count."""
+        variable = self._add_variable("integer")
+        loop = Loop([], variable, count)
+        self._append_statement(loop)
+        with self._inside_block(loop.body):
+            yield variable
+
+    @contextmanager
+    def loop_forever(self) -> Iterator[None]:
+        """The statements inside until one of them leaves."""
+        loop = Loop([])
+        self._append_statement(loop)
+        with self._inside_block(loop.body):
+            yield
+
+    @contextmanager
+    def if_then(self, condition: RoutineValue) -> Iterator[None]:
+        """The statements inside where something is true."""
+        when = If(condition, [], [])
+        self._append_statement(when)
+        with self._inside_block(when.then_body):
+            yield
+
+    @contextmanager
+    def if_else(self) -> Iterator[None]:
+        """The statements inside where the test of the `if_then` before them is not true."""
+        when = self._open_blocks[-1][-1]
+        assert isinstance(when, If)
+        with self._inside_block(when.else_body):
+            yield
+
+    def break_loop(self) -> None:
+        """Go on behind the innermost loop."""
+        self._append_statement(Break())
+
+    def return_value(self, value: Operand) -> None:
+        """Return."""
+        self._append_statement(Return(as_value(value, "integer")))
+
+    def _add_variable(self, kind: ValueKind) -> RoutineValue:
+        variable = RoutineValue(kind, "variable", (f"x{len(self.variables)}",))
+        self.variables.append(variable)
+        return variable
+
+    def _append_statement(self, statement: Statement) -> None:
+        self._open_blocks[-1].append(statement)
+
+    @contextmanager
+    def _inside_block(self, body: list[Statement]) -> Iterator[None]:
+        self._open_blocks.append(body)
+        yield
+        self._open_blocks.pop()

@@ -1,0 +1,268 @@
+"""Straight formulas in LLVM's language, long ones in pieces.
+
+What takes a compiler time grows faster than a function's length; so a long formula becomes several
+functions, one called after the other, that hand each other numbers in memory.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from crane.codegen.intermediate_representation import Formula
+from crane.codegen.llvm.dot_products import (
+    FAST_MATH_FLAGS,
+    emit_dot_product_stores,
+    emit_dot_products,
+    format_operand,
+    shared_operands,
+)
+from crane.codegen.llvm.vector_functions import MAX_VECTOR_WIDTH, VECTOR_FUNCTIONS, format_real
+from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
+
+MAX_SINGLE_FUNCTION_LENGTH = (
+    6500  # operations of a formula that stays one function, which runs faster
+)
+PIECE_LENGTH = 1000  # of one of several
+_ARITHMETIC = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
+_INTRINSICS = {
+    "sqrt": "@llvm.sqrt.f64", "abs": "@llvm.fabs.f64", "maximum": "@larger",
+    "copysign": "@llvm.copysign.f64", "positive": "@chosen",
+}  # fmt: skip
+# Numbers that registers have no room for are reached with a byte less through the frame pointer.
+# A processor keeps some 32 kB of instructions at hand, and waits for those of longer formulas.
+_FRAME_POINTER_ATTRIBUTES = '"frame-pointer"="all" "no-realign-stack"'
+_VECTORIZED = VECTOR_FUNCTIONS | {"dot"}
+_FUNCTION_END = "  ret void\n}"
+
+
+def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
+    """A straight function; adds to `functions` what it calls of `definitions`."""
+    tapes = {value.tape for value in formula.outputs if isinstance(value, SymbolicExpression)}
+    operations = tapes.pop().operations if tapes else []
+    pieces = [
+        _FormulaPiece(operations, steps)
+        for steps in _split_steps(_group_operations(operations, formula))
+    ]
+    memory_slots = _assign_memory_slots(pieces)
+    targets: dict[int, list[int]] = {}
+    copied_outputs: list[list[str]] = []
+    for i, value in enumerate(formula.outputs):
+        if isinstance(value, SymbolicExpression) and operations[value.index][0] != "load":
+            targets.setdefault(value.index, []).append(i)
+        else:
+            copied_outputs.append(_emit_copied_output(i, value, operations))
+    texts = [piece.emit(memory_slots, targets, functions) for piece in pieces]
+    for start in range(0, len(copied_outputs), PIECE_LENGTH):
+        texts.append(
+            [line for lines in copied_outputs[start : start + PIECE_LENGTH] for line in lines]
+        )
+    if len(pieces) == 1 and len(copied_outputs) <= PIECE_LENGTH:
+        texts = [[line for text in texts for line in text]]
+    inputs = [f"ptr noalias readonly %in{i}" for i in range(formula.input_count)]
+    arguments = ", ".join([*inputs, "ptr noalias %out"])
+    head = f"define void @{formula.name}({arguments}) "
+    if len(texts) <= 1:
+        head += f"{_FRAME_POINTER_ATTRIBUTES} {{"
+        return "\n".join([head, *(line for text in texts for line in text), _FUNCTION_END])
+    shared = f"{arguments}, ptr noalias %between"
+    out, lines = (
+        [],
+        [
+            f"{head}{{",
+            f"  %between = alloca [{1 + max(memory_slots.values(), default=0)} x double]",
+        ],
+    )
+    for number, text in enumerate(texts):
+        name = f"@{formula.name}.{number}"
+        out.append(
+            "\n".join([f"define internal void {name}({shared}) noinline {{", *text, _FUNCTION_END])
+        )
+        words = [f"ptr %in{i}" for i in range(formula.input_count)]
+        lines.append(f"  call void {name}({', '.join([*words, 'ptr %out, ptr %between'])})")
+    return "\n".join([*out, *lines, _FUNCTION_END])
+
+
+def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[list[int]]:
+    """Operations in an order that can be computed, those of `_VECTORIZED` several at once."""
+    steps: list[list[int]] = []
+    for level in _dependency_levels(operations, required_operations(formula.outputs)):
+        same: dict[tuple, list[int]] = {}
+        for i in level:
+            if operations[i][0] in _VECTORIZED:
+                name = operations[i][:1]
+                alike = shared_operands(operations[i]) if name == ("dot",) else name
+                same.setdefault(alike, []).append(i)
+        for _, indices in sorted(same.items(), key=lambda item: item[0][0]):
+            steps += [
+                indices[start : start + MAX_VECTOR_WIDTH]
+                for start in range(0, len(indices), MAX_VECTOR_WIDTH)
+            ]
+        steps += [[i] for i in level if operations[i][0] not in _VECTORIZED | {"load"}]
+    return steps
+
+
+def _split_steps(steps: list[list[int]]) -> list[list[list[int]]]:
+    """Pieces of about equal length; a short formula stays whole, and one without steps is one."""
+    count = round(len(steps) / PIECE_LENGTH) if len(steps) > MAX_SINGLE_FUNCTION_LENGTH else 1
+    size = -(-len(steps) // count) if steps else 1
+    return [steps[start : start + size] for start in range(0, max(1, len(steps)), size)]
+
+
+class _FormulaPiece:
+    """Consecutive operations of a formula.
+
+    Args:
+        operations: All of the formula.
+        steps: Those of the piece, in their order.
+
+    Attributes:
+        computed: What it computes.
+        required: What it needs of earlier pieces.
+    """
+
+    def __init__(self, operations: Sequence[tuple], steps: list[list[int]]):
+        self._operations, self._steps = operations, steps
+        self.computed = {index for step in steps for index in step}
+        self.required = {
+            x
+            for index in self.computed
+            for x in _operand_indices(operations[index])
+            if x not in self.computed and operations[x][0] != "load"
+        }
+
+    def emit(
+        self,
+        memory_slots: dict[int, int],
+        output_indices: dict[int, list[int]],
+        functions: set[tuple[str, int]],
+    ) -> list[str]:
+        """Its statements.
+
+        Args:
+            memory_slots: Where in memory pieces find each other's numbers.
+            output_indices: Which outputs a number is.
+            functions: Takes what it calls of `definitions`.
+        """
+        lines, available = [], set(self.computed)
+        vectors: set[str] = set()
+        for step in self._steps:
+            for x in sorted(
+                {x for index in step for x in _operand_indices(self._operations[index])}
+            ):
+                if x not in available:
+                    available.add(x)
+                    lines += self._emit_load(x, memory_slots)
+            if self._operations[step[0]][0] == "dot":
+                lines += emit_dot_products(step, [self._operations[i][1:] for i in step], vectors)
+                lanes = ((at, k) for k, i in enumerate(step) for at in output_indices.get(i, ()))
+                lines += emit_dot_product_stores(step, lanes)
+            else:
+                lines += self._emit_step(step, functions)
+                for index in step:
+                    for at in output_indices.get(index, ()):
+                        lines += _emit_store(f"q{at}", "out", at, f"%v{index}")
+            for index in step:
+                if index in memory_slots:
+                    lines += _emit_store(f"b{index}", "between", memory_slots[index], f"%v{index}")
+        return lines
+
+    def _emit_step(self, step: list[int], functions: set[tuple[str, int]]) -> list[str]:
+        name = self._operations[step[0]][0]
+        if name not in VECTOR_FUNCTIONS:
+            return [_emit_scalar_operation(step[0], *self._operations[step[0]])]
+        width = 1 << (len(step) - 1).bit_length()
+        functions.add((name, width))
+        return _emit_vector_call(name, width, [(i, self._operations[i][1]) for i in step])
+
+    def _emit_load(self, index: int, memory_slots: dict[int, int]) -> list[str]:
+        """A number from an argument of the formula or an earlier piece."""
+        kind, *where = self._operations[index]
+        array, at = (
+            (f"in{where[0]}", where[1]) if kind == "load" else ("between", memory_slots[index])
+        )
+        return [
+            f"  %p{index} = getelementptr double, ptr %{array}, i64 {at}",
+            f"  %v{index} = load double, ptr %p{index}",
+        ]
+
+
+def _emit_copied_output(at: int, value: Scalar, operations: Sequence[tuple]) -> list[str]:
+    """An output that nothing has to be computed for."""
+    if not isinstance(value, SymbolicExpression):
+        return _emit_store(f"q{at}", "out", at, format_real(float(value)))
+    _, array, index = operations[value.index]
+    return [
+        f"  %l{at} = getelementptr double, ptr %in{array}, i64 {index}",
+        f"  %c{at} = load double, ptr %l{at}",
+        *_emit_store(f"q{at}", "out", at, f"%c{at}"),
+    ]
+
+
+def _emit_store(name: str, array: str, at: int, word: str) -> list[str]:
+    return [
+        f"  %{name} = getelementptr double, ptr %{array}, i64 {at}",
+        f"  store double {word}, ptr %{name}",
+    ]
+
+
+def _operand_indices(operation: tuple) -> list[int]:
+    if operation[0] == "load":
+        return []
+    return [x for x in operation[1:] if isinstance(x, int)]
+
+
+def _assign_memory_slots(pieces: Sequence[_FormulaPiece]) -> dict[int, int]:
+    """Memory for what later pieces need, used again behind the last one that does."""
+    last = {index: number for number, piece in enumerate(pieces) for index in piece.required}
+    memory_slots: dict[int, int] = {}
+    free: list[int] = []
+    count = 0
+    for number, piece in enumerate(pieces):
+        for index in sorted(piece.computed & last.keys()):
+            if not free:
+                free, count = [count], count + 1
+            memory_slots[index] = free.pop()
+        free += sorted(memory_slots[index] for index in piece.required if last[index] == number)
+    return memory_slots
+
+
+def _dependency_levels(operations: Sequence[tuple], indices: Sequence[int]) -> list[list[int]]:
+    """Operations by how many of `_VECTORIZED` come after each other on the way to them."""
+    level: dict[int, int] = {}
+    out: list[list[int]] = []
+    for index in indices:
+        operation = operations[index]
+        before = max((level[x] for x in _operand_indices(operation)), default=0)
+        level[index] = before + (operation[0] in _VECTORIZED)
+        while len(out) <= level[index]:
+            out.append([])
+        out[level[index]].append(index)
+    return out
+
+
+def _emit_vector_call(name: str, width: int, calls: list[tuple[int, Any]]) -> list[str]:
+    """One call of a function of `width` numbers, of which there may be fewer."""
+    lines = []
+    kind, vector = f"<{width} x double>", "poison"
+    for lane in range(width):  # the first once more where there are too few
+        _, operand = calls[lane] if lane < len(calls) else calls[0]
+        word, made = format_operand(operand), f"%{name}{calls[0][0]}_{lane}"
+        lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
+        vector = made
+    result = f"%{name}{calls[0][0]}"
+    lines.append(f"  {result} = call {kind} @{name}{width}({kind} {vector})")
+    lines += [
+        f"  %v{index} = extractelement {kind} {result}, i32 {lane}"
+        for lane, (index, _) in enumerate(calls)
+    ]
+    return lines
+
+
+def _emit_scalar_operation(index: int, kind: str, *operands: Any) -> str:
+    """One operation of one number."""
+    words = [format_operand(operand) for operand in operands]
+    if kind == "negate":
+        return f"  %v{index} = fneg double {words[0]}"
+    if kind in _INTRINSICS:
+        typed = ", ".join(f"double {word}" for word in words)
+        return f"  %v{index} = call double {_INTRINSICS[kind]}({typed})"
+    return f"  %v{index} = {_ARITHMETIC[kind]} {FAST_MATH_FLAGS} double {words[0]}, {words[1]}"

@@ -1,0 +1,303 @@
+"""Numbers that remember how they were computed.
+
+Python code that computes with `SymbolicExpression`s instead of floats leaves a tape of operations.
+What is known while tracing is folded: 0 and 1 disappear, equal operations are done once. So the
+general algorithms, traced for one machine, become that machine's own formulas.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Union
+
+Scalar = Union["SymbolicExpression", float]
+
+
+class Tape:
+    """Operations in the order of their first use.
+
+    Attributes:
+        operations: Tuples (name, operand, ...); an operand is the index of an operation or, as a
+            float, a constant. ("load", array, index) reads an argument.
+    """
+
+    def __init__(self) -> None:
+        self.operations: list[tuple] = []
+        self._known_operations: dict[tuple[object, ...], int] = {}
+
+    def record(self, *operation: object) -> "SymbolicExpression":
+        """The expression of an operation, the old one if it is there already."""
+        # the constant 2.0 and operation number 2 are equal to Python
+        key = (*operation, *(type(operand) is float for operand in operation))
+        index = self._known_operations.get(key)
+        if index is None:
+            index = self._known_operations[key] = len(self.operations)
+            self.operations.append(operation)
+        return SymbolicExpression(self, index)
+
+    def load(self, array: int, index: int) -> "SymbolicExpression":
+        """Element of an argument."""
+        return self.record("load", array, index)
+
+    def load_vector(self, array: int, start: int, count: int) -> list[Scalar]:
+        """Consecutive elements of an argument."""
+        return [self.load(array, start + i) for i in range(count)]
+
+
+class SymbolicExpression:
+    """One value on a tape."""
+
+    __slots__ = ("index", "tape")
+
+    def __init__(self, tape: Tape, index: int):
+        self.tape, self.index = tape, index
+
+    def __bool__(self) -> bool:
+        raise TypeError("a formula is neither true nor false, choose with where_positive")
+
+    def __add__(self, other: Scalar) -> Scalar:
+        if not isinstance(other, SymbolicExpression) and other == 0:
+            return self
+        return self._commutative("add", other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Scalar) -> Scalar:
+        if not isinstance(other, SymbolicExpression):
+            return self + (-other)
+        if other.index == self.index:
+            return 0.0
+        return self.tape.record("subtract", self.index, other.index)
+
+    def __rsub__(self, other: float) -> Scalar:
+        return -self if other == 0 else self.tape.record("subtract", float(other), self.index)
+
+    def __mul__(self, other: Scalar) -> Scalar:
+        if not isinstance(other, SymbolicExpression):
+            if other == 0:
+                return 0.0
+            if abs(other) == 1:
+                return self if other == 1 else -self
+        return self._commutative("multiply", other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Scalar) -> Scalar:
+        if not isinstance(other, SymbolicExpression):
+            return self * (1.0 / other)
+        return self.tape.record("divide", self.index, other.index)
+
+    def __rtruediv__(self, other: float) -> Scalar:
+        return 0.0 if other == 0 else self.tape.record("divide", float(other), self.index)
+
+    def __neg__(self) -> "SymbolicExpression":
+        operation = self.tape.operations[self.index]
+        if operation[0] == "negate":
+            return SymbolicExpression(self.tape, operation[1])
+        return self.tape.record("negate", self.index)
+
+    def _commutative(self, name: str, other: Scalar) -> "SymbolicExpression":
+        if not isinstance(other, SymbolicExpression):
+            return self.tape.record(name, self.index, float(other))
+        return self.tape.record(name, *sorted((self.index, other.index)))
+
+
+def required_operations(outputs: Sequence[Scalar]) -> list[int]:
+    """Indices of the operations that the outputs depend on, in order."""
+    found: set[int] = set()
+    symbolic_outputs = [value for value in outputs if isinstance(value, SymbolicExpression)]
+    operations = symbolic_outputs[0].tape.operations if symbolic_outputs else []
+    indices = [value.index for value in symbolic_outputs]
+    while indices:
+        index = indices.pop()
+        if index in found:
+            continue
+        found.add(index)
+        kind, *operands = operations[index]
+        if kind != "load":
+            indices += [operand for operand in operands if type(operand) is int]
+    return sorted(found)
+
+
+def apply_function(function: str, x: Scalar) -> Scalar:
+    """One of sin, cos, exp, log, tanh, sqrt, abs."""
+    if isinstance(x, SymbolicExpression):
+        return x.tape.record(function, x.index)
+    return abs(x) if function == "abs" else float(getattr(math, function)(x))
+
+
+def maximum(a: Scalar, b: Scalar) -> Scalar:
+    """The larger of two; NaN wins, so that it cannot hide."""
+    if isinstance(a, SymbolicExpression):
+        return a.tape.record(
+            "maximum", a.index, b.index if isinstance(b, SymbolicExpression) else float(b)
+        )
+    if isinstance(b, SymbolicExpression):
+        return maximum(b, a)
+    return math.nan if a != a or b != b else max(a, b)
+
+
+def minimum(a: Scalar, b: Scalar) -> Scalar:
+    """The smaller of two; NaN wins."""
+    return -maximum(-a, -b)
+
+
+def where_positive(x: Scalar, if_positive: Scalar, otherwise: Scalar) -> Scalar:
+    """One number where x > 0, another elsewhere."""
+    if not isinstance(x, SymbolicExpression):
+        return if_positive if x > 0 else otherwise
+    words = (
+        y.index if isinstance(y, SymbolicExpression) else float(y)
+        for y in (if_positive, otherwise)
+    )
+    return x.tape.record("positive", x.index, *words)
+
+
+def max_abs(values: Iterable[Scalar]) -> Scalar:
+    """The largest absolute value, 0 of none."""
+    out: Scalar = 0.0
+    for value in values:
+        out = maximum(out, apply_function("abs", value))
+    return out
+
+
+def copysign(magnitude: Scalar, sign: Scalar) -> Scalar:
+    """|magnitude| with another's sign."""
+    if not isinstance(sign, SymbolicExpression):
+        return math.copysign(1.0, sign) * apply_function("abs", magnitude)
+    first = magnitude.index if isinstance(magnitude, SymbolicExpression) else float(magnitude)
+    return sign.tape.record("copysign", first, sign.index)
+
+
+def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
+    """Dot product of two vectors."""
+    total: Scalar = 0.0
+    for x, y in zip(a, b, strict=True):
+        total = total + x * y
+    return total
+
+
+def cross(a: Sequence[Scalar], b: Sequence[Scalar]) -> list[Scalar]:
+    """Cross product of two vectors (3,)."""
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+
+
+def add_vectors(*vectors: Sequence[Scalar]) -> list[Scalar]:
+    """Sum of vectors."""
+    out = list(vectors[0])
+    for vector in vectors[1:]:
+        out = [x + y for x, y in zip(out, vector, strict=True)]
+    return out
+
+
+def scale_vector(factor: Scalar, vector: Sequence[Scalar]) -> list[Scalar]:
+    """A factor times a vector."""
+    return [factor * x for x in vector]
+
+
+def subtract_vectors(a: Sequence[Scalar], b: Sequence[Scalar]) -> list[Scalar]:
+    """Difference of two vectors."""
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def matvec(matrix: Sequence[Sequence[Scalar]], vector: Sequence[Scalar]) -> list[Scalar]:
+    """Matrix times vector."""
+    return [dot(row, vector) for row in matrix]
+
+
+def transpose(matrix: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
+    """Rows as columns."""
+    return [list(column) for column in zip(*matrix, strict=True)]
+
+
+def matmul(a: Sequence[Sequence[Scalar]], b: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
+    """Matrix times matrix."""
+    columns = list(zip(*b, strict=True))
+    return [[dot(row, column) for column in columns] for row in a]
+
+
+def dot_products(vector: Sequence[Scalar], others: Sequence[Sequence[Scalar]]) -> list[Scalar]:
+    """Dot products of one vector with several, which machine code takes at once.
+
+    Each is one operation, ("dot", *vector, *other). What is not a formula is not worth one.
+    """
+    nonzero = [i for i, x in enumerate(vector) if isinstance(x, SymbolicExpression) or x != 0]
+    first = [vector[i] for i in nonzero]
+    out: list[Scalar] = []
+    for other in others:
+        second = [other[i] for i in nonzero]
+        found = [x for x in (*first, *second) if isinstance(x, SymbolicExpression)]
+        if not found or all(not isinstance(x, SymbolicExpression) and x == 0 for x in second):
+            out.append(dot(first, second))
+            continue
+        words = (
+            x.index if isinstance(x, SymbolicExpression) else float(x) for x in (*first, *second)
+        )
+        out.append(found[0].tape.record("dot", *words))
+    return out
+
+
+def solve_linear_system(
+    matrix: Sequence[Sequence[Scalar]], right: Sequence[Sequence[Scalar]]
+) -> tuple[list[list[Scalar]], Scalar]:
+    """Solve A X = B without branches: Cramer's rule to order 2, else Householder reflections.
+
+    Reflections need no pivoting.
+
+    Args:
+        matrix: (k, k).
+        right: (k, columns).
+
+    Returns:
+        X (k, columns), and the determinant of A.
+    """
+    size = len(matrix)
+    if size == 1:
+        inverse = 1.0 / matrix[0][0]
+        return [[x * inverse for x in right[0]]], matrix[0][0]
+    if size == 2:
+        (a, b), (c, d) = matrix
+        determinant = a * d - b * c
+        inverse = 1.0 / determinant
+        top = [(d * x - b * y) * inverse for x, y in zip(*right, strict=True)]
+        bottom = [(a * y - c * x) * inverse for x, y in zip(*right, strict=True)]
+        return [top, bottom], determinant
+    rows = [[*row, *more] for row, more in zip(matrix, right, strict=True)]
+    determinant = 1.0
+    diagonal: list[Scalar] = []
+    for k in range(size):
+        column = [rows[i][k] for i in range(k, size)]
+        below = dot(column[1:], column[1:])
+        if (
+            not isinstance(below, SymbolicExpression) and below == 0
+        ):  # nothing below: no reflection
+            diagonal.append(column[0])
+            determinant = determinant * column[0]
+            continue
+        length = apply_function("sqrt", column[0] * column[0] + below)
+        if isinstance(column[0], SymbolicExpression):
+            length = copysign(length, column[0])
+        elif column[0] < 0:
+            length = -length
+        first = column[0] + length
+        normal = [first, *column[1:]]
+        factor = 1.0 / (length * first)
+        for j in range(k + 1, len(rows[0])):
+            part = factor * dot(normal, [rows[i][j] for i in range(k, size)])
+            for i in range(k, size):
+                rows[i][j] = rows[i][j] - part * normal[i - k]
+        diagonal.append(-length)
+        determinant = determinant * length  # -length on the diagonal, and -1 of the reflection
+    width = len(right[0])
+    out: list[list[Scalar]] = [[0.0] * width for _ in range(size)]
+    for k in range(size - 1, -1, -1):
+        inverse = 1.0 / diagonal[k]
+        for j in range(width):
+            total = rows[k][size + j]
+            for i in range(k + 1, size):
+                total = total - rows[k][i] * out[i][j]
+            out[k][j] = total * inverse
+    return out, determinant

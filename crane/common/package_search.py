@@ -1,0 +1,254 @@
+"""Where files are that other files name: paths, and places in packages of ROS and Gazebo.
+
+`package://PACKAGE/PATH`, `$(find PACKAGE)` and `model://MODEL/PATH` name a folder that only the
+writer's system knew. It is sought, in this order, in the folders that the user gives, in those
+above the file that names it and beside its own package, and where ROS and Gazebo look. A package
+is a folder whose package.xml (of a model: model.config) has its name, or, without such a file,
+that is called so.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+from crane.common.errors import InputError
+
+URDF_CONSTRAINT = "urdf_constraint"  # reads a URDF's <constraint> elements as loops
+NEAREST_ASSEMBLY = "nearest_assembly"  # takes an assembly that is far from what the file says
+OWN_ARGUMENTS = (URDF_CONSTRAINT, NEAREST_ASSEMBLY)  # that no file need have
+
+_MANIFESTS = ("package.xml", "model.config")
+_NAME_PATTERN = re.compile(rb"<name[^>]*>\s*([^<]*?)\s*</name>")
+_MAX_DEPTH, _MAX_FOLDERS = 4, 2000  # levels below a given folder, and folders looked into
+# Variables with folders of packages, and what is between them and the packages.
+_SEARCH_VARIABLES = {
+    "ROS_PACKAGE_PATH": "", "AMENT_PREFIX_PATH": "share", "CMAKE_PREFIX_PATH": "share",
+    "GZ_SIM_RESOURCE_PATH": "", "IGN_GAZEBO_RESOURCE_PATH": "", "GAZEBO_MODEL_PATH": "",
+    "SDF_PATH": "",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoadOptions:
+    """What a user says beside the name of a file.
+
+    Attributes:
+        packages: Folders of packages, or in which there are some.
+        arguments: Values by name of the file's arguments.
+        floating_root: Whether the root is to float.
+        strict: Whether what only has an odd form is refused, as `crane.load` has it.
+        found_packages: Packages that were sought while it holds, by name and by who asked.
+    """
+
+    packages: tuple[str, ...] = ()
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    floating_root: bool = False
+    strict: bool = False
+    found_packages: dict[tuple[str, Path], Path | None] = field(default_factory=dict, repr=False)
+
+
+_load_options: ContextVar[LoadOptions | None] = ContextVar("given", default=None)
+
+
+def load_options() -> LoadOptions:
+    """What holds for the files that are read now."""
+    return _load_options.get() or LoadOptions()
+
+
+@contextmanager
+def use_load_options(
+    packages: Sequence[str] = (),
+    arguments: Mapping[str, object] | None = None,
+    floating: bool = False,
+    strict: bool = False,
+) -> Iterator[LoadOptions]:
+    """Read files with packages in these folders and with values of arguments.
+
+    Args:
+        packages: Folders.
+        arguments: Values by name; numbers and truth values are written as XML has them.
+        floating: Whether the root is to float.
+        strict: Whether what only has an odd form is refused, here and in all that is read within.
+    """
+    values = {str(name): _format_argument(value) for name, value in (arguments or {}).items()}
+    options = LoadOptions(tuple(packages), values, floating, strict or load_options().strict)
+    token = _load_options.set(options)
+    try:
+        yield options
+    finally:
+        _load_options.reset(token)
+
+
+def asked(name: str) -> bool:
+    """Whether one of the package's own arguments is true, see `OWN_ARGUMENTS`.
+
+    Raises:
+        InputError: It is neither true nor false.
+    """
+    value = load_options().arguments.get(name, "false").lower()
+    if value not in ("true", "false"):
+        raise InputError(f"the argument {name} is '{value}', give true or false")
+    return value == "true"
+
+
+def _format_argument(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def check_package_folders(packages: object) -> list[str]:
+    """Folders of packages, as a caller gives them.
+
+    Raises:
+        InputError: They are no list, or not there.
+    """
+    if isinstance(packages, str | Path) or not isinstance(packages, Sequence):
+        raise InputError(f"packages is {packages!r}, give a list of folders such as ['src']")
+    folders = [Path(str(folder)).resolve() for folder in packages]
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"packages: {folder} is no folder, check the path")
+    return [str(folder) for folder in folders]
+
+
+def check_argument_values(arguments: object) -> Mapping[str, object]:
+    """Values of arguments, as a caller gives them.
+
+    Raises:
+        InputError: They are not given by name.
+    """
+    if not isinstance(arguments, Mapping | None):
+        raise InputError(
+            f"arguments is {arguments!r}, give values by name such as {{'name': 'value'}}"
+        )
+    return arguments or {}
+
+
+def find_file(name: str, folder: Path) -> Path | None:
+    """The file or folder that a name stands for, None if there is none.
+
+    A name is a path from the folder of the file that has it, or from one above. `package://NAME/`
+    and `model://NAME/` begin in a package, see `find_package`; where that is not known, the rest
+    is a path, and so is that of other `SCHEME://PATH`. `package://FILE`, which names no package,
+    is FILE.
+
+    Args:
+        name: As a file has it.
+        folder: Of that file.
+    """
+    scheme, separated, rest = name.partition("://")
+    parts = [part for part in Path(rest if separated else name).parts if part != "/"]
+    in_package = bool(separated) and scheme in ("package", "model") and bool(parts)
+    try:
+        if in_package and (package := find_package(parts[0], folder)) is not None:
+            inside = package.joinpath(*parts[1:])
+            if inside.exists():
+                return inside
+        return _search_upwards(Path(rest if separated else name), parts, folder, in_package)
+    except (OSError, ValueError):  # a name that cannot be a file's
+        return None
+
+
+def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool) -> Path | None:
+    """A path from a folder or one above it; in a package perhaps without the package's name."""
+    ends = [path]
+    if in_package:
+        ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
+    places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
+    return next((place for place in places if place.is_file()), None)
+
+
+def find_package(name: str, folder: Path) -> Path | None:
+    """The folder of a package, None where it is not found.
+
+    Args:
+        name: Of the package.
+        folder: Of the file that names it.
+    """
+    key, options = (name, folder.absolute()), load_options()
+    if key not in options.found_packages:
+        options.found_packages[key] = _search_package(name, folder.absolute(), options.packages)
+    return options.found_packages[key]
+
+
+def _search_package(name: str, folder: Path, packages: Sequence[str]) -> Path | None:
+    for folder_given in packages:
+        if (found := _search_below(name, Path(folder_given))) is not None:
+            return found
+    for above in (folder, *folder.parents):
+        for place in (above, above / name):
+            if _is_package(place, name):
+                return place
+    own_package = next(
+        (above for above in (folder, *folder.parents) if _package_name(above)), None
+    )
+    for top in () if own_package is None else (own_package, own_package.parent):
+        if (found := _search_below(name, top, 2)) is not None:
+            return found
+    for variable, between in _SEARCH_VARIABLES.items():
+        for prefix in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+            if (found := _search_below(name, Path(prefix) / between, 2)) is not None:
+                return found
+    same_named = (x for above in (folder, *folder.parents) for x in (above, above / name))
+    return next((x for x in same_named if x.name == name and x.is_dir()), None)
+
+
+def _is_package(folder: Path, name: str) -> bool:
+    """Whether a folder is the package of a name."""
+    name_in_manifest = _package_name(folder)
+    return name_in_manifest == name or (
+        folder.name == name and folder.is_dir() and not name_in_manifest
+    )
+
+
+def _search_below(name: str, top: Path, depth: int = _MAX_DEPTH) -> Path | None:
+    """The package of a name in a folder, the nearest to it."""
+    level = [top]
+    seen = 0
+    for _ in range(depth + 1):
+        for folder in level:
+            if _is_package(folder, name):
+                return folder
+        deeper: list[Path] = []
+        for folder in level:
+            if seen > _MAX_FOLDERS:
+                break
+            inside = _subfolders(str(folder))
+            seen += len(inside)
+            deeper += map(Path, inside)
+        level = deeper
+    return None
+
+
+def _subfolders(folder: str) -> list[str]:
+    try:
+        with os.scandir(folder) as inside:
+            return sorted(x.path for x in inside if x.is_dir() and not x.name.startswith("."))
+    except OSError:
+        return []
+
+
+def _package_name(folder: Path) -> str:
+    """The name in a folder's package.xml or model.config, empty without one."""
+    for manifest in _MANIFESTS:
+        file = folder / manifest
+        try:
+            changed = file.stat().st_mtime_ns
+        except (OSError, ValueError):
+            continue
+        if name := _name_in_manifest(str(file), changed):
+            return name if manifest == _MANIFESTS[0] else folder.name
+    return ""
+
+
+@lru_cache(maxsize=4096)
+def _name_in_manifest(file: str, _: int) -> str:
+    try:
+        found = _NAME_PATTERN.search(Path(file).read_bytes()[:100_000])
+    except OSError:
+        return ""
+    return found[1].decode("utf-8", "replace") if found else ""

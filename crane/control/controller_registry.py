@@ -1,0 +1,40 @@
+"""Controllers by name."""
+
+from collections.abc import Callable, Mapping
+
+from crane.common.errors import InputError, suggest_names
+from crane.control.control_law import Controller
+from crane.control.force_controllers import PI, ComputedTorque
+from crane.control.tip_velocity import TipVelocity
+from crane.control.valve_commands import ValveCommand, ValvePD
+from crane.control.valve_feedforward import ValveFeedforward
+from crane.machine import Machine
+from crane.motion.trajectory import Trajectory
+
+CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | ValveCommand]] = {
+    "pi": PI,
+    "computed-torque": ComputedTorque,
+    "valve-pd": ValvePD,
+    "valve-feedforward": ValveFeedforward,
+    "tip-velocity": TipVelocity,
+}
+
+
+def default_controller_name(machine: Machine) -> str:
+    """The controller that follows a machine's tasks if none is named."""
+    if machine.hydraulics is not None and machine.hydraulics.control:
+        return "valve-pd"
+    return "pi" if machine.control else "computed-torque"
+
+
+def make_controller(
+    name: str, machine: Machine, reference: Trajectory
+) -> Controller | ValveCommand:
+    """A built-in controller by name.
+
+    Raises:
+        InputError: There is no such controller.
+    """
+    if name not in CONTROLLERS:
+        raise InputError(f"controller '{name}' is unknown, {suggest_names(CONTROLLERS, name)}")
+    return CONTROLLERS[name](machine, reference)

@@ -1,0 +1,341 @@
+"""Signals of valves: from a controller, a joystick, or a recording."""
+
+import threading
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.codegen import Scalar
+from crane.codegen.symbolic import apply_function
+from crane.common.errors import InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.plausible_ranges import suggested_units_text
+from crane.common.samples import Array, as_number, as_sample
+from crane.control.control_law import ControllerInputs
+from crane.hydraulics import Hydraulics, PDGains, Valve
+from crane.hydraulics.components import Spool
+from crane.machine import Machine
+from crane.motion.task_trajectories import add_free_joints
+from crane.motion.trajectory import Trajectory
+
+_MAX_LOG_INTERVAL = 0.02  # [s] between samples of a log, at most
+_SLOPE_TOLERANCE = (
+    1e-12  # of a signal, that slopes differ by over its shortest step where it goes on
+)
+_TIME_TOLERANCE = 1e-9  # of a period, between instants that are one
+_DEAD_BAND_SMOOTHING = (
+    0.01  # of the spool's stroke, over which the feedforward jumps the dead band
+)
+
+
+@runtime_checkable
+class ValveCommand(Protocol):
+    """Where the signals of m spools come from, one per valve and one more per second spool.
+
+    What is written here is what those have that say nothing else. A valve with dead time gets the
+    signal of an earlier instant: `ValveDrive` asks for it.
+
+    Attributes:
+        reference: The reference motion, or None.
+        initial_coordinates: (n,) active coordinates that it begins at, None for home or the
+            reference's start.
+        has_measured_pressures: Whether the last two references are the pressures of supply and
+            tank.
+        settings: (s,) its numbers.
+        period: Time between calls of `update` [s]; 0 if it wants none.
+        is_open_loop: Whether the first m references are the signals, whatever the machine does,
+            and those of instants that have passed are remembered.
+        duration: How long it takes, at most [s]; 0 where it does not know.
+        is_finished: Whether it has no more to do: a run that was given no duration ends then.
+        channels: Names and units of what its references have behind the signals, to be recorded.
+        clock: Tells its phase (N,) at times (N,) [s]; None where it has none.
+    """
+
+    reference: Trajectory | None = None
+    initial_coordinates: Array | None = None
+    has_measured_pressures: bool = False
+    settings: Array = np.zeros(0)
+    period: float = 0.0
+    is_open_loop: bool = False
+    duration: float = 0.0
+    is_finished: bool = False
+    channels: tuple[tuple[str, str], ...] = ()
+    clock: Callable[[Array], Array] | None = None
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
+        return
+
+    def references(self, times: Array) -> Array:
+        """All that depends on time alone, (N, c) at times (N,) [s]; nothing yet."""
+        return np.zeros((len(times), 0))
+
+    def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """Signals (m,) [V], from floats or as formulas; what it sees are its own settings."""
+        raise NotImplementedError
+
+
+def require_circuit(machine: Machine) -> Hydraulics:
+    """The circuit of a machine.
+
+    Raises:
+        InputError: It has none.
+    """
+    if machine.hydraulics is None:
+        raise InputError(
+            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
+            "the machine file"
+        )
+    return machine.hydraulics
+
+
+def lever_signals(spool: Valve | Spool, lever: Array) -> Array:
+    """Signals of a spool (.,) [V] for a lever (.,) from -1 to 1, a share of its valve's flow.
+
+    Beyond zero it jumps over the dead band, as the electronics of such machines do.
+    """
+    u = lever * (1.0 - spool.dead_band) + spool.dead_band * np.sign(lever)
+    return np.asarray(spool.neutral + (spool.full - spool.neutral) * u)
+
+
+class ValveSignals(ValveCommand, OneLineRepr):
+    """Signals given in time, straight between the instants and constant beyond them.
+
+    Args:
+        machine: The machine.
+        time: Instants (N,) [s], increasing.
+        signals: [V] (N,) by joint, and by JOINT_b of second spools, which get that of the first
+            one if they are not named; valves that are not named stay neutral.
+        supply: Measured pressure of the supply (N,) [Pa], if it is to be used.
+        tank: Measured pressure of the tank (N,) [Pa]; that of the machine file if not given.
+
+    Attributes:
+        title: What they come from, in words; recordings name their controller by it.
+        duration: From zero to the last instant [s].
+
+    Raises:
+        InputError: Unknown joints, wrong lengths, or times that do not increase.
+    """
+
+    title = "given valve signals"
+    is_open_loop = True
+
+    def __init__(
+        self,
+        machine: Machine,
+        time: ArrayLike,
+        signals: Mapping[str, ArrayLike],
+        supply: ArrayLike | None = None,
+        tank: ArrayLike | None = None,
+    ):
+        circuit = require_circuit(machine)
+        shape = np.shape(time)
+        if len(shape) != 1 or not shape[0]:
+            raise InputError(f"time has the shape {shape}, give (N,) instants")
+        self._instants = as_sample(time, shape[0], "time of the signals").copy()
+        if not (np.diff(self._instants) > 0).all():
+            raise InputError("time of the signals does not increase, sort it")
+        if not isinstance(signals, Mapping):
+            example = next(iter(circuit.spools))
+            raise InputError(
+                f"signals are a {type(signals).__name__}, give those of each valve by its joint, "
+                f"as {{'{example}': [...]}}"
+            )
+        for name in signals:
+            if name not in circuit.spools:
+                raise InputError(f"no valve for '{name}', {suggest_names(circuit.spools, name)}")
+        columns = []
+        for name, spool in circuit.spools.items():
+            lever = name if name in signals else spool.joint
+            columns.append(
+                self._check_column(signals[lever], f"signal of '{lever}'")
+                if lever in signals
+                else np.full(len(self._instants), spool.neutral)
+            )
+        self.has_measured_pressures = supply is not None or tank is not None
+        if self.has_measured_pressures:
+            for given, default, port in (
+                (supply, circuit.supply.pressure, "supply"),
+                (tank, circuit.supply.tank, "tank"),
+            ):
+                samples = np.full(len(self._instants), default) if given is None else given
+                columns.append(self._check_column(samples, f"pressure of the {port}"))
+                if columns[-1].min() < 0:
+                    raise InputError(
+                        f"pressure of the {port} is {columns[-1].min():g} Pa, it counts from a "
+                        "vacuum and cannot be negative: add 1e5 to gauge pressures"
+                    )
+            highest = float(columns[-2].max())
+            if 0 < highest < columns[-1].min() / 2:  # also of a pump that rests the line has more
+                raise InputError(
+                    f"pressure of the supply is {highest:g} Pa at most, far below the tank's"
+                    + (
+                        suggested_units_text("pressure", highest)
+                        or ", give it in Pa from a vacuum"
+                    )
+                )
+        self._columns = np.asfortranarray(np.column_stack(columns))  # read column by column
+        self._spool_count = len(circuit.spools)
+        self.duration = float(self._instants[-1])
+
+    def _check_column(self, values: ArrayLike, label: str) -> Array:
+        return as_sample(values, len(self._instants), label)
+
+    def breaks(self) -> Array:
+        """Times (k,) [s] at which signals turn; none of a log, whose samples are close."""
+        if len(self._instants) > 1 and self.duration - self._instants[0] < _MAX_LOG_INTERVAL * len(
+            self._instants
+        ):
+            return np.zeros(0)
+        return self._instants
+
+    def slope_changes(self, spool_index: int) -> Array:
+        """Times (k,) [s] at which the signal of a spool turns."""
+        time, values = self._instants, self._columns[:, spool_index]
+        if len(time) < 2:
+            return time
+        slopes = np.concatenate([[0.0], np.diff(values) / np.diff(time), [0.0]])
+        slope_tolerance = _SLOPE_TOLERANCE * np.abs(values).max() / np.diff(time).min()
+        corner_times: Array = time[np.abs(np.diff(slopes)) > slope_tolerance]
+        return corner_times
+
+    def references(self, times: Array) -> Array:
+        """See `ValveCommand`."""
+        return np.column_stack([np.interp(times, self._instants, x) for x in self._columns.T])
+
+    def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """See `ValveCommand`."""
+        return inputs.reference[: self._spool_count]
+
+
+class ValvePD(ValveCommand, OneLineRepr):
+    """One PD controller per spool, equation (37) of the electro-hydraulic forwarder paper.
+
+    u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f, with the feedforward F_f that jumps over the
+    dead band d: F_f = d tanh(w / 0.01), w the sum of the other terms. q are the active joints'
+    own coordinates.
+
+    Args:
+        machine: The machine.
+        reference: Reference of the active joints.
+        gains: By joint; those of the machine file if not given.
+
+    Raises:
+        InputError: No valves, or no gains for one.
+    """
+
+    def __init__(
+        self, machine: Machine, reference: Trajectory, gains: Mapping[str, PDGains] | None = None
+    ):
+        circuit = require_circuit(machine)
+        gains = circuit.control if gains is None else gains
+        for joint in circuit.joints:
+            if joint not in gains:
+                raise InputError(
+                    f"no gains for the valve of '{joint}' of '{machine.name}', give kp and kd "
+                    "under 'control' of its 'hydraulics'"
+                )
+        self.reference: Trajectory = add_free_joints(machine, reference)
+        spools = circuit.spools.values()
+        self._active_indices = [machine.active.index(spool.joint) for spool in spools]
+        settings = [
+            [gains[spool.joint].kp for spool in spools],
+            [gains[spool.joint].kd for spool in spools],
+            [spool.dead_band for spool in spools],
+            [spool.neutral for spool in spools],
+            [spool.full - spool.neutral for spool in spools],
+        ]
+        self.settings = np.array(settings, dtype=np.float64).ravel()
+
+    def references(self, times: Array) -> Array:
+        """See `ValveCommand`."""
+        q, v = self.reference.position(times), self.reference.velocity(times)
+        return np.hstack([q[:, self._active_indices], v[:, self._active_indices]])
+
+    def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """See `ValveCommand`."""
+        m = len(self._active_indices)
+        kp, kd, dead_bands, neutral, span = (
+            inputs.settings[i * m : (i + 1) * m] for i in range(5)
+        )
+        out: list[Scalar] = []
+        for i, joint in enumerate(self._active_indices):
+            opening_command = kp[i] * (inputs.reference[i] - inputs.q_a[joint])
+            opening_command = opening_command + kd[i] * (
+                inputs.reference[m + i] - inputs.v_a[joint]
+            )
+            dead_band_jump = dead_bands[i] * apply_function(
+                "tanh", opening_command * (1.0 / _DEAD_BAND_SMOOTHING)
+            )
+            out.append(neutral[i] + span[i] * (opening_command + dead_band_jump))
+        return out
+
+
+class _HeldSignals(threading.local):
+    """Signals (s,) that the valves keep until they are set again, in every thread its own.
+
+    Attributes:
+        signals: All of them.
+        set_times: When each of them was set [s].
+    """
+
+    def __init__(self, signals: Array):
+        self.signals, self.set_times = [signals], [0.0]
+
+
+class SampledCommand(ValveCommand, OneLineRepr):
+    """A program of the user that sets the valves once per period, as a control unit does.
+
+    Args:
+        function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.spools`,
+            which are its joints where no valve has two; t [s], q_a and v_a (n,), pressures (m, 2)
+            of A and B by joint [Pa], signals (s,) [V].
+        machine: The machine.
+        period: [s], a whole number of steps of the simulation.
+    """
+
+    is_open_loop = True
+
+    def __init__(
+        self,
+        function: Callable[[float, Array, Array, Array], ArrayLike],
+        machine: Machine,
+        period: float = 0.01,
+    ):
+        if not callable(function):
+            raise InputError(f"{function!r} is no function (t, q_a, v_a, pressures) -> signals")
+        self._function = function
+        circuit = require_circuit(machine)
+        self._spool_names = tuple(circuit.spools)
+        self._active_columns = machine.closure.active
+        self.period = as_number(period, "the period", "s", greater_than=0)
+        neutral = np.array([spool.neutral for spool in circuit.spools.values()])
+        self._held_signals = _HeldSignals(neutral)  # by a run, which is one thread's
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """See `ValveCommand`."""
+        signals = self._function(time, q[self._active_columns].copy(), v_a.copy(), pressures)
+        label = f"the signals at t = {time:g} s"
+        held = self._held_signals
+        kept_count = bisect_left(
+            held.set_times, time - _TIME_TOLERANCE * self.period
+        )  # what is later is of before
+        held.set_times[kept_count:] = [time]
+        held.signals[kept_count:] = [
+            as_sample(signals, len(self._spool_names), label, self._spool_names)
+        ]
+
+    def references(self, times: Array) -> Array:
+        """See `ValveCommand`; between two jumps, at which steps end, it holds one signal."""
+        mid_time = 0.5 * (times[0] + times[-1]) + _TIME_TOLERANCE * self.period
+        held = self._held_signals.signals[
+            max(bisect_right(self._held_signals.set_times, mid_time) - 1, 0)
+        ]
+        return np.tile(held, (len(times), 1))
+
+    def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """See `ValveCommand`."""
+        return inputs.reference

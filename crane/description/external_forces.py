@@ -1,0 +1,258 @@
+"""Forces from outside: wrenches at frames of a machine, by time, place and velocity."""
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.codegen.symbolic import Scalar, matvec
+from crane.common.errors import InputError
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array
+
+AXES = ("world", "frame")
+WRENCH_COMPONENTS = tuple(f"{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz")
+
+
+class FrameMotion(NamedTuple):
+    """What a force from outside sees: floats, or formulas while it becomes machine code.
+
+    Attributes:
+        position: (3,) origin of its frame in the world [m].
+        rotation: (3, 3) its axes, columns in the world.
+        velocity: (3,) of the origin, in the world [m/s].
+        angular_velocity: (3,) angular velocity, in the world [rad/s].
+        reference: (c,) its row of `references`.
+        states: (s,) its own, see `ExternalForce.state_count`.
+    """
+
+    position: list[Scalar]
+    rotation: list[list[Scalar]]
+    velocity: list[Scalar]
+    angular_velocity: list[Scalar]
+    reference: list[Scalar]
+    states: Sequence[Scalar] = ()
+
+
+class ExternalForce(OneLineRepr):
+    """A wrench at a frame. What depends on more than time writes `wrench` in a class of its own.
+
+    Its formulas become machine code: `wrench` is called with numbers and, once, with formulas.
+    `crane.Wrench` is one by time, `crane.WrenchFunction` calls a function in Python.
+
+    Args:
+        frame: A link of the machine.
+        name: What it is called in recordings; its frame's name if not given.
+
+    Attributes:
+        frame: The same.
+        name: Likewise.
+    """
+
+    is_traceable: ClassVar[bool] = True  # else `wrench` reads its answer behind the references
+
+    def __init__(self, frame: str, name: str = ""):
+        self.frame, self.name = frame, name or frame
+
+    def references(self, times: Array) -> Array:
+        """All that depends on time alone, (N, c) at times (N,) [s]."""
+        return np.zeros((len(times), 0))
+
+    def breaks(self) -> Array:
+        """Times (k,) [s] at which that jumps or turns sharply, in order."""
+        return np.zeros(0)
+
+    def event_lengths(self, motion: FrameMotion) -> Sequence[Scalar]:
+        """Lengths [m] at whose signs the wrench bends sharply: steps end there; none yet."""
+        return ()
+
+    @property
+    def channels(self) -> list[tuple[str, str]]:
+        """Names and units of what `outputs` tells; nothing yet."""
+        return []
+
+    def outputs(self, motion: FrameMotion) -> Sequence[Scalar]:
+        """What is recorded besides the wrench, in the order of `channels`."""
+        return ()
+
+    @property
+    def state_count(self) -> int:
+        """How many lengths [m] it remembers, which are 0 at the start; none yet."""
+        return 0
+
+    def state_rates(self, motion: FrameMotion) -> Sequence[Scalar]:
+        """How fast those change [m/s]."""
+        return ()
+
+    def wrench(self, motion: FrameMotion) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """Force (3,) [N] and moment (3,) [N m] about the frame's origin, in the world's axes."""
+        raise NotImplementedError
+
+
+class Wrench(ExternalForce):
+    """A wrench by time: constant, or straight between given times and held before and after.
+
+    Args:
+        frame: See `ExternalForce`.
+        force: (3,) or (N, 3) [N].
+        moment: (3,) or (N, 3) about the frame's origin [N m].
+        times: (N,) rising [s]; none of what is constant. Two may be equal, where it jumps.
+        axes: "world", or "frame" of what turns with it.
+        name: See `ExternalForce`.
+
+    Attributes:
+        times: (N,), one of what is constant.
+        values: (N, 6) force and moment.
+        axes: As given.
+
+    Raises:
+        InputError: Wrong shapes, no numbers, times that do not rise, or other axes.
+    """
+
+    def __init__(
+        self,
+        frame: str,
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        moment: ArrayLike = (0.0, 0.0, 0.0),
+        times: ArrayLike | None = None,
+        axes: str = "world",
+        name: str = "",
+    ):
+        super().__init__(frame, name)
+        label = f"the load on '{frame}'"
+        if axes not in AXES:
+            raise InputError(f"{label} has axes '{axes}', give 'world' or 'frame'")
+        self.axes = axes
+        self.times = _as_finite_array(
+            [0.0] if times is None else times, f"the list of times of {label}", 1
+        )
+        components = []
+        for name_, given in (("force", force), ("moment", moment)):
+            component = _as_finite_array(given, f"the {name_} of {label}", None)
+            if component.shape not in ((3,), (len(self.times), 3)):
+                raise InputError(
+                    f"{label}: {name_} has the shape {component.shape}, give (3,), or with "
+                    f"times (N,) "
+                    "(N, 3)"
+                )
+            components.append(np.broadcast_to(component, (len(self.times), 3)))
+        if not len(self.times) or (np.diff(self.times) < 0).any():
+            raise InputError(f"{label}: times do not rise, give them in order")
+        self.values: Array = np.hstack(components)
+
+    def references(self, times: Array) -> Array:
+        """See `ExternalForce`."""
+        columns = [np.interp(times, self.times, column) for column in self.values.T]
+        return np.stack(columns, axis=1)
+
+    def breaks(self) -> Array:
+        """See `ExternalForce`."""
+        return np.unique(self.times) if len(self.times) > 1 else np.zeros(0)
+
+    def wrench(self, motion: FrameMotion) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """See `ExternalForce`."""
+        force, moment = motion.reference[:3], motion.reference[3:]
+        if self.axes == "frame":
+            return matvec(motion.rotation, force), matvec(motion.rotation, moment)
+        return force, moment
+
+
+class PhasedWrench(Wrench):
+    """A wrench over the phases of a task of levers in place of time, straight in between.
+
+    Args:
+        frame: See `ExternalForce`.
+        force: See `Wrench`.
+        moment: See `Wrench`.
+        phases: (N,) rising: 0 as the first phase begins, 1.5 when the second is half done.
+        axes: See `Wrench`.
+        name: See `ExternalForce`.
+
+    Attributes:
+        clock: Tells the phase (N,) at times (N,) [s]; None until a run has one, see `with_clock`.
+    """
+
+    clock: Callable[[Array], Array] | None = None
+
+    def __init__(
+        self,
+        frame: str,
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        moment: ArrayLike = (0.0, 0.0, 0.0),
+        phases: ArrayLike | None = None,
+        axes: str = "world",
+        name: str = "",
+    ):
+        super().__init__(frame, force, moment, phases, axes, name)
+
+    def with_clock(self, clock: Callable[[Array], Array]) -> "PhasedWrench":
+        """The same by the clock of a run."""
+        result = copy(self)
+        result.clock = clock
+        return result
+
+    def references(self, times: Array) -> Array:
+        """See `ExternalForce`."""
+        return super().references(times if self.clock is None else self.clock(times))
+
+    def breaks(self) -> Array:
+        """See `ExternalForce`: when phases end is not known before."""
+        return np.zeros(0)
+
+
+class WrenchFunction(ExternalForce):
+    """A wrench by a function in Python, which is called at every stage of a step.
+
+    Args:
+        frame: See `ExternalForce`.
+        function: (t, place (3,), turn (3, 3), velocity (3,), spin (3,)) -> (6,) force and moment
+            about the frame's origin in the world's axes [N], [N m]; see `FrameMotion`.
+        name: See `ExternalForce`.
+    """
+
+    is_traceable = False
+
+    def __init__(
+        self,
+        frame: str,
+        function: Callable[[float, Array, Array, Array, Array], ArrayLike],
+        name: str = "",
+    ):
+        super().__init__(frame, name)
+        if not callable(function):
+            raise InputError(f"the load on '{frame}' is no function, give one of (t, place, ...)")
+        self._function = function
+
+    def references(self, times: Array) -> Array:
+        """See `ExternalForce`."""
+        return times[:, None]
+
+    def wrench(self, motion: FrameMotion) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """See `ExternalForce`.
+
+        Raises:
+            InputError: The function does not give six numbers.
+        """
+        if len(motion.reference) > 1:  # asked already
+            return motion.reference[1:4], motion.reference[4:]
+        time = float(motion.reference[0])  # type: ignore[arg-type]
+        inputs = (np.array(part, dtype=np.float64) for part in motion[:4])
+        result = np.asarray(self._function(time, *inputs))
+        if result.shape != (6,) or result.dtype.kind not in "fiu" or not np.isfinite(result).all():
+            raise InputError(
+                f"the load '{self.name}' gives {np.array2string(result, separator=', ')} at "
+                f"t = {time:g} s, give six numbers: force [N] and moment [N m]"
+            )
+        return result[:3].tolist(), result[3:].tolist()
+
+
+def _as_finite_array(values: ArrayLike, label: str, dimensions: int | None) -> Array:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if not np.isfinite(array).all() or (dimensions is not None and array.ndim != dimensions):
+        raise InputError(f"{label} holds what is no finite number, correct it")
+    return array

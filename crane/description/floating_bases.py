@@ -1,0 +1,176 @@
+"""Bodies that float: which series of six freedoms at the root are one joint without singularity.
+
+A joint with six freedoms is read as a series of three slides and three turns (see
+`crane.formats.joint_series`), whose Cardan angles have a singularity at a pitch of 90 degrees.
+Where such a series carries a body from the ground, and no loop, coupling, spring or drive acts on
+it, its place need not be solved for: the series is one free-flyer then, with coordinates and
+velocities of its own.
+
+Its coordinates are the place p [m] and the rotation vector r [rad] of the body, R = exp(r x), of a
+length of at most pi; its velocities the body's twist in the body's axes, V = (linear, angular):
+
+    p' = R V_lin,   r' = (1 + r x / 2 + c (r x)^2) V_ang,   c = (1 - (t/2) cot(t/2)) / t^2, t = |r|
+
+(Bullo and Murray 1995), which is regular up to t = 2 pi. Forces are a wrench in the same axes.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+from crane.common.errors import InputError
+from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.specification import MachineSpec
+
+FLOATING_FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def floating_bases(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
+    """By name of each joint with six freedoms that floats the joints of its series, in order."""
+    return {
+        name: series
+        for name, series in floating_series(spec).items()
+        if len(series) == len(FLOATING_FREEDOMS)
+    }
+
+
+def floating_series(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
+    """The same, and what moves of series of which some freedoms are locked or not there."""
+    series_by_joint: dict[str, list[Joint]] = {}
+    for joint in spec.tree.joints.values():
+        if joint.floating_joint and joint.is_movable:
+            series_by_joint.setdefault(joint.floating_joint, []).append(joint)
+    found = {}
+    for name, series in series_by_joint.items():
+        if _is_unconstrained(spec, series):
+            found[name] = tuple(joint.name for joint in series)
+    return found
+
+
+def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
+    """Whether a series carries a body from the ground that nothing else holds."""
+    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
+    link = series[0].parent
+    while link in parent_joints:
+        if parent_joints[link].is_movable:
+            return False  # it rides on another body
+        link = parent_joints[link].parent
+    names = {joint.name for joint in series}
+    force_element_joints = {part.joint for part in spec.force_elements if part.between is None}
+    force_element_joints |= {part.joint for part in spec.end_stops}
+    driven_joints = set(spec.active or ()) - set(spec.free)
+    driven_joints |= {joint for drive in spec.drives for joint in drive.factors}
+    coupled_joints = {joint for coupling in spec.couplings for joint in coupling.factors}
+    if names & (force_element_joints | driven_joints | coupled_joints):
+        return False
+    return not any(
+        _carries_link(parent_joints, loop.predecessor, series[-1].child)
+        != _carries_link(parent_joints, loop.successor, series[-1].child)
+        for loop in spec.loops
+    )
+
+
+def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> bool:
+    """Whether a body carries a link."""
+    seen = set()
+    while link != body and link in parent_joints and link not in seen:
+        seen.add(link)
+        link = parent_joints[link].parent
+    return link == body
+
+
+def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
+    """A machine whose home has Cardan angles, R_x R_y R_z, of bodies that turn out to float."""
+    from scipy.spatial.transform import Rotation
+
+    home = dict(spec.home)
+    for series in floating_bases(spec).values():
+        rotations = series[3:]
+        angles = [home.pop(name, 0.0) for name in rotations]
+        rotation_vector = Rotation.from_euler("XYZ", angles).as_rotvec().tolist()
+        home |= {name: x for name, x in zip(rotations, rotation_vector, strict=True) if x}
+    return dataclasses.replace(spec, home=home)
+
+
+def convert_locked_rotations(
+    spec: MachineSpec, lock: Mapping[str, float]
+) -> tuple[MachineSpec, Mapping[str, float]]:
+    """Home and locks of series that no longer float once some of their joints are locked.
+
+    Three turns locked together are a rotation vector, as the coordinates are; what is left of
+    them, and one or two that are locked alone, are Cardan angles.
+    """
+    from scipy.spatial.transform import Rotation
+
+    home, locked = dict(spec.home), dict(lock)
+    for series in floating_bases(spec).values():
+        rotations = series[3:]
+        if not locked.keys() & set(series):
+            continue
+        all_locked = locked.keys() >= set(rotations)
+        values = locked if all_locked else home
+        rotation_vector = [values.get(name, 0.0) for name in rotations]
+        angles = Rotation.from_rotvec(rotation_vector).as_euler("XYZ").tolist()
+        values |= dict(zip(rotations, angles, strict=True))
+    return dataclasses.replace(spec, home=home), locked
+
+
+def add_floating_base(spec: MachineSpec, freedoms: bool | Sequence[str] = True) -> MachineSpec:
+    """A machine whose root floats instead of standing on the ground, by base_x to base_rz.
+
+    A machine that floats already stays as it is.
+
+    Args:
+        spec: The machine.
+        freedoms: Those of `FLOATING_FREEDOMS` that it has; True for all.
+    """
+    if not freedoms or floating_series(spec):
+        return spec
+    base_freedoms = FLOATING_FREEDOMS if freedoms is True else check_freedoms(freedoms)
+    return dataclasses.replace(spec, tree=add_base_joints(spec.tree, base_freedoms))
+
+
+def check_freedoms(names: object) -> tuple[str, ...]:
+    """Freedoms of a root in the order of `FLOATING_FREEDOMS`.
+
+    Raises:
+        InputError: Names that are none of those.
+    """
+    if (
+        isinstance(names, str)
+        or not isinstance(names, Sequence)
+        or not set(names) <= set(FLOATING_FREEDOMS)
+    ):
+        raise InputError(
+            f"floating is {names!r}, give True or some of {', '.join(FLOATING_FREEDOMS)}"
+        )
+    return tuple(part for part in FLOATING_FREEDOMS if part in names)
+
+
+def add_base_joints(tree: Tree, freedoms: Sequence[str]) -> Tree:
+    """A tree whose root has some of the `FLOATING_FREEDOMS`, by joints base_x to base_rz."""
+    root = tree.root_link
+    used_names = {*tree.links, *tree.joints}
+    name = "base"
+    while used_names & {
+        f"{name}_{part}"
+        for part in (*FLOATING_FREEDOMS, *range(1, len(FLOATING_FREEDOMS)), "ground")
+    }:
+        name += "_"
+    ground = f"{name}_ground"
+    where = tree.links[root].source_location
+    links = [Link(ground, where)]
+    links += [Link(f"{name}_{i}", where, composite_joint=name) for i in range(1, len(freedoms))]
+    joint_links = [ground, *(link.name for link in links[1:]), root]
+    joints = []
+    for i, freedom in enumerate(freedoms):
+        kind = "revolute" if freedom.startswith("r") else "prismatic"
+        axis = [0.0, 0.0, 0.0]
+        axis["xyz".index(freedom[-1])] = 1.0
+        joints.append(
+            Joint(
+                f"{name}_{freedom}", kind, joint_links[i], joint_links[i + 1], where,
+                axis=(axis[0], axis[1], axis[2]), floating_joint=name,
+            )
+        )  # fmt: skip
+    # the ground first: it is the root now
+    return Tree({links[0].name: links[0]}, {}).with_parts(*tree, *links[1:], *joints)

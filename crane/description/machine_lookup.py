@@ -1,0 +1,144 @@
+"""Where machines are found: bundled by name, example-robot-data by name, or a path."""
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache
+from itertools import takewhile
+from pathlib import Path
+
+from crane.common.errors import DescriptionError, suggest_names
+from crane.common.package_search import LoadOptions, load_options
+
+CHANGES_SEPARATOR = " with "  # between a machine and the numbers of it that are changed, see `Machine.load_expression`
+FOLDER_FILES = ("robot.yaml", "model.sdf")  # of example-parallel-robots, of Gazebo
+MACHINE_SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
+
+
+def _models_folder() -> Path:
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "models"
+    return installed if installed.is_dir() else package.parent / "models"
+
+
+def bundled_machines() -> dict[str, Path]:
+    """Names and machine files of the machines that come with the package."""
+    return {path.stem: path for path in sorted(_models_folder().glob("*.yaml"))}
+
+
+def machine_summary(path: Path) -> str:
+    """What a bundled machine is: the first sentence of the comment that begins its file."""
+    lines = takewhile(lambda line: line.startswith("#"), path.read_text("utf-8").splitlines())
+    return " ".join(line.strip("# ") for line in lines).partition(". ")[0]
+
+
+@cache
+def example_root() -> Path | None:
+    """Folder `robots` of example-robot-data, or None where that is not installed."""
+    from importlib.metadata import PackageNotFoundError, files  # slow to import
+
+    try:
+        package_files = files("example-robot-data") or []
+    except PackageNotFoundError:  # as where conda installed it, which keeps no list of Python's
+        shared_folder = Path(sys.prefix, "share", "example-robot-data", "robots")
+        return shared_folder if shared_folder.is_dir() else None
+    for item in package_files:
+        parts = item.parts
+        if "robots" in parts:
+            file_path = Path(str(item.locate())).resolve()
+            depth = len(parts) - 1 - parts.index("robots")
+            return file_path.parents[depth - 1]
+    return None
+
+
+@cache
+def example_robots() -> dict[str, Path]:
+    """Names and URDFs of the robots in example-robot-data."""
+    root = example_root()
+    if root is None:
+        return {}
+    return {path.stem: path for path in sorted(root.glob("**/*.urdf"))}
+
+
+def without_changes(load_expression: str) -> str:
+    """The machine or file in what `Machine.load_expression` says."""
+    return load_expression.partition(CHANGES_SEPARATOR + "{")[0]
+
+
+def command_line_arguments(
+    name: str | Path,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    changes: Mapping[str, float] | None = None,
+    lock: Mapping[str, float] | None = None,
+    options: LoadOptions | None = None,
+) -> str:
+    """A machine as commands take it: its name, and the options with which it loads as it did.
+
+    Args:
+        name: As for `load`.
+        active: Driven joints, where they are chosen.
+        free: Coordinates that nothing drives, where they are chosen.
+        changes: New values of numbers.
+        lock: Coordinates of joints that are held.
+        options: Packages, arguments, and whether the root floats; as files are read now if not
+            given.
+    """
+    options = load_options() if options is None else options
+    words = [str(name)]
+    for option, values in {"--set": changes, "--lock": lock}.items():
+        words += [x for key, value in (values or {}).items() for x in (option, f"{key}={value!r}")]
+    for option, joints in {"--active": active, "--free": free}.items():
+        words += [] if joints is None else [option, ",".join(joints)]
+    words += ["--floating"] * options.floating_root
+    words += [x for folder in options.packages for x in ("--packages", folder)]
+    words += [x for key, value in options.arguments.items() for x in ("--arg", f"{key}:={value}")]
+    return shlex.join(words)
+
+
+def find_machine_file(name: str | Path) -> Path:
+    """The machine file or URDF that a name or path stands for.
+
+    Args:
+        name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml,
+            .yml, .urdf, .xacro, .sdf, .world, .xml or .mjcf, or of a folder with a robot.yaml or a
+            model.sdf.
+
+    Raises:
+        DescriptionError: There is none.
+    """
+    if not isinstance(name, str | Path):
+        raise DescriptionError(
+            f"{type(name).__name__} names no machine, give a name or the path of a file"
+        )
+    path, text = Path(name), str(name)
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+    except OSError as error:  # a name longer than any file's, a folder that may not be entered
+        raise DescriptionError(
+            f"{path}: cannot be read ({error.strerror}), check the path"
+        ) from None
+    folder_files = [path / name for name in FOLDER_FILES if is_folder and (path / name).is_file()]
+    if folder_files:
+        return folder_files[0].resolve()
+    if path.suffix.lower() in MACHINE_SUFFIXES:
+        if is_file:
+            return path.resolve()
+        problem = "is a folder, give a file" if is_folder else "no such file, check the path"
+        raise DescriptionError(f"{path}: {problem}")
+    machines = bundled_machines()
+    if text in machines:
+        return machines[text]
+    robots = example_robots()
+    if text in robots:
+        return robots[text]
+    if is_file or is_folder:
+        raise DescriptionError(
+            f"{path}: not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an "
+            "SDF (.sdf) or a MJCF (.xml)"
+        )
+    hint = suggest_names([*machines, *robots], text)
+    if not hint.startswith("did you mean"):
+        robots_hint = "; crane list --robots names more" if robots else ""
+        hint = f"{suggest_names(machines)}{robots_hint}"
+    raise DescriptionError(f"no machine and no file is named '{text}', {hint}")

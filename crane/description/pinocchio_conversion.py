@@ -1,0 +1,87 @@
+"""Places and inertias of a description as Pinocchio has them, and back."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pinocchio as pin
+
+from crane.description.kinematic_tree import Inertial, Placement, Tree, Vector
+
+
+def to_vector(values: np.ndarray) -> Vector:
+    """Three numbers, zeros without a sign."""
+    x, y, z = (float(value) + 0.0 for value in values)
+    return x, y, z
+
+
+def rotation_from_rpy(rpy: Vector) -> np.ndarray:
+    """(3, 3) R_z(yaw) R_y(pitch) R_x(roll), by way of the quaternion that readers of URDF take.
+
+    So it is to the last digit what Pinocchio makes of the same numbers in a URDF.
+    """
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in rpy)
+    x, y, z, w = (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    quaternion = pin.Quaternion(w / length, x / length, y / length, z / length)
+    return np.asarray(quaternion.toRotationMatrix())
+
+
+def se3_from_xyz_rpy(xyz: Vector, rpy: Vector) -> pin.SE3:
+    """A placement."""
+    return pin.SE3(rotation_from_rpy(rpy), np.array(xyz))
+
+
+def xyz_rpy_from_se3(se3_placement: pin.SE3) -> Placement:
+    """Numbers of a placement."""
+    return to_vector(se3_placement.translation), to_vector(
+        pin.rpy.matrixToRpy(se3_placement.rotation)
+    )
+
+
+def inertia_from_inertial(link_inertial: Inertial | None) -> pin.Inertia:
+    """The inertia of a link in its frame, zero without one."""
+    if link_inertial is None:
+        return pin.Inertia.Zero()
+    axes_rotation = rotation_from_rpy(link_inertial.rpy)
+    spatial_inertia = pin.Inertia(
+        link_inertial.mass, np.array(link_inertial.com), np.zeros((3, 3))
+    )
+    spatial_inertia.inertia = (
+        axes_rotation @ link_inertial.inertia_matrix @ axes_rotation.T
+    )  # the constructor refuses what assembling refuses with the link's name
+    return spatial_inertia
+
+
+def inertial_from_inertia(spatial_inertia: pin.Inertia) -> Inertial | None:
+    """An inertia along the axes of the link's frame, None without mass."""
+    if not spatial_inertia.mass:
+        return None
+    tensor = tuple(float(x) + 0.0 for x in spatial_inertia.inertia[np.triu_indices(3)])
+    return Inertial(
+        float(spatial_inertia.mass), to_vector(spatial_inertia.lever), (0.0, 0.0, 0.0), tensor
+    )
+
+
+def add_rigid_load(tree: Tree, frame: str, load: pin.Inertia) -> Tree:
+    """A tree with a rigid load on a frame, as part of the link that the frame is fixed to.
+
+    So a point mass is no link of its own, which a URDF has to give an inertia.
+    """
+    parent_joints = {joint.child: joint for joint in tree.joints.values()}
+    link = frame
+    while link in parent_joints and not parent_joints[link].is_movable:
+        load = load.se3Action(se3_from_xyz_rpy(parent_joints[link].xyz, parent_joints[link].rpy))
+        link = parent_joints[link].parent
+    body_link = tree.links[link]
+    loaded_inertial = inertial_from_inertia(inertia_from_inertial(body_link.inertial) + load)
+    if loaded_inertial is not None and body_link.inertial is not None:
+        loaded_inertial = dataclasses.replace(
+            loaded_inertial, finding_location=body_link.inertial.finding_location
+        )
+    return tree.with_parts(dataclasses.replace(body_link, inertial=loaded_inertial))

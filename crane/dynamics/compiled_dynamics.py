@@ -1,0 +1,424 @@
+"""Equations of motion and their derivatives in machine code made for one machine."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
+from crane.closure.gamma_derivatives import GammaDerivatives
+from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
+from crane.codegen import Program, Scalar, SymbolicExpression, Tape, max_abs
+from crane.codegen.differentiation import directional_derivative
+from crane.codegen.program import BoundFunction
+from crane.common.samples import Array
+from crane.common.threads import ThreadLocal
+from crane.dynamics.dynamics_derivatives import DynamicsDerivatives
+from crane.dynamics.dynamics_formulas import (
+    DynamicsFormulas,
+    FormulaStructure,
+    StickSlipAccelerations,
+)
+from crane.dynamics.spatial_inertia import Matrix
+from crane.machine import Machine
+
+
+def _state_rates(
+    formulas: DynamicsFormulas, accelerations: StickSlipAccelerations
+) -> list[Scalar]:
+    return [
+        *formulas.coordinate_derivatives,
+        *accelerations.a_a,
+        formulas.dissipated_power,
+        accelerations.transition_margin,
+    ]
+
+
+def _observation(
+    formulas: DynamicsFormulas, accelerations: StickSlipAccelerations
+) -> list[Scalar]:
+    return [
+        *accelerations.active_friction,
+        formulas.kinetic,
+        formulas.potential,
+        *accelerations.friction_at_rest,
+    ]
+
+
+WITH_FRICTION = " with friction"
+STICK_SLIP_QUANTITIES = (
+    "rates",
+    "observation",
+    "resting",
+)  # what depends on `set_modes`, `set_grip`
+# What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
+# tau_A for the others.
+QUANTITIES: dict[str, Callable[[DynamicsFormulas, list[Scalar]], list[Scalar]]] = {
+    "inverse": lambda sweep, x: sweep.inverse_dynamics(x, friction=False),
+    "inverse" + WITH_FRICTION: lambda sweep, x: sweep.inverse_dynamics(x, friction=True),
+    "forward": lambda sweep, x: sweep.forward_dynamics(x, friction=False),
+    "forward" + WITH_FRICTION: lambda sweep, x: sweep.forward_dynamics(x, friction=True),
+    "mass matrix": lambda sweep, x: [entry for row in sweep.mass_matrix for entry in row],
+    "bias": lambda sweep, x: [
+        b - f for b, f in zip(sweep.inertial_bias, sweep.passive_force, strict=True)
+    ],
+    "gravity": lambda sweep, x: sweep.gravity_force,
+    "friction": lambda sweep, x: sweep.friction_force,
+    "passive": lambda sweep, x: sweep.passive_force,
+    "energy": lambda sweep, x: [sweep.kinetic, sweep.potential],
+    "rates": lambda sweep, x: _state_rates(
+        sweep, sweep.accelerations_with_stick_slip(x, with_joints_at_rest=True)
+    ),
+    "observation": lambda sweep, x: _observation(
+        sweep, sweep.accelerations_with_stick_slip(x, with_joints_at_rest=True)
+    ),
+    "resting": lambda sweep, x: sweep.stick_slip_equations(x),
+    "statics": lambda sweep, x: sweep.static_quantities,
+    "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
+}
+_AnalyticDerivatives = Callable[[DynamicsDerivatives, list[Scalar]], tuple[Matrix, Matrix, Matrix]]
+_ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
+    "inverse": lambda found, x: (*found.inverse_dynamics_derivatives(x), found.mass_matrix),
+    "forward": lambda found, x: found.forward_dynamics_derivatives(x),
+}
+DERIVATIVES_OF = (
+    "slopes of "  # before a quantity: its derivatives by q_A, v_A and the second argument
+)
+_FLOAT = np.dtype(np.float64)
+
+
+class _QuantityWorkspace(NamedTuple):
+    """What evaluating a quantity writes.
+
+    Attributes:
+        cursor: Where it has got to.
+        q: (nq,) the last posture.
+        sample_buffers: Of one sample second argument, v_A and q_A (n,) each, the result (size,),
+            and what evaluates it.
+    """
+
+    cursor: ContinuationCursor
+    q: Array
+    sample_buffers: tuple[Array, Array, Array, Array, BoundFunction]
+
+
+class CompiledQuantity:
+    """One quantity as machine code.
+
+    Args:
+        quantity: A key of `QUANTITIES`, perhaps behind `DERIVATIVES_OF`.
+        machine: The machine.
+        formula_constants: See `dynamics_constants`; read when a quantity is asked for.
+        constant_pattern: What of them is part of the formulas.
+        formula_structure: What they depend on besides.
+
+    Attributes:
+        result_size: Length of the result of one sample.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(
+        self,
+        quantity: str,
+        machine: Machine,
+        formula_constants: Array,
+        constant_pattern: Array,
+        formula_structure: FormulaStructure,
+    ):
+        fast = self._compiled_closure = machine.closure.compiled_closure
+        self._formula_constants = formula_constants
+        nq, n = machine.model.nv, len(machine.active)
+        key = (quantity, folding_pattern(constant_pattern), formula_structure)
+        if key not in fast.programs:
+            fast.programs[key] = fast.cached_program(
+                ("quantity", *key),
+                lambda program: _build_quantity(
+                    program, quantity, fast, constant_pattern, n, formula_structure
+                ),
+            )
+        program = self._program = fast.programs[key]
+        result_size = self.size = program.formula_outputs("formula").size
+        self._shape = (n,)
+
+        def memory() -> _QuantityWorkspace:
+            cursor, q, target = fast.new_cursor(), np.zeros(nq), np.zeros(n)
+            inputs, out = np.zeros(2 * n), np.zeros(result_size)
+            arrays = (
+                fast.geometry.constants,
+                formula_constants,
+                target,
+                inputs,
+                cursor.state,
+                q,
+                out,
+            )
+            once = program.bind("once", fast.follow_address, *arrays, fast.tolerances)
+            return _QuantityWorkspace(cursor, q, (inputs[n:], inputs[:n], target, out, once))
+
+        self._workspace = ThreadLocal(memory)
+
+    @property
+    def cursor(self) -> ContinuationCursor:
+        """Where this thread has got to."""
+        return self._workspace.value.cursor
+
+    def evaluate_sample(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
+        """The quantity of one sample without delay, or None where arguments need a closer look.
+
+        Args:
+            q_a: (n,).
+            v_a: (n,), or None where the quantity does not ask for it.
+            x: Likewise.
+        """
+        shape = self._shape
+        second, first, target, out, once = self._workspace.value.sample_buffers
+        for buffer, array in ((second, x), (first, v_a), (target, q_a)):
+            if array is not None:
+                if (
+                    array.__class__ is not np.ndarray
+                    or array.shape != shape
+                    or array.dtype != _FLOAT
+                ):
+                    return None
+                buffer[:] = array
+        return out.copy() if once() == 1 else None
+
+    def evaluate_closed(self, q: Array, inputs: Array) -> Array:
+        """The quantity at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        out = np.empty(self.size)
+        geometry = self._compiled_closure.geometry.constants
+        self._program.call("formula", geometry, self._formula_constants, q, inputs, out)
+        return out
+
+    def evaluate_targets(self, targets: Array, inputs: Array, out: Array) -> int:
+        """The quantity at q_A (N, n) with inputs (N, 2 n), until one is too far from the last.
+
+        Returns:
+            How many were done.
+        """
+        fast, memory = self._compiled_closure, self._workspace.value
+        arrays = (
+            fast.geometry.constants,
+            self._formula_constants,
+            targets,
+            inputs,
+            memory.cursor.state,
+        )
+        return self._program.call(
+            "each", len(targets), fast.follow_address, *arrays, memory.q, out, fast.tolerances
+        )
+
+    def evaluate_closed_stack(self, q: Array, inputs: Array, out: Array) -> None:
+        """The quantity at closed postures (N, nq) with inputs (N, 2 n) into out (N, size)."""
+        geometry = self._compiled_closure.geometry.constants
+        self._program.call("along", len(q), geometry, self._formula_constants, q, inputs, out)
+
+
+def _build_quantity(
+    program: Program,
+    quantity: str,
+    compiled_closure: CompiledClosure,
+    constant_pattern: Array,
+    n: int,
+    formula_structure: FormulaStructure,
+) -> None:
+    tape = Tape()
+    q, kinematics, loops = compiled_closure.trace_kinematics(tape, 0, 2)
+    constants = FormulaConstants(tape, 1, constant_pattern)
+    v_a, x = tape.load_vector(3, 0, n), tape.load_vector(3, n, n)
+    modes, base_quantity = quantity in STICK_SLIP_QUANTITIES, quantity.removeprefix(DERIVATIVES_OF)
+    geometry = compiled_closure.geometry
+    is_holonomic = (
+        not geometry.floating_bases and formula_structure.carrier_bodies == geometry.parents
+    )
+    frictionless_quantity = base_quantity.removesuffix(WITH_FRICTION)
+    if (
+        base_quantity != quantity
+        and frictionless_quantity in _ANALYTIC_DERIVATIVES
+        and is_holonomic
+    ):
+        gamma_derivatives = GammaDerivatives(kinematics, loops, compiled_closure.clusters, v_a)
+        formulas = DynamicsFormulas(
+            kinematics, loops, constants, q, v_a, formula_structure, drift=gamma_derivatives.drift
+        )
+        matrices = _ANALYTIC_DERIVATIVES[frictionless_quantity](
+            DynamicsDerivatives(
+                formulas, gamma_derivatives, base_quantity != frictionless_quantity
+            ),
+            x,
+        )
+        outputs = [entry for matrix in matrices for row in matrix for entry in row]
+    else:
+        formulas = DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure, modes)
+        if modes:
+            formulas = formulas.with_circuit_friction(formulas.circuit_friction)
+        outputs = QUANTITIES[base_quantity](formulas, x)
+        if base_quantity != quantity:
+            outputs = _state_derivatives(formulas, outputs, x)
+    program.add_formula("formula", 4, outputs)
+    tape = Tape()  # what is not finite is left to the checks that name it
+    program.add_formula(
+        "scan", 2, [max_abs([*tape.load_vector(0, 0, n), *tape.load_vector(1, 0, 2 * n)])]
+    )
+    _add_evaluation_routines(program, len(q), n)
+
+
+class CompiledParameterDerivatives:
+    """Derivatives of one quantity by numbers of the machine, as machine code.
+
+    With numbers p of the machine, and phi(q, p) = 0 of its loops, at given q_A, v_A and second
+    argument,
+
+        d y / d p = dy/dp + dy/dq dq/dp,    J_P dq_P/dp = -dphi/dp.
+
+    Args:
+        quantity: A key of `QUANTITIES`.
+        machine: The machine.
+        formula_constants: See `dynamics_constants`.
+        constant_pattern: What of them is part of the formulas.
+        formula_structure: What the formulas depend on besides.
+        geometry_derivatives: (k, .) how the geometry's numbers change with each number of the
+            machine.
+        constant_derivatives: (k, .) how `formula_constants` do.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(
+        self,
+        quantity: str,
+        machine: Machine,
+        formula_constants: Array,
+        constant_pattern: Array,
+        formula_structure: FormulaStructure,
+        geometry_derivatives: Array,
+        constant_derivatives: Array,
+    ):
+        fast = self._compiled_closure = machine.closure.compiled_closure
+        self._formula_constants, self._geometry_derivatives, self._constant_derivatives = (
+            formula_constants,
+            geometry_derivatives,
+            constant_derivatives,
+        )
+        geometry_changes, constants_change = (
+            np.any(geometry_derivatives != 0, axis=0),
+            np.any(constant_derivatives != 0, axis=0),
+        )
+        folded_constants = (
+            np.where(geometry_changes, np.nan, fast.geometry.constants),
+            np.where(constants_change, np.nan, constant_pattern),
+        )
+        key = (
+            "named",
+            quantity,
+            *map(folding_pattern, folded_constants),
+            geometry_changes.tobytes(),
+            constants_change.tobytes(),
+            formula_structure,
+        )
+        n = len(machine.active)
+
+        def build(program: Program) -> None:
+            tape = Tape()
+            q, posture, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
+            constants, v_a = (
+                FormulaConstants(tape, 1, folded_constants[1]),
+                tape.load_vector(3, 0, n),
+            )
+            sweep = DynamicsFormulas(posture, loops, constants, q, v_a, formula_structure)
+            values = QUANTITIES[quantity](sweep, tape.load_vector(3, n, n))
+            seeds: dict[int, Scalar] = {}
+            for i in np.flatnonzero(geometry_changes).tolist():
+                seeds[tape.load(0, i).index] = tape.load(4, i)
+            opened = directional_derivative([row.phi for row in loops.rows], seeds)
+            held: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
+            moving, _ = loops.solve_passive(held, [[-1.0 * x] for x in opened])
+            seeds |= {_tape_index(q[i - 1]): rate for i, (rate,) in moving.items()}
+            for i in np.flatnonzero(constants_change).tolist():
+                seeds[tape.load(1, i).index] = tape.load(5, i)
+            program.add_formula("formula", 6, directional_derivative(values, seeds))
+
+        if key not in fast.programs:
+            fast.programs[key] = fast.cached_program(key, build)
+        self._program = fast.programs[key]
+        self.result_size = self._program.formula_outputs("formula").size
+
+    def evaluate_closed(self, q: Array, inputs: Array) -> Array:
+        """(size, k) at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        out = np.empty((len(self._constant_derivatives), self.result_size))
+        geometry = self._compiled_closure.geometry.constants
+        for row, bent, moved in zip(
+            out, self._geometry_derivatives, self._constant_derivatives, strict=True
+        ):
+            self._program.call(
+                "formula", geometry, self._formula_constants, q, inputs, bent, moved, row
+            )
+        return out.T
+
+
+def _state_derivatives(
+    formulas: DynamicsFormulas, values: list[Scalar], x: list[Scalar]
+) -> list[Scalar]:
+    """Derivatives (3, k, n) of values (k,) by q_A, v_A and x."""
+    n = len(x)
+    seeds = [
+        dict(zip(map(_tape_index, formulas.q), formulas.coordinate_direction(k), strict=True))
+        for k in range(n)
+    ]
+    for entry in (*formulas.v_a, *x):
+        seeds.append({_tape_index(entry): 1.0})
+    columns = [directional_derivative(values, seed) for seed in seeds]
+    return [
+        columns[n * part + k][i] for part in range(3) for i in range(len(values)) for k in range(n)
+    ]
+
+
+def _tape_index(loaded: Scalar) -> int:
+    """Of a number that was loaded."""
+    assert isinstance(loaded, SymbolicExpression)
+    return loaded.index
+
+
+def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
+    """each: close the loops sample by sample and evaluate there; once: the same of one sample.
+
+    along: evaluate at postures that are closed already.
+
+    Like `follow` of `CompiledClosure`, it stops at the first sample that is too far from the one
+    before it.
+    """
+    arrays = ("geometry", "numbers", "targets", "inputs", "at", "q", "out", "bounds")
+    outputs = program.formula_outputs("formula").size
+    with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
+        with r.loop(r.count) as i:
+            target = r.targets.row_pointer(i, n)
+            got = r.call("follow", 1, r.geometry, target, r.at, r.q, r.bounds)
+            with r.if_then(got < 1):
+                r.return_value(i)
+            out = r.out.row_pointer(i, outputs)
+            r.call("formula", r.geometry, r.numbers, r.q, r.inputs.row_pointer(i, 2 * n), out)
+        r.return_value(r.count)
+    closed = ("geometry", "numbers", "postures", "inputs", "out")
+    with program.add_routine("along", counts=("count",), arrays=closed) as r:
+        with r.loop(r.count) as i:
+            q, inputs, out = (
+                r.postures.row_pointer(i, nq),
+                r.inputs.row_pointer(i, 2 * n),
+                r.out.row_pointer(i, outputs),
+            )
+            r.call("formula", r.geometry, r.numbers, q, inputs, out)
+        r.return_value(r.count)
+    with program.add_routine("once", functions=("follow",), arrays=arrays) as r:
+        scanned = r.local_array("scanned", program.formula_outputs("scan"))
+        r.call("scan", r.targets, r.inputs, scanned)
+        with r.if_then(~(scanned["all"] < np.inf)):
+            r.return_value(0)
+        r.return_value(
+            r.call(
+                "each", 1, r.follow, r.geometry, r.numbers, r.targets, r.inputs, r.at, r.q, r.out,
+                r.bounds,
+            )
+        )  # fmt: skip

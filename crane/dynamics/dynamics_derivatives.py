@@ -1,0 +1,482 @@
+"""Exact derivatives of inverse and forward dynamics through closed loops, as formulas.
+
+Coordinates q_j of the machine move every body b with a twist J_b,j = dV_b/dv_j. For any holonomic
+mechanism, d_j J_k - d_k J_j = J_j x J_k, so what a coordinate does to twists and accelerations are
+time derivatives of its own columns,
+
+    d_j V = J_j' + J_j x V,    d_j A = J_j'' + J_j' x V + J_j x A,
+
+and of the wrench f = I A + V x* I V = I A + B V of a body
+
+    d f / d v_j = 2 I J_j' + 2 B J_j,
+    d f / d q_j = J_j x* f + I J_j'' + 2 B J_j',
+    2 B [u, t] = [2 t x p, 2 (tr(K) t - K t)],    p = sum m r',    K = sum m r' r^T,
+
+with sums over the body's points r (Singh, Russell, Wensing 2022, equations (39) to (46), have the
+same for open trees, with other signs and names). Columns hold gamma's derivatives
+(`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.clusters`) move with its
+own coordinates alone: sums over bodies are taken cluster by cluster, with what hangs on each body
+as one inertia.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from crane.closure.gamma_derivatives import BodyMotions, GammaDerivatives, JointRates
+from crane.closure.spatial_vectors import (
+    SpatialVector,
+    Vector,
+    add_spatial,
+    cross_wrench,
+    scale_spatial,
+    spatial_dot,
+)
+from crane.codegen.differentiation import directional_derivative
+from crane.codegen.matrix_factorization import LdltFactorization
+from crane.codegen.symbolic import (
+    Scalar,
+    SymbolicExpression,
+    add_vectors,
+    cross,
+    dot,
+    dot_products,
+    matvec,
+    scale_vector,
+    subtract_vectors,
+    transpose,
+)  # fmt: skip
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
+from crane.dynamics.spatial_inertia import Matrix
+
+_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True)
+class MassMoments:
+    """What moves as one body: sums over its points at r, which move with r'.
+
+    Attributes:
+        mass: sum m.
+        first_moment: sum m r (3,).
+        inertia_tensor: sum m (r^2 - r r^T) (3, 3).
+        momentum: sum m r' (3,).
+        moment_rate: tr(K) - K (3, 3), K = sum m r' r^T.
+    """
+
+    mass: Scalar
+    first_moment: Vector
+    inertia_tensor: Matrix
+    momentum: Vector
+    moment_rate: Matrix
+
+    @classmethod
+    def rigid_body(
+        cls, mass: Scalar, centre: Vector, tensor: Matrix, motion: SpatialVector
+    ) -> "MassMoments":
+        """A rigid body.
+
+        Args:
+            mass: Its mass.
+            centre: Its centre of mass.
+            tensor: Inertia about it.
+            motion: Its twist.
+        """
+        first = scale_vector(mass, centre)
+        square = dot(first, centre)
+        inertia = _symmetric_matrix(
+            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0)
+        )
+        v, w = motion
+        momentum = scale_vector(mass, add_vectors(v, cross(w, centre)))
+        # second moments about the centre, tr(I) / 2 - I
+        half = 0.5 * (tensor[0][0] + tensor[1][1] + tensor[2][2])
+        spread = _symmetric_matrix(lambda r, c: (half if r == c else 0.0) - tensor[r][c])
+        spun = transpose([cross(w, column) for column in spread])
+        k = [
+            [p * x + more for x, more in zip(centre, row, strict=True)]
+            for p, row in zip(momentum, spun, strict=True)
+        ]
+        sums = [k[1][1] + k[2][2], k[0][0] + k[2][2], k[0][0] + k[1][1]]
+        mixed = [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)]
+        return cls(mass, first, inertia, momentum, mixed)
+
+    def __add__(self, other: "MassMoments") -> "MassMoments":
+        return MassMoments(
+            self.mass + other.mass,
+            add_vectors(self.first_moment, other.first_moment),
+            _symmetric_matrix(lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c]),
+            add_vectors(self.momentum, other.momentum),
+            [
+                add_vectors(one, two)
+                for one, two in zip(self.moment_rate, other.moment_rate, strict=True)
+            ],
+        )
+
+    def inertial_wrench(self, acceleration: SpatialVector) -> SpatialVector:
+        """I A."""
+        a, e = acceleration
+        force = add_vectors(scale_vector(self.mass, a), cross(e, self.first_moment))
+        return force, add_vectors(cross(self.first_moment, a), matvec(self.inertia_tensor, e))
+
+    def velocity_wrench(self, angular: Vector) -> SpatialVector:
+        """B of a motion, whose linear part does not matter."""
+        return cross(angular, self.momentum), matvec(self.moment_rate, angular)
+
+    def transposed_velocity_product(self, motion: SpatialVector) -> Vector:
+        """What B^T of a motion has for the angular part of another."""
+        v, w = motion
+        return add_vectors(cross(self.momentum, v), matvec(transpose(self.moment_rate), w))
+
+
+@dataclass(frozen=True)
+class _CoordinateEffect:
+    """What a coordinate does to inverse dynamics within its cluster and on what carries that.
+
+    Attributes:
+        joint_forces_by_q: Forces along the cluster's joints, by joint, per unit of the coordinate,
+            but for what turns with the joints.
+        joint_forces_by_v: Half of those per unit of its velocity.
+        wrench_shifts: By joint, wrenches that turn with it.
+        base_wrench_by_q: Wrench on the body that carries the cluster, per unit of the coordinate.
+        base_wrench_by_v: Half of that per unit of its velocity.
+        transposed_product: B^T J_j of all bodies.
+    """
+
+    joint_forces_by_q: JointRates
+    joint_forces_by_v: JointRates
+    wrench_shifts: dict[int, SpatialVector]
+    base_wrench_by_q: SpatialVector
+    base_wrench_by_v: SpatialVector
+    transposed_product: Vector
+
+
+class DynamicsDerivatives:
+    """Derivatives of inverse and forward dynamics at a posture and velocity.
+
+    Of holonomic coordinates, without free-flyers, in the exact formulation.
+
+    Args:
+        formulas: The machine.
+        gamma_derivatives: Derivatives of its gamma.
+        friction: Whether friction brakes.
+    """
+
+    def __init__(
+        self, formulas: DynamicsFormulas, gamma_derivatives: GammaDerivatives, friction: bool
+    ):
+        self._formulas, self._gamma_derivatives, self._friction = (
+            formulas,
+            gamma_derivatives,
+            friction,
+        )
+        self._joint_axes = formulas.posture.joint_axes
+        self._parents, self._n = formulas.posture.geometry.parents, len(formulas.v_a)
+        self._cluster_of_joint = {
+            i: c for c, x in enumerate(gamma_derivatives.clusters) for i in x.joints
+        }
+
+    @cached_property
+    def _body_velocities(self) -> list[SpatialVector]:
+        """Of every body."""
+        return self._formulas.body_motions([0.0] * len(self._parents))[0]
+
+    @cached_property
+    def _body_moments(self) -> dict[int, MassMoments]:
+        """Every body."""
+        bodies = enumerate(self._formulas.body_inertias, start=1)
+        return {i: MassMoments.rigid_body(*body, self._body_velocities[i]) for i, body in bodies}
+
+    @cached_property
+    def _lumped_moments(self) -> dict[int, MassMoments]:
+        """What every joint moves, but for what hangs on other joints of its cluster."""
+        lumped, subtree = dict(self._body_moments), dict(self._body_moments)
+        for i in range(len(lumped), 0, -1):
+            if parent := self._parents[i]:
+                subtree[parent] = subtree[parent] + subtree[i]
+                if self._cluster_of_joint[parent] != self._cluster_of_joint[i]:
+                    lumped[parent] = lumped[parent] + subtree[i]
+        return lumped
+
+    def _accumulate_wrenches(
+        self, cluster_index: int, wrenches: dict[int, SpatialVector]
+    ) -> dict[int, SpatialVector]:
+        """Wrenches on the bodies of a cluster and all beyond them in it, and on its base."""
+        out = dict(wrenches)
+        for i in reversed(self._gamma_derivatives.clusters[cluster_index].joints):
+            parent = self._parents[i]
+            out[parent] = add_spatial(out[parent], out[i]) if parent in out else out[i]
+        return out
+
+    @cached_property
+    def _unit_acceleration_wrenches(self) -> dict[int, dict[int, SpatialVector]]:
+        """By coordinate, wrenches I J_j of its cluster's bodies and what is beyond."""
+        return {
+            j: self._accumulate_wrenches(
+                c,
+                {
+                    i: self._lumped_moments[i].inertial_wrench(
+                        self._gamma_derivatives.twists[j][i]
+                    )
+                    for i in cluster.joints
+                },
+            )
+            for c, cluster in enumerate(self._gamma_derivatives.clusters)
+            for j in self._gamma_derivatives.own[c]
+        }
+
+    @cached_property
+    def mass_matrix(self) -> Matrix:
+        """M_A (n, n) = d tau_A / d a_A."""
+        out: Matrix = [[0.0] * self._n for _ in range(self._n)]
+        gamma, rotors, twists = (
+            self._formulas.gamma,
+            self._formulas.rotors,
+            self._gamma_derivatives.twists,
+        )
+        for c, cluster in enumerate(self._gamma_derivatives.clusters):
+            own = self._gamma_derivatives.own[c]
+            for j in own:
+                wrenches = self._unit_acceleration_wrenches[j]
+                for k in [k for k in own if k <= j]:
+                    total: Scalar = 0.0
+                    for i in cluster.joints:
+                        force = (
+                            spatial_dot(self._joint_axes[i], wrenches[i]) + rotors[i] * gamma[i][j]
+                        )
+                        total = total + gamma[i][k] * force
+                    out[k][j] = out[j][k] = total
+                for k, body in self._carrying_coordinates(c):
+                    out[k][j] = out[j][k] = spatial_dot(twists[k][body], wrenches[cluster.base])
+        return out
+
+    def _carrying_coordinates(self, cluster_index: int) -> list[tuple[int, int]]:
+        """The coordinates that carry a cluster, with the body of theirs that it hangs on."""
+        out, body = [], self._gamma_derivatives.clusters[cluster_index].base
+        while body:
+            carrying_cluster = self._cluster_of_joint[body]
+            out += [(k, body) for k in self._gamma_derivatives.own[carrying_cluster]]
+            body = self._gamma_derivatives.clusters[carrying_cluster].base
+        return out
+
+    def inverse_dynamics_derivatives(self, a_a: Sequence[Scalar]) -> tuple[Matrix, Matrix]:
+        """Derivatives (n, n) of tau_A by q_A and v_A at an acceleration a_A (n,)."""
+        formulas, gamma_derivatives, size = (
+            self._formulas,
+            self._gamma_derivatives,
+            len(self._parents),
+        )
+        rates = [0.0, *(dot(formulas.gamma[i], a_a) + formulas.drift[i] for i in range(1, size))]
+        second = gamma_derivatives.second_time_derivatives(formulas.rates, rates)
+        motions = tuple(dict(enumerate(x)) for x in formulas.body_motions(rates))
+        subtree_wrenches, forces = (
+            self._subtree_wrenches(rates),
+            formulas.passive_and_friction_forces(self._friction),
+        )
+        # what the drives of all joints would have to do
+        required_joint_forces = subtract_vectors(
+            self._inertial_joint_forces(subtree_wrenches, rates), forces
+        )
+        by_q: Matrix = [[0.0] * self._n for _ in range(self._n)]
+        by_v: Matrix = [[0.0] * self._n for _ in range(self._n)]
+        twist_derivatives: dict[int, tuple[BodyMotions, BodyMotions]] = {}
+        for c, cluster in enumerate(gamma_derivatives.clusters):
+            axis_derivatives = gamma_derivatives.joint_axis_derivatives(cluster, *motions)
+            for j in gamma_derivatives.own[c]:
+                twist_derivatives[j] = gamma_derivatives.twist_derivatives(
+                    cluster, j, axis_derivatives, second[j]
+                )
+                effect = self._coordinate_effect(
+                    c, j, twist_derivatives[j], subtree_wrenches, second[j]
+                )
+                self._add_cluster_block(c, j, effect, required_joint_forces, by_q, by_v)
+                self._add_carrier_blocks(c, j, effect, twist_derivatives, by_q, by_v)
+                force_derivatives = self._joint_force_derivatives(c, j, forces)
+                for k in range(self._n):
+                    column = [formulas.gamma[i][k] for i in range(1, size)]
+                    by_q[k][j] = by_q[k][j] - dot(column, force_derivatives[0][1:])
+                    by_v[k][j] = by_v[k][j] - dot(column, force_derivatives[1][1:])
+        return by_q, by_v
+
+    def _subtree_wrenches(self, joint_accelerations: Sequence[Scalar]) -> dict[int, SpatialVector]:
+        """By joint, the wrench that all that hangs on it takes to accelerate so."""
+        _, accelerations = self._formulas.body_motions(joint_accelerations)
+        subtree: dict[int, SpatialVector] = {}
+        for i in range(len(accelerations) - 1, 0, -1):
+            moments = self._body_moments[i]
+            wrench = add_spatial(
+                moments.inertial_wrench(accelerations[i]),
+                moments.velocity_wrench(self._body_velocities[i][1]),
+            )
+            subtree[i] = add_spatial(subtree[i], wrench) if i in subtree else wrench
+            if parent := self._parents[i]:
+                subtree[parent] = (
+                    add_spatial(subtree[parent], subtree[i]) if parent in subtree else subtree[i]
+                )
+        return subtree
+
+    def _inertial_joint_forces(
+        self, subtree_wrenches: Mapping[int, SpatialVector], joint_accelerations: Sequence[Scalar]
+    ) -> Vector:
+        """Forces along the joints (nb + 1,) that bodies and rotors take to accelerate so."""
+        out: Vector = [0.0] * len(joint_accelerations)
+        for i, wrench in subtree_wrenches.items():
+            out[i] = (
+                spatial_dot(self._joint_axes[i], wrench)
+                + self._formulas.rotors[i] * joint_accelerations[i]
+            )
+        return out
+
+    def _coordinate_effect(
+        self,
+        cluster_index: int,
+        coordinate: int,
+        twist_derivatives: tuple[BodyMotions, BodyMotions],
+        subtree_wrenches: Mapping[int, SpatialVector],
+        second_time_derivative: Mapping[int, Scalar],
+    ) -> "_CoordinateEffect":
+        """What one of a cluster's own coordinates does to the bodies of the cluster."""
+        formulas, cluster, (rate, twice) = (
+            self._formulas,
+            self._gamma_derivatives.clusters[cluster_index],
+            twist_derivatives,
+        )
+        by_q: dict[int, SpatialVector] = {}
+        by_v: dict[int, SpatialVector] = {}
+        wrench_shifts: dict[int, SpatialVector] = {}
+        turned: Vector = [0.0] * 3
+        for i in cluster.joints:
+            moments, twist = self._lumped_moments[i], self._gamma_derivatives.twists[coordinate][i]
+            by_q[i] = add_spatial(
+                moments.inertial_wrench(twice[i]),
+                moments.velocity_wrench(scale_vector(2.0, rate[i][1])),
+            )
+            by_v[i] = add_spatial(
+                moments.inertial_wrench(rate[i]), moments.velocity_wrench(twist[1])
+            )
+            wrench_shifts[i] = scale_spatial(
+                formulas.gamma[i][coordinate],
+                cross_wrench(self._joint_axes[i], subtree_wrenches[i]),
+            )
+            turned = add_vectors(turned, moments.transposed_velocity_product(twist))
+        by_q, by_v = (
+            self._accumulate_wrenches(cluster_index, by_q),
+            self._accumulate_wrenches(cluster_index, by_v),
+        )
+        first = self._gamma_derivatives.first[coordinate]
+        return _CoordinateEffect(
+            {
+                i: spatial_dot(self._joint_axes[i], by_q[i])
+                + formulas.rotors[i] * second_time_derivative[i]
+                for i in cluster.joints
+            },
+            {
+                i: spatial_dot(self._joint_axes[i], by_v[i]) + formulas.rotors[i] * first[i]
+                for i in cluster.joints
+            },
+            wrench_shifts,
+            add_spatial(by_q[cluster.base], *wrench_shifts.values()),
+            by_v[cluster.base],
+            turned,
+        )
+
+    def _add_cluster_block(
+        self,
+        cluster_index: int,
+        j: int,
+        effect: "_CoordinateEffect",
+        required_joint_forces: Vector,
+        by_q: Matrix,
+        by_v: Matrix,
+    ) -> None:
+        """Rows of the coordinates of the same cluster, gamma's derivative among them."""
+        gamma, gamma_derivatives = self._formulas.gamma, self._gamma_derivatives
+        joints = gamma_derivatives.clusters[cluster_index].joints
+        for k in gamma_derivatives.own[cluster_index]:
+            row = [gamma[i][k] for i in joints]
+            partial_derivative = gamma_derivatives.partial_derivatives.get(
+                (min(k, j), max(k, j)), {}
+            )
+            by_q[k][j] = dot(row, [effect.joint_forces_by_q[i] for i in joints])
+            by_q[k][j] = by_q[k][j] + dot(
+                [required_joint_forces[i] for i in partial_derivative],
+                list(partial_derivative.values()),
+            )
+            for i in joints:
+                by_q[k][j] = by_q[k][j] + spatial_dot(
+                    gamma_derivatives.twists[k][i], effect.wrench_shifts[i]
+                )
+            by_v[k][j] = 2.0 * dot(row, [effect.joint_forces_by_v[i] for i in joints])
+
+    def _add_carrier_blocks(
+        self,
+        cluster_index: int,
+        j: int,
+        effect: "_CoordinateEffect",
+        twist_derivatives: Mapping[int, tuple[BodyMotions, BodyMotions]],
+        by_q: Matrix,
+        by_v: Matrix,
+    ) -> None:
+        """Rows and columns of the coordinates that carry the cluster."""
+        wrench = self._unit_acceleration_wrenches[j][
+            self._gamma_derivatives.clusters[cluster_index].base
+        ]
+        for k, body in self._carrying_coordinates(cluster_index):
+            twist = self._gamma_derivatives.twists[k][body]
+            rate, twice = (motions[body] for motions in twist_derivatives[k])
+            by_q[k][j] = by_q[k][j] + spatial_dot(twist, effect.base_wrench_by_q)
+            by_v[k][j] = by_v[k][j] + 2.0 * spatial_dot(twist, effect.base_wrench_by_v)
+            by_q[j][k] = (
+                by_q[j][k]
+                + spatial_dot(twice, wrench)
+                + 2.0 * dot(effect.transposed_product, rate[1])
+            )
+            back = spatial_dot(rate, wrench) + dot(effect.transposed_product, twist[1])
+            by_v[j][k] = by_v[j][k] + 2.0 * back
+
+    def forward_dynamics_derivatives(self, tau: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
+        """Derivatives (n, n) of a_A by q_A, v_A and tau_A.
+
+        With M_A a_A + h = tau_A, d a_A = M_A^-1 (d tau_A - d inverse at a_A).
+        """
+        formulas = self._formulas
+        mass = LdltFactorization(self.mass_matrix)
+        right = add_vectors(
+            tau, formulas.project(formulas.passive_and_friction_forces(self._friction))
+        )
+        bias = formulas.project(
+            self._inertial_joint_forces(self._subtree_wrenches(formulas.drift), formulas.drift)
+        )
+        by_q, by_v = self.inverse_dynamics_derivatives(mass.solve(subtract_vectors(right, bias)))
+        inverse = mass.inverse_matrix
+        back = [scale_vector(-1.0, row) for row in inverse]
+        columns = transpose([[*q, *v] for q, v in zip(by_q, by_v, strict=True)])
+        rows = [dot_products(row, columns) for row in back]
+        return [row[: self._n] for row in rows], [row[self._n :] for row in rows], inverse
+
+    def _joint_force_derivatives(
+        self, cluster_index: int, coordinate: int, forces: Vector
+    ) -> tuple[Vector, Vector]:
+        """What forces along the joints change by with q_j and with v_j (nb + 1,)."""
+        formulas, joints = self._formulas, self._gamma_derivatives.clusters[cluster_index].joints
+        at = {i: formulas.q[i - 1] for i in joints}
+        rates = {
+            i: rate for i in joints if isinstance(rate := formulas.rates[i], SymbolicExpression)
+        }
+        by_q = {
+            x.index: formulas.gamma[i][coordinate]
+            for i, x in at.items()
+            if isinstance(x, SymbolicExpression)
+        }
+        by_q |= {
+            rate.index: self._gamma_derivatives.first[coordinate][i] for i, rate in rates.items()
+        }
+        by_v = {rate.index: formulas.gamma[i][coordinate] for i, rate in rates.items()}
+        return directional_derivative(forces, by_q), directional_derivative(forces, by_v)
+
+
+def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:
+    out: Matrix = [[0.0] * 3 for _ in range(3)]
+    for r, c in _UPPER_TRIANGLE:
+        out[r][c] = out[c][r] = entry(r, c)
+    return out

@@ -1,0 +1,296 @@
+"""Forces from outside along the joints: J^T w, by Pinocchio and as formulas."""
+
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.kinematics_formulas import TreeGeometry
+from crane.closure.spatial_vectors import Vector
+from crane.codegen import PythonCallback, SymbolicExpression, Tape
+from crane.codegen.symbolic import (
+    Scalar,
+    add_vectors,
+    cross,
+    dot,
+    matmul,
+    matvec,
+    scale_vector,
+    subtract_vectors,
+    transpose,
+)
+from crane.common.samples import Array
+from crane.description.external_forces import WRENCH_COMPONENTS, ExternalForce, FrameMotion
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
+from crane.dynamics.frame_jacobians import FrameJacobians
+from crane.machine import Machine
+
+_CALLBACK_INPUT_SIZE = 19  # numbers that a function in Python is called with
+
+
+class ExternalForceFormulas(NamedTuple):
+    """What forces from outside do to a machine.
+
+    Attributes:
+        active_forces: gamma^T J^T w (n,) of all of them together.
+        powers: (k,) of each [W].
+        event_lengths: Lengths [m] at whose signs some of them bend.
+        outputs: (s,) of each its wrench in the world's axes and its channels.
+        state_rates: Of their states, one after the other.
+        callback_inputs: What those that are functions in Python are called with, see
+            `ExternalForceCallback`.
+    """
+
+    active_forces: Vector
+    powers: Vector
+    event_lengths: Vector
+    outputs: Vector
+    state_rates: Vector
+    callback_inputs: Vector
+
+
+class ExternalForceValues(NamedTuple):
+    """The same at a state, in numbers.
+
+    Attributes:
+        generalized_forces: J^T w (nv,) of all of them together; gamma^T J^T w (n,) where a chart
+            gives it.
+        powers: (k,) of each [W].
+        outputs: See `ExternalForceFormulas`.
+        state_rates: See `ExternalForceFormulas`.
+    """
+
+    generalized_forces: Array
+    powers: Array
+    outputs: Array
+    state_rates: Array
+
+
+def reference_samples(forces: Sequence[ExternalForce], times: Array) -> Array:
+    """References (N, c) of all at times (N,) [s], with room for answers of functions in Python."""
+    parts: list[Array] = [np.zeros((len(times), 0))]
+    for force in forces:
+        parts.append(force.references(times))
+        if not force.is_traceable:
+            parts.append(np.zeros((len(times), len(WRENCH_COMPONENTS))))
+    return np.hstack(parts)
+
+
+def reference_counts(forces: Sequence[ExternalForce]) -> list[int]:
+    """(k,) how many references each has there."""
+    return [reference_samples([force], np.zeros(1)).shape[1] for force in forces]
+
+
+def formula_key(machine: Machine) -> Hashable:
+    """All that the formulas of a machine's external forces are, each traced by itself."""
+    out: list[Hashable] = []
+    for force, count in zip(
+        machine.external_forces, reference_counts(machine.external_forces), strict=True
+    ):
+        tape = Tape()
+        parts = (tape.load_vector(i, 0, 3) for i in range(3))
+        place, velocity, spin = parts
+        turn = [tape.load_vector(3, 3 * row, 3) for row in range(3)]
+        references_and_states = (
+            tape.load_vector(4, 0, count),
+            tape.load_vector(5, 0, force.state_count),
+        )
+        here = FrameMotion(place, turn, velocity, spin, *references_and_states)
+        outputs = [
+            [x.index if isinstance(x, SymbolicExpression) else float(x) for x in part]
+            for part in (
+                *force.wrench(here),
+                force.event_lengths(here),
+                force.outputs(here),
+                force.state_rates(here),
+            )  # fmt: skip
+        ]
+        joint, pose = _frame_placement(machine, force)
+        shape = count, force.state_count
+        out.append((repr((shape, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
+    return tuple(out)
+
+
+def state_count(forces: Sequence[ExternalForce]) -> int:
+    """How many states they have together."""
+    return sum(force.state_count for force in forces)
+
+
+def trace_external_forces(
+    machine: Machine,
+    formulas: DynamicsFormulas,
+    references: Sequence[Scalar],
+    states: Sequence[Scalar],
+) -> ExternalForceFormulas:
+    """`ExternalForces` as formulas, with their references and states one after the other."""
+    kinematics, geometry = formulas.posture, formulas.posture.geometry
+    active_forces: Vector = [0.0] * len(machine.active)
+    powers: Vector = []
+    event_lengths: Vector = []
+    outputs: Vector = []
+    state_rates: Vector = []
+    callback_inputs: Vector = []
+    world_rotation, first = (
+        transpose(kinematics.rotation[0]),
+        0,
+    )  # formulas are seen from the trunk
+    for force, count in zip(
+        machine.external_forces, reference_counts(machine.external_forces), strict=True
+    ):
+        joint, pose = _frame_placement(machine, force)
+        body = machine.coordinates.body_of_joint[joint]
+        turn = geometry.body_rotations[body].T
+        arm = matvec(kinematics.rotation[body], (turn @ pose.translation).tolist())
+        at = add_vectors(kinematics.origin[body], arm)
+        axes = matmul(kinematics.rotation[body], (turn @ pose.rotation).tolist())
+        carriers = _supporting_bodies(geometry, body)
+        velocity: Vector = [0.0] * 3
+        spin: Vector = [0.0] * 3
+        for i in carriers:
+            linear, angular = kinematics.joint_axes[i]
+            velocity = add_vectors(
+                velocity, scale_vector(formulas.rates[i], add_vectors(linear, cross(angular, at)))
+            )
+            spin = add_vectors(spin, scale_vector(formulas.rates[i], angular))
+        here = FrameMotion(
+            matvec(world_rotation, subtract_vectors(at, kinematics.origin[0])),
+            matmul(world_rotation, axes),
+            matvec(world_rotation, velocity),
+            matvec(world_rotation, spin),
+            list(references[first : first + count]),
+            list(states[len(state_rates) : len(state_rates) + force.state_count]),
+        )
+        first += count
+        state_rates += force.state_rates(here)
+        if not force.is_traceable:
+            axes_ = [x for row in here.rotation for x in row]
+            callback_inputs += [
+                here.reference[0],
+                *here.position,
+                *axes_,
+                *here.velocity,
+                *here.angular_velocity,
+            ]
+        event_lengths += force.event_lengths(here)
+        wrench = [list(part) for part in force.wrench(here)]
+        outputs += [*wrench[0], *wrench[1], *force.outputs(here)]
+        push, moment = (matvec(kinematics.rotation[0], part) for part in wrench)
+        powers.append(dot(push, velocity) + dot(moment, spin))
+        about = add_vectors(moment, cross(at, push))
+        for i in carriers:
+            linear, angular = kinematics.joint_axes[i]
+            active_forces = add_vectors(
+                active_forces,
+                scale_vector(dot(push, linear) + dot(about, angular), formulas.gamma[i]),
+            )
+    return ExternalForceFormulas(
+        active_forces, powers, event_lengths, outputs, state_rates, callback_inputs
+    )
+
+
+class ExternalForceCallback(PythonCallback):
+    """Calls those of a machine's external forces that are functions in Python, for machine code.
+
+    It reads of each (19,): time, place, axes, velocity and spin, see `FrameMotion`, and fills its
+    answer into the references of all.
+
+    Args:
+        forces: All of a machine.
+    """
+
+    def __init__(self, forces: Sequence[ExternalForce]):
+        counts = reference_counts(forces)
+        ends = np.cumsum(counts)
+        self._reference_slices = [
+            (force, slice(end - len(WRENCH_COMPONENTS), end))
+            for force, end in zip(forces, ends.tolist(), strict=True)
+            if not force.is_traceable
+        ]
+        super().__init__(
+            self._evaluate_forces,
+            _CALLBACK_INPUT_SIZE * len(self._reference_slices),
+            int(sum(counts)),
+        )
+
+    def _evaluate_forces(self, inputs: Array, references: Array) -> None:
+        for k, (force, place) in enumerate(self._reference_slices):
+            x = inputs[_CALLBACK_INPUT_SIZE * k : _CALLBACK_INPUT_SIZE * (k + 1)].tolist()
+            turn = [x[4:7], x[7:10], x[10:13]]
+            here = FrameMotion(x[1:4], turn, x[13:16], x[16:], x[:1])
+            push, moment = force.wrench(here)
+            references[place] = np.array([*push, *moment], dtype=np.float64)
+
+
+class ExternalForces:
+    """What acts on a machine from outside, in numbers.
+
+    Args:
+        machine: The machine.
+        forces: Those of its `external` that act.
+    """
+
+    def __init__(self, machine: Machine, forces: Sequence[ExternalForce]):
+        self._forces, self._jacobians = forces, FrameJacobians(machine)
+
+    def generalized_forces(
+        self, time: float, q: Array, v: Array, states: Array
+    ) -> ExternalForceValues:
+        """J^T w along the joints.
+
+        Args:
+            time: [s].
+            q: (nq,) closed posture.
+            v: (nv,) velocities of all joints.
+            states: Of all forces.
+        """
+        self._jacobians.set_configuration(q)
+        joint_forces, powers = np.zeros(len(v)), np.empty(len(self._forces))
+        outputs: Vector = []
+        state_rates: Vector = []
+        for k, force in enumerate(self._forces):
+            jacobian = self._jacobians.jacobian(force.frame)
+            own = states[len(state_rates) : len(state_rates) + force.state_count].tolist()
+            pose, rate = self._jacobians.frame_pose(force.frame), jacobian @ v
+            reference = force.references(np.array([time]))[0].tolist()
+            here = FrameMotion(
+                pose.translation.tolist(), pose.rotation.tolist(), rate[:3].tolist(),
+                rate[3:].tolist(), reference, own,
+            )  # fmt: skip
+            state_rates += force.state_rates(here)
+            push, moment = force.wrench(here)
+            outputs += [*push, *moment, *force.outputs(here)]
+            wrench = np.array([*push, *moment], dtype=np.float64)
+            joint_forces += jacobian.T @ wrench
+            powers[k] = wrench @ rate
+        return ExternalForceValues(
+            joint_forces,
+            powers,
+            np.array(outputs, dtype=np.float64),
+            np.array(state_rates, dtype=np.float64),
+        )
+
+
+def static_active_forces(machine: Machine, q: Array) -> Array:
+    """gamma^T J^T w (n,) of a machine's external forces at time 0, at rest in a posture (nq,)."""
+    if not machine.external_forces:
+        return np.zeros(len(machine.active))
+    still, none = np.zeros(machine.model.nv), np.zeros(state_count(machine.external_forces))
+    applied = ExternalForces(machine, machine.external_forces).generalized_forces(
+        0.0, q, still, none
+    )
+    return np.asarray(machine.closure.gamma(q).T @ applied.generalized_forces)
+
+
+def _frame_placement(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:
+    """Pinocchio's joint that moves a force's frame, and where the frame is in it."""
+    frame = machine.model.frames[machine.frame(force.frame)]
+    return int(frame.parentJoint), frame.placement
+
+
+def _supporting_bodies(geometry: TreeGeometry, body: int) -> list[int]:
+    found = []
+    while body:
+        found.append(body)
+        body = geometry.parents[body]
+    return found

@@ -1,0 +1,329 @@
+"""Equations of motion by Pinocchio's algorithms on the spanning tree, projected by gamma."""
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import MechanismError
+from crane.common.samples import Array, solve_linear
+from crane.common.threads import ThreadLocal
+from crane.dynamics.frame_jacobians import point_jacobian
+from crane.dynamics.joint_forces import REST_VELOCITY, JointForces
+from crane.machine import Machine
+
+
+class ClosedState(NamedTuple):
+    """One closed posture in motion.
+
+    Attributes:
+        q: (nv,) posture.
+        gamma: (nv, n).
+        v: (nv,) velocities gamma v_A.
+        drift: (nv,) accelerations at a_A = 0.
+    """
+
+    q: Array
+    gamma: Array
+    v: Array
+    drift: Array
+
+
+class _Subtree:
+    """Bodies that move together, on a base that stands still.
+
+    Args:
+        tree: The machine's tree.
+        bodies: Their indices, a parent before its children.
+
+    Attributes:
+        bodies: The same.
+        velocity_columns: Of their joints in v.
+        configuration_indices: Of their joints in Pinocchio's q.
+        base_body: The body of the tree that they stand on.
+        model: Of them alone; its gravity is written as the base turns.
+        data: Its data.
+    """
+
+    def __init__(self, tree: pin.Model, bodies: Sequence[int]):
+        self.bodies = np.array(bodies)
+        joints = [tree.joints[body] for body in bodies]
+        self.velocity_columns = np.concatenate(
+            [np.arange(x.idx_v, x.idx_v + x.nv) for x in joints]
+        )
+        self.configuration_indices = np.concatenate(
+            [np.arange(x.idx_q, x.idx_q + x.nq) for x in joints]
+        )
+        self.base_body = tree.parents[bodies[0]]
+        self.model, place = pin.Model(), {self.base_body: 0}
+        for body in bodies:
+            place[body] = self.model.addJoint(
+                place[tree.parents[body]],
+                tree.joints[body],
+                tree.jointPlacements[body],
+                tree.names[body],
+            )
+            self.model.appendBodyToJoint(place[body], tree.inertias[body], pin.SE3.Identity())
+        self.data = self.model.createData()
+
+
+class _TreeWorkspace:
+    """What evaluating a quantity writes.
+
+    Args:
+        model: The tree.
+        body_groups: Bodies that carry each other, together.
+
+    Attributes:
+        data: Of the tree.
+        body_groups: Models of the bodies and their data.
+    """
+
+    def __init__(self, model: pin.Model, body_groups: Sequence[Sequence[int]]):
+        self.data = model.createData()
+        self.subtrees = [_Subtree(model, bodies) for bodies in body_groups]
+
+
+class PinocchioDynamics:
+    """Any quantity of `QUANTITIES` at a closed posture, with rnea, crba and the tree's regressor.
+
+    Args:
+        machine: The machine.
+        forces: Its friction and passive forces.
+        carrier_bodies: See `crane.dynamics.formulation`.
+    """
+
+    def __init__(self, machine: Machine, forces: JointForces, carrier_bodies: Sequence[int]):
+        # a copy, so that parameters stay those of this moment
+        self._model = pin.Model(machine.model)
+        # added here, not by the parts: Pinocchio's kinetic energy forgets those of some joints
+        self._armature = np.array(self._model.armature)
+        self._rotor_columns = np.flatnonzero(self._armature)
+        self._closure, self._joint_forces = machine.closure, forces
+        self._coordinates, self._carrier_bodies = machine.coordinates, carrier_bodies
+        self._tip_point: tuple[int, Array] | None = None
+        if machine.tip is not None:
+            frame = self._model.frames[machine.frame(machine.tip)]
+            self._tip_point = int(frame.parentJoint), np.array(frame.placement.translation)
+
+    @cached_property
+    def _workspace(self) -> ThreadLocal[_TreeWorkspace]:
+        return ThreadLocal(
+            partial(_TreeWorkspace, self._model, self._group_bodies(self._carrier_bodies))
+        )
+
+    def _group_bodies(self, carrier_bodies: Sequence[int]) -> list[list[int]]:
+        """Bodies that carry each other, a parent before its children."""
+        joints = [0, *self._coordinates.joints.tolist()]
+        roots: dict[int, list[int]] = {}
+        root_of = {0: 0}
+        for body in range(1, self._model.njoints):
+            carrier = joints[carrier_bodies[self._model.joints[body].idx_v + 1]]
+            root_of[body] = root_of[carrier] or body
+            roots.setdefault(root_of[body], []).append(body)
+        return list(roots.values())
+
+    @property
+    def inertial_parameters(self) -> Array:
+        """See `Dynamics.inertial_parameters`."""
+        inertias = list(self._model.inertias)[1:]
+        bodies = [inertia.toDynamicParameters() for inertia in inertias]
+        return np.concatenate([*bodies, self._armature[self._rotor_columns]])
+
+    def evaluate(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
+        """A quantity of one sample; see `QUANTITIES` for x.
+
+        Args:
+            quantity: Its name.
+            q: (nq,) closed posture.
+            v_a: (n,).
+            x: (n,).
+
+        Returns:
+            The result, flattened.
+        """
+        state = ClosedState(q, *self._closure.gamma_velocity_drift(q, v_a))
+        gamma, v = state.gamma, state.v
+        match quantity:
+            case "inverse" | "inverse with friction":
+                a = gamma @ x + state.drift
+                friction = quantity.endswith("friction")
+                start = self._joint_forces.breakaway_forces(v, a) if friction else np.zeros_like(v)
+                return self._inverse_dynamics(state, a, friction) + gamma.T @ start
+            case "forward" | "forward with friction":
+                return self._forward_dynamics(state, x, quantity.endswith("friction"))
+            case "mass matrix":
+                return self._mass_matrix(state).ravel()
+            case "bias":
+                return self._inverse_dynamics(state, state.drift, False)
+            case "gravity":
+                return gamma.T @ self._tree_inverse_dynamics(q, np.zeros_like(v), np.zeros_like(v))
+            case "friction":
+                return gamma.T @ self._joint_forces.friction_forces(v)
+            case "passive":
+                return gamma.T @ self._joint_forces.passive_forces(q, v)
+            case "energy":
+                return self._kinetic_and_potential_energy(state)
+            case "rates":
+                a_a, _, margin, _ = self._accelerations_with_stick_slip(state, x)
+                rates = self._coordinates.coordinate_derivatives(q, v)
+                return np.concatenate([rates, a_a, [self._dissipated_power(state), margin]])
+            case "observation":
+                _, joint_friction, _, holding_forces = self._accelerations_with_stick_slip(
+                    state, x
+                )
+                stick_slip, (slip, held, pace) = (
+                    list(self._joint_forces.sticking),
+                    self._joint_forces.stick_slip_modes,
+                )
+                is_at_rest = (np.abs(slip) < 1) | (
+                    held.any() & (np.abs(v[stick_slip]) * pace < REST_VELOCITY)
+                )
+                friction_at_rest = np.where(
+                    is_at_rest, self._joint_forces.friction_at_rest(slip) + holding_forces, 0.0
+                )
+                return np.concatenate(
+                    [
+                        gamma.T @ joint_friction,
+                        self._kinetic_and_potential_energy(state),
+                        friction_at_rest,
+                    ]
+                )
+            case "resting":
+                stick_slip = list(self._joint_forces.sticking)
+                joint_friction = gamma.T @ self._joint_forces.friction_forces(v, use_modes=True)
+                net = x - self._inverse_dynamics(state, state.drift, False) - joint_friction
+                parts = self._mass_matrix(state), gamma[stick_slip], state.drift[stick_slip], net
+                return np.concatenate([np.ravel(part) for part in parts])
+            case "statics":
+                return self._static_quantities(state)
+            case "regressor":
+                return (gamma.T @ self._tree_regressor(q, v, gamma @ x + state.drift)).ravel()
+        raise AssertionError(quantity)
+
+    def _static_quantities(self, state: ClosedState) -> Array:
+        """See `DynamicsFormulas.static_quantities`."""
+        q, gamma = state.q, state.gamma
+        model, data = self._model, self._workspace.value.data
+        jacobian = pin.jacobianCenterOfMass(model, data, self._coordinates.configuration(q), False)
+        still, moving = model.inertias[0], data.mass[0]
+        moment = moving * data.com[0] + still.mass * still.lever
+        out = [moment, moving * jacobian @ gamma, [moving + still.mass]]
+        out.append(gamma.T @ self._joint_forces.passive_forces(q, state.v))
+        if self._tip_point is not None:
+            joint, place = self._tip_point
+            pin.computeJointJacobians(model, data, self._coordinates.configuration(q))
+            out.append(data.oMi[joint].act(place))
+            out.append(point_jacobian(model, data, joint, place)[:3] @ gamma)
+        return np.concatenate([np.ravel(part) for part in out])
+
+    def _forward_dynamics(self, state: ClosedState, tau_a: Array, friction: bool) -> Array:
+        return self._solve_mass_matrix(
+            state, tau_a - self._inverse_dynamics(state, state.drift, friction)
+        )
+
+    def _accelerations_with_stick_slip(
+        self, state: ClosedState, tau_a: Array
+    ) -> tuple[Array, Array, float, Array]:
+        """Accelerations, friction of all joints, margin, modes; see `DynamicsFormulas.accelerations_with_stick_slip`."""
+        forces, stick_slip = self._joint_forces, list(self._joint_forces.sticking)
+        slip, held, pace = forces.stick_slip_modes
+        joint_friction = forces.friction_forces(state.v, use_modes=True)
+        bias = self._inverse_dynamics(state, state.drift, False) + state.gamma.T @ joint_friction
+        a_a = self._solve_mass_matrix(state, tau_a - bias)
+        margins, holding_forces = slip * state.v[stick_slip] * pace, np.zeros(len(stick_slip))
+        held_indices = np.flatnonzero(held)
+        if len(held_indices):
+            rows = state.gamma[stick_slip][held_indices]
+            unit_accelerations = np.array([self._solve_mass_matrix(state, row) for row in rows])
+            required = rows @ a_a + state.drift[stick_slip][held_indices]
+            constraint_forces = np.linalg.solve(rows @ unit_accelerations.T, required)
+            a_a = (a_a - constraint_forces @ unit_accelerations) * forces.moving_factor
+            holding_forces[held_indices] = constraint_forces
+            joint_friction[stick_slip] += holding_forces
+            margins[held_indices] = (
+                1.0 - np.abs(constraint_forces) / forces.breakaway[held_indices]
+            )
+        return a_a, joint_friction, float(min([1.0, *margins])), holding_forces
+
+    def _solve_mass_matrix(self, state: ClosedState, forces: Array) -> Array:
+        """M_A^-1 of net forces."""
+        mass = self._mass_matrix(state)
+        try:
+            np.linalg.cholesky(mass)  # elimination would divide by what rounding leaves
+            return solve_linear(mass, forces)
+        except np.linalg.LinAlgError:
+            raise MechanismError(
+                "the mass matrix is not definite: some motion moves no mass that counts beside "
+                "the others', correct the masses and inertias"
+            ) from None
+
+    def _kinetic_and_potential_energy(self, state: ClosedState) -> Array:
+        """Kinetic and potential."""
+        configuration = self._coordinates.configuration(state.q)
+        kinetic, memory = 0.5 * float(self._armature @ state.v**2), self._workspace.value
+        for part in memory.subtrees:
+            at, v = configuration[part.configuration_indices], state.v[part.velocity_columns]
+            kinetic += pin.computeKineticEnergy(part.model, part.data, at, v)
+        weight = pin.computePotentialEnergy(self._model, memory.data, configuration)
+        return np.array([kinetic, weight + self._joint_forces.potential_energy(state.q)])
+
+    def _dissipated_power(self, state: ClosedState) -> float:
+        """Power that friction, dampers and end stops take out."""
+        conservative = self._joint_forces.passive_forces(state.q, np.zeros_like(state.v))
+        braking = conservative - self._joint_forces.passive_forces(state.q, state.v)
+        return float(
+            state.v @ (self._joint_forces.friction_forces(state.v, use_modes=True) + braking)
+        )
+
+    def _inverse_dynamics(self, state: ClosedState, a: Array, friction: bool) -> Array:
+        """gamma^T (rnea(q, v, a) - f [+ tau_F])."""
+        tau = self._tree_inverse_dynamics(state.q, state.v, a) - self._joint_forces.passive_forces(
+            state.q, state.v
+        )
+        if friction:
+            tau += self._joint_forces.friction_forces(state.v)
+        return np.asarray(state.gamma.T @ tau)
+
+    def _mass_matrix(self, state: ClosedState) -> Array:
+        configuration = self._coordinates.configuration(state.q)
+        total = state.gamma.T @ (self._armature[:, None] * state.gamma)
+        for part in self._workspace.value.subtrees:
+            upper = np.triu(
+                pin.crba(part.model, part.data, configuration[part.configuration_indices])
+            )
+            gamma = state.gamma[part.velocity_columns]
+            total += gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
+        return total
+
+    def _tree_inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        """Forces along the joints (nv,), part after part."""
+        tau = np.empty_like(v)
+        for part, at in self._subtree_configurations(q):
+            c = part.velocity_columns
+            tau[c] = pin.rnea(part.model, part.data, at, v[c], a[c])
+        return tau + self._armature * a
+
+    def _tree_regressor(self, q: Array, v: Array, a: Array) -> Array:
+        """Of the tree (nv, 10 nb + nr), part after part; a column for each rotor."""
+        size = 10 * (self._model.njoints - 1)
+        out = np.zeros((len(v), size + len(self._rotor_columns)))
+        out[self._rotor_columns, size + np.arange(len(self._rotor_columns))] = a[
+            self._rotor_columns
+        ]
+        for part, at in self._subtree_configurations(q):
+            c = part.velocity_columns
+            block = pin.computeJointTorqueRegressor(part.model, part.data, at, v[c], a[c])
+            out[np.ix_(c, (10 * (part.bodies[:, None] - 1) + np.arange(10)).ravel())] = block
+        return out
+
+    def _subtree_configurations(self, q: Array) -> Iterator[tuple[_Subtree, Array]]:
+        """The parts and their configurations, gravity turned into their bases' directions."""
+        configuration, memory = self._coordinates.configuration(q), self._workspace.value
+        pin.forwardKinematics(self._model, memory.data, configuration)
+        for part in memory.subtrees:
+            base = memory.data.oMi[part.base_body].rotation
+            part.model.gravity.linear = base.T @ self._model.gravity.linear
+            yield part, configuration[part.configuration_indices]

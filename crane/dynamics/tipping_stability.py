@@ -1,0 +1,302 @@
+"""Whether a machine tips: what its supports carry, and the moments about its tipping lines."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_samples
+from crane.common.threads import ThreadLocal
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.description.ground_contact import Contact
+from crane.dynamics.frame_jacobians import FrameJacobians
+from crane.machine import Machine
+
+_NEGATIVE_LOAD_TOLERANCE = -1e-9  # of the weight, that a support carries which carries none
+
+
+class TippingMargins(NamedTuple):
+    """How far a machine is from tipping, at N postures with k tipping lines.
+
+    Attributes:
+        moments: (N, k) about each line, that hold the machine down [N m]; below 0 it tips.
+        weight_ratios: (N, k) the same as a share of the machine's weight: what the support that is
+            farthest from the line would carry of it, if it alone held against the moment.
+    """
+
+    moments: Array
+    weight_ratios: Array
+
+    @property
+    def smallest_ratio(self) -> Array:
+        """(N,) the smallest share."""
+        least: Array = self.weight_ratios.min(axis=1)
+        return least
+
+
+class TippingStability:
+    """The tipping lines of a machine, the edges of the hull around its supports seen from above.
+
+    With G, M the force and the moment about the world's origin by which the ground holds it, and a
+    line from support i to the next one anticlockwise, j,
+
+        moment = (p_j - p_i) / |p_j - p_i| . (M - p_i x G),
+
+    which is what turns the machine about the line onto its supports: its static part is that of
+    ISO 10567 and EN 13000, inertial forces belong to it too (Ghasempoor and Sepehri, A measure of
+    machine stability for moving base manipulators, ICRA 1995). Of a machine that is fixed to the
+    world they follow from its motion,
+
+        G = d(momentum)/dt - m g - sum F,
+        M = d(angular momentum)/dt - sum r x m g - sum (r x F + M_F),
+
+    with wrenches F, M_F from outside. Of one on contacts they are what those press with.
+
+    Args:
+        machine: With `find_supports`, or at least three contacts.
+
+    Attributes:
+        support_names: Of the supports.
+        line_names: Of each line the names of its two supports.
+        line_indices: Of each line the indices of its two supports.
+        is_stationary: Whether no support moves.
+        mass: Of the machine [kg].
+
+    Raises:
+        InputError: It has fewer than three supports, or all in one line.
+    """
+
+    def __init__(self, machine: Machine):
+        self.machine, self._frame_jacobians = machine, FrameJacobians(machine)
+        support_list = find_supports(machine)
+        self.support_names, self._support_links = (
+            [name for name, _ in support_list],
+            [link for _, link in support_list],
+        )
+        # which of the forces from outside are those of supports
+        self._support_contacts = [
+            k
+            for k, force in enumerate(machine.external_forces)
+            if isinstance(force, Contact)
+            and (not machine.supports or force.frame in self._support_links)
+        ]
+        self.is_stationary = all(
+            not machine.model.frames[machine.frame(x)].parentJoint for x in self._support_links
+        )
+        if not self.is_stationary and len(self._support_contacts) < len(self._support_links):
+            raise InputError(f"'{machine.name}' has supports that move without being contacts")
+        from scipy.spatial import ConvexHull, QhullError  # slow to import
+
+        try:
+            hull = ConvexHull(self.support_positions(machine.home[None])[0, :, :2])
+        except (QhullError, ValueError):
+            raise InputError(
+                f"'{machine.name}' has {len(support_list)} supports and no area between them, "
+                f"name three "
+                "that are not in one line"
+            ) from None
+        around = [int(i) for i in hull.vertices]
+        self.line_indices = list(zip(around, around[1:] + around[:1], strict=True))
+        self.line_names = [
+            (self.support_names[i], self.support_names[j]) for i, j in self.line_indices
+        ]
+        self._model = pin.Model(machine.model)
+        self._workspace = ThreadLocal(self._model.createData)
+        self.mass = float(sum(inertia.mass for inertia in self._model.inertias))
+        self._gravity = self._model.gravity.linear.copy()
+
+    def static_margins(self, q_a: ArrayLike) -> TippingMargins:
+        """At rest, without forces from outside.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+        """
+        machine = self.machine
+        given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
+        q = machine.closure.solve(given)
+        return self.tipping_margins(q, self.ground_wrench(q))
+
+    def tipping_load(self, q_a: ArrayLike, frame: str | None = None) -> tuple[Array, list[str]]:
+        """The mass at a frame that tips the machine at rest: moment = -lever m g about a line.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            frame: Where it hangs; the tip if not given.
+
+        Returns:
+            (N,) [kg], infinite where it hangs between the supports, below 0 where the machine
+            tips without it; and about which line, "A to B", "" about none.
+        """
+        machine = self.machine
+        link = machine.tip if frame is None else frame
+        if link is None:
+            raise InputError(f"'{machine.name}' has no tip, name the frame that a load hangs from")
+        given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
+        q = machine.closure.solve(given)
+        moments = self.tipping_margins(q, self.ground_wrench(q)).moments
+        hanging = self._frame_jacobians.frame_origins(q, [link])[:, 0]
+        unit_load_wrenches = np.hstack(
+            [-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)]
+        )
+        levers = self._moments_about_lines(self.support_positions(q), unit_load_wrenches)
+        with np.errstate(divide="ignore"):
+            loads_by_line = np.where(levers < 0, moments / -levers, np.inf)
+        first = loads_by_line.argmin(axis=1)
+        loads = loads_by_line[np.arange(len(q)), first]
+        named = [" to ".join(self.line_names[k]) for k in first.tolist()]
+        return loads, [x if np.isfinite(y) else "" for x, y in zip(named, loads, strict=True)]
+
+    def ground_wrench(
+        self,
+        q: Array,
+        v: Array | None = None,
+        a: Array | None = None,
+        external_wrenches: Array | None = None,
+    ) -> Array:
+        """The wrench by which the ground holds it (N, 6), about the world's origin.
+
+        Args:
+            q: (N, nv) closed postures.
+            v: (N, nv) velocities; at rest if not given.
+            a: (N, nv) accelerations, likewise.
+            external_wrenches: (N, .) wrench and channels of each force from outside as a run
+                records them; none act if not given. Those of contacts that are supports are left
+                out.
+        """
+        rates, centres = np.zeros((len(q), 6)), np.empty((len(q), 3))
+        data = self._workspace.value
+        still = np.zeros(self._model.nv)
+        moves = v is not None or a is not None
+        for i, posture in enumerate(q):
+            at = self.machine.coordinates.configuration(posture)
+            if moves:
+                rates[i] = pin.computeCentroidalMomentumTimeVariation(
+                    self._model, data, at,
+                    still if v is None else v[i], still if a is None else a[i],
+                ).vector  # fmt: skip
+            else:
+                pin.centerOfMass(self._model, data, at, False)
+            centres[i] = data.com[0]
+        own = self._model.inertias[0]  # what stands has no momentum
+        out = rates - self.mass * np.append(self._gravity, np.zeros(3))
+        # the momentum's rate counts about the centre of what moves
+        moved = rates[:, :3] - (self.mass - own.mass) * self._gravity
+        out[:, 3:] += np.cross(centres, moved) - np.cross(own.mass * own.lever, self._gravity)
+        if external_wrenches is not None:
+            for k in range(len(self.machine.external_forces)):
+                if k not in self._support_contacts:
+                    out -= self._external_wrench_about_origin(q, k, external_wrenches)
+        return out
+
+    def contact_wrench(self, q: Array, external_wrenches: Array) -> Array:
+        """The wrench (N, 6) by which its contacts hold it, about the world's origin."""
+        out = np.zeros((len(q), 6))
+        for k in self._support_contacts:
+            out += self._external_wrench_about_origin(q, k, external_wrenches)
+        return out
+
+    def tipping_margins(self, q: Array, ground_wrench: Array) -> TippingMargins:
+        """About all lines.
+
+        Args:
+            q: (N, nv) closed postures.
+            ground_wrench: (N, 6) see `ground_wrench`.
+        """
+        points = self.support_positions(q)
+        weight = self.mass * float(np.linalg.norm(self._gravity))
+        moments = self._moments_about_lines(points, ground_wrench)
+        shares = np.empty_like(moments)
+        for k, (first, second) in enumerate(self.line_indices):
+            line_direction = points[:, second, :2] - points[:, first, :2]
+            across = points[..., :2] - points[:, first, None, :2]
+            area = (
+                line_direction[:, None, 0] * across[..., 1]
+                - line_direction[:, None, 1] * across[..., 0]
+            )
+            distances = np.abs(area).max(axis=1) / np.linalg.norm(line_direction, axis=1)
+            shares[:, k] = moments[:, k] / (weight * distances)
+        return TippingMargins(moments, shares)
+
+    def support_forces(self, q: Array, ground_wrench: Array) -> Array:
+        """What each support carries (N, s) [N], of equal stiffness under a rigid frame.
+
+        Of all forces above 0 that are in balance with the ground's, those with the least sum of
+        squares; where it tips, those nearest to balance.
+        """
+        points = self.support_positions(q)
+        x, y, z = np.moveaxis(points, 2, 0)
+        force, moment = ground_wrench[:, :3], ground_wrench[:, 3:]
+        level = np.zeros_like(force)
+        level[:, 2] = z.mean(axis=1)
+        moment = moment - np.cross(level, force)
+        required = np.stack([force[:, 2], moment[:, 0], moment[:, 1]], axis=1)
+        balance = np.stack([np.ones_like(x), y, -x], axis=1)
+        out: Array = np.einsum("nsk,nk->ns", np.linalg.pinv(balance), required)
+        for i in np.flatnonzero(out.min(axis=1) < 0):
+            out[i] = _nonnegative_support_forces(balance[i], required[i])
+        return out
+
+    def support_positions(self, q: Array) -> Array:
+        """(N, s, 3) where the supports are."""
+        found = self._frame_jacobians.frame_origins(
+            q[:1] if self.is_stationary else q, self._support_links
+        )
+        return np.broadcast_to(found, (len(q), *found.shape[1:]))
+
+    def _moments_about_lines(self, points: Array, wrench: Array) -> Array:
+        """(N, k) moments of wrenches (N, 6) about the lines."""
+        out = np.empty((len(points), len(self.line_indices)))
+        for k, (first, second) in enumerate(self.line_indices):
+            line_direction = points[:, second] - points[:, first]
+            moment = wrench[:, 3:] - np.cross(points[:, first], wrench[:, :3])
+            out[:, k] = (line_direction * moment).sum(axis=1) / np.linalg.norm(
+                line_direction, axis=1
+            )
+        return out
+
+    def _external_wrench_about_origin(self, q: Array, k: int, external_wrenches: Array) -> Array:
+        """(N, 6) of force k from outside."""
+        first = sum(
+            len(WRENCH_COMPONENTS) + len(x.channels) for x in self.machine.external_forces[:k]
+        )
+        wrench = external_wrenches[:, first : first + len(WRENCH_COMPONENTS)].copy()
+        acts = wrench.any(axis=1)
+        places = self._frame_jacobians.frame_origins(
+            q[acts], [self.machine.external_forces[k].frame]
+        )[:, 0]
+        wrench[acts, 3:] += np.cross(places, wrench[acts, :3])
+        return wrench
+
+
+def find_supports(machine: Machine) -> list[tuple[str, str]]:
+    """Names and links of what a machine stands on: `find_supports`, or its contacts."""
+    if machine.supports:
+        return [(link, link) for link in machine.supports]
+    return [(x.name, x.frame) for x in machine.external_forces if isinstance(x, Contact)]
+
+
+def has_supports(machine: Machine) -> bool:
+    """Whether there is a `TippingStability` of it."""
+    try:
+        return len(find_supports(machine)) > 2 and bool(TippingStability(machine).line_names)
+    except InputError:
+        return False
+
+
+def _nonnegative_support_forces(balance: Array, required: Array) -> Array:
+    """Forces of at least 0 with balance (3, s) @ forces = wanted (3,) and least squares."""
+    loaded: Sequence[int] = range(balance.shape[1])
+    out = np.zeros(balance.shape[1])
+    while len(loaded) > 2:
+        part = np.linalg.lstsq(balance[:, loaded], required, rcond=None)[0]
+        if part.min() >= _NEGATIVE_LOAD_TOLERANCE * np.abs(part).max():
+            out[loaded] = np.maximum(part, 0.0)
+            return out
+        loaded = [i for i, force in zip(loaded, part, strict=True) if force > 0]
+    from scipy.optimize import nnls  # slow to import
+
+    found: Array = nnls(balance, required)[0]
+    return found

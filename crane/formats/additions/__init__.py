@@ -1,0 +1,9 @@
+"""Parts and loops added to machines that were described without them."""
+
+from crane.formats.additions.cylinder_addition import AddedCylinder, add_cylinder
+from crane.formats.additions.loop_addition import AddedLoops, add_loops
+from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
+
+__all__ = [
+    "AddedCylinder", "AddedLoops", "LoopProposal", "add_cylinder", "add_loops", "propose_loops",
+]  # fmt: skip

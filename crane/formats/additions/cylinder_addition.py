@@ -1,0 +1,210 @@
+"""A cylinder put between two eyes of a machine: barrel and rod, closed by a loop."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.atomic_output import fill_folder, portable_file_name
+from crane.common.errors import CraneWarning, InputError
+from crane.formats.additions.attachment_points import joints_between, parse_attachment_point
+from crane.formats.additions.cylinder_chain import add_barrel_and_rod
+from crane.formats.additions.cylinder_fit import (
+    fit_to_joint_range,
+    warn_about_masses,
+    warn_about_strokes,
+)
+from crane.formats.additions.distance_curve import DistanceCurve, distance_curve
+from crane.formats.additions.drive_replacement import replace_drive
+from crane.formats.additions.output_files import check_files_are_new, machine_file_path
+from crane.formats.additions.steel_cylinder import SteelCylinder
+from crane.formats.machine_file.machine_writer import MachineDraft
+from crane.formats.machine_loading import load
+from crane.machine import Machine
+
+_NAME_SUFFIXES = (
+    "", "_base", "_barrel", "_cross", "_rod", "_eye", "_pin", "_pin_y", "_pin_z", "_attachment",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class AddedCylinder:
+    """What was added, and what it does.
+
+    Attributes:
+        path: The machine file.
+        name: Of the cylinder and its active joint, the stroke.
+        joint: The joint that it drives.
+        shares_load: Whether it shares the load with what drove the joint before, else in its
+            place.
+        unit: Of the joint.
+        limits: Of the joint, or what was looked at where it has none.
+        driven_range: Part of them that the stroke reaches.
+        length_range: (2,) least and largest distance of the eyes over `limits` [m].
+        stroke_range: (2,) of the cylinder at both ends of `driven_range` [m].
+        lever_arm_range: (2,) least and largest lever arm over `driven_range` [m], of a slide a
+            ratio.
+        masses: Of barrel and rod [kg].
+        notes: What was assumed.
+    """
+
+    path: Path
+    name: str
+    joint: str
+    shares_load: bool
+    unit: str
+    limits: tuple[float, float]
+    driven_range: tuple[float, float]
+    length_range: tuple[float, float]
+    stroke_range: tuple[float, float]
+    lever_arm_range: tuple[float, float]
+    masses: tuple[float, float]
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """A few lines."""
+        verb_phrase = "shares the load on" if self.shares_load else "drives"
+        lever_arm_name = "lever arm" if self.unit == "rad" else "ratio"
+        lines = [
+            f"{self.name} {verb_phrase} {self.joint} from {self.driven_range[0]:.4g} to "
+            f"{self.driven_range[1]:.4g} {self.unit}, with {self.stroke_range[0]:.4g} to "
+            f"{self.stroke_range[1]:.4g} m of its stroke, {lever_arm_name} "
+            f"{self.lever_arm_range[0]:.3g} to "
+            f"{self.lever_arm_range[1]:.3g}{' m' * (self.unit == 'rad')}",
+            f"barrel {self.masses[0]:.4g} kg, rod {self.masses[1]:.4g} kg of steel, without oil",
+            *self.notes,
+            f"written to {self.path}",
+        ]
+        return "\n".join(lines)
+
+
+def add_cylinder(
+    machine: str | Path,
+    between: Sequence[str],
+    bore: float,
+    rod: float,
+    stroke: float,
+    *,
+    name: str = "cylinder",
+    dead_length: float | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+) -> AddedCylinder:
+    """Put a cylinder between two points of a machine, and write the closed machine.
+
+    The stroke becomes an active joint in place of the joint that it determines. Where the joints
+    between the two bodies move in one plane and the eyes lie in it, the barrel turns about an axis
+    normal to it and the rod's eye is a revolute loop; else the barrel has a universal joint and
+    the rod's eye a spherical one, so that the rod does not spin.
+
+    Args:
+        machine: As for `load`.
+        between: Eyes of barrel and rod: LINK, or LINK:x,y,z with metres in the link's frame.
+        bore: Diameter of the piston [m].
+        rod: Diameter of the rod [m].
+        stroke: [m].
+        name: Of the cylinder: its stroke, chain and loop; its links have it in front.
+        dead_length: Pin to pin with the rod in [m]; stroke and four bores if not given.
+        out: The machine file to write, its URDFs go to a folder beside of the same name without
+            suffix; MACHINE_NAME.yaml in this folder if not given.
+        force: Whether files that are there are replaced.
+
+    Returns:
+        What was added; `path` is the machine file, for `load`.
+
+    Raises:
+        InputError: The cylinder is none, its eyes are not there, or it does not fit between them.
+        OutputError: The files cannot be written, or are there already.
+    """
+    cylinder = SteelCylinder.from_dimensions(bore, rod, stroke, dead_length)
+    if isinstance(between, str) or len(between) != 2:
+        raise InputError(f"between is {between!r}, give the two eyes, of barrel and rod")
+    if not name or name != name.strip() or not name.isprintable():
+        raise InputError(f"the cylinder's name is {name!r}, give a word")
+    loaded = load(machine)
+    file = machine_file_path(out, f"{portable_file_name(f'{loaded.name}_{name}')}.yaml")
+    points = [parse_attachment_point(loaded, text) for text in between]
+    draft = MachineDraft(loaded, file.stem)
+    _check_names_are_free(loaded, name)
+    distances = distance_curve(loaded, points)
+    start_index, reached_distances = fit_to_joint_range(distances, cylinder, points, loaded)
+    joint_path = [joint.name for joint in joints_between(loaded, points[0].link, points[1].link)]
+    shares_load = loaded.unit(distances.joint) == "m" and distances.joint not in joint_path
+    notes = _choice_notes(distances, start_index, shares_load) + add_barrel_and_rod(
+        draft, loaded, name, points, cylinder, distances.configurations[start_index]
+    )
+    replace_drive(draft, loaded, name, None if shares_load else distances.joint)
+    check_files_are_new(draft, file, force)
+    with fill_folder(file.parent) as output_folder:
+        draft.write(output_folder, file.name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CraneWarning)
+            closed = load(output_folder / file.name)  # what does not load is not left behind
+        warn_about_strokes(closed, name)
+    warn_about_masses(loaded, cylinder, distances.joint)
+    return _added_cylinder(
+        file, name, loaded, cylinder, distances, reached_distances, shares_load, notes
+    )
+
+
+def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool) -> list[str]:
+    """What was chosen: the joint that is driven, the posture to begin from."""
+    notes = []
+    if distances.alternative_joints and not shares_load:
+        notes.append(
+            f"{', '.join(distances.alternative_joints)} "
+            f"stay{'s' * (len(distances.alternative_joints) == 1)} driven: of them and "
+            f"{distances.joint} the cylinder drives {distances.joint} best"
+        )
+    if start_index != distances.home_index:
+        notes.append(
+            f"home: {distances.joint} at {distances.values[start_index]:.4g}, where the "
+            f"cylinder fits"
+        )
+    return notes
+
+
+def _added_cylinder(
+    file: Path,
+    name: str,
+    machine: Machine,
+    cylinder: SteelCylinder,
+    distances: DistanceCurve,
+    reached_distances: DistanceCurve,
+    shares_load: bool,
+    notes: Sequence[str],
+) -> AddedCylinder:
+    """The result, from the postures that the cylinder reaches."""
+    lever_arms = np.abs(reached_distances.lever_arms)
+    strokes = np.clip(
+        reached_distances.length[[0, -1]] - cylinder.retracted_length, 0, cylinder.stroke
+    )
+    return AddedCylinder(
+        path=file,
+        name=name,
+        joint=distances.joint,
+        shares_load=shares_load,
+        unit=machine.unit(distances.joint),
+        limits=(float(distances.values[0]), float(distances.values[-1])),
+        driven_range=(float(reached_distances.values[0]), float(reached_distances.values[-1])),
+        length_range=(float(distances.length.min()), float(distances.length.max())),
+        stroke_range=(float(strokes[0]), float(strokes[1])),
+        lever_arm_range=(float(lever_arms.min()), float(lever_arms.max())),
+        masses=(cylinder.barrel_inertial.mass, cylinder.rod_inertial.mass),
+        notes=tuple(notes),
+    )
+
+
+def _check_names_are_free(machine: Machine, name: str) -> None:
+    used_names = {*machine.tree.links, *machine.tree.joints}
+    used_names |= {chain.name for chain in machine.chains}
+    used_names |= set(machine.closure.equations.names)
+    for suffix in _NAME_SUFFIXES:
+        if name + suffix in used_names:
+            raise InputError(
+                f"'{name}{suffix}' is a part of '{machine.name}' already, give the cylinder "
+                f"another "
+                "name with --name"
+            )

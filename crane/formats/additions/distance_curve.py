@@ -1,0 +1,267 @@
+"""How long a cylinder has to be over the range of the joint that it drives."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.closure.active_joint_selection import coordinate_units
+from crane.common.errors import CraneError, InputError
+from crane.common.samples import Array
+from crane.formats.additions.attachment_points import (
+    AttachmentPoint,
+    joints_between,
+    lever_arm,
+    vector_between,
+)
+from crane.machine import Machine
+
+_FINE_SAMPLES = 400  # postures over the range of the joint
+_COARSE_SAMPLES = 24  # the same while it is not known which joint
+_STANDSTILL_TOLERANCE = 1e-9  # change of the length, as a share of it, that is none
+_CLOSING_RESOLUTION = (
+    1e-7  # share of the range to which it is known where the machine still closes
+)
+_ROUNDING_TOLERANCE = 1e-15  # of a coordinate's size
+_MIN_LEVER_ARM_SHARE = (
+    0.02  # share of the best lever arm below which a posture is as good as a dead centre
+)
+
+RangeSample = tuple[float, Array]  # a coordinate and the posture (nq,) there
+
+
+@dataclass(frozen=True)
+class DistanceCurve:
+    """The distance between two eyes over the range of one active joint, others at home.
+
+    Attributes:
+        machine: Whose they are.
+        points: The two.
+        joint: The joint.
+        values: (N,) its coordinates where the machine closes [m], [rad].
+        configurations: (N, nq) postures.
+        length: (N,) between the eyes [m].
+        home_index: Index of the home posture.
+        alternative_joints: Joints that a cylinder could drive instead.
+    """
+
+    machine: Machine
+    points: Sequence[AttachmentPoint]
+    joint: str
+    values: Array
+    configurations: Array
+    length: Array
+    home_index: int
+    alternative_joints: tuple[str, ...] = ()
+
+    @property
+    def lever_arms(self) -> Array:
+        """(N,) change of the length with the coordinate: the lever arm [m], or a ratio."""
+        return np.array(
+            [lever_arm(self.machine, self.points, q, self.joint) for q in self.configurations]
+        )
+
+    def driven_part(
+        self, min_length: float, max_length: float
+    ) -> "tuple[int, DistanceCurve] | None":
+        """Where a cylinder of that length drives the joint.
+
+        Args:
+            min_length: Its length with the rod in [m].
+            max_length: With the rod out [m].
+
+        Returns:
+            The posture to start from: home, or the nearest to it with a length between and a
+            lever arm; and what is reached from there before the stroke ends or a dead centre
+            comes, its ends found between the postures. None where no posture has such a length.
+        """
+        tolerance = 1e-9 * max_length
+        fits = (self.length >= min_length - tolerance) & (self.length <= max_length + tolerance)
+        rates = np.abs(np.gradient(self.length, self.values))
+        is_drivable = fits & (rates > _MIN_LEVER_ARM_SHARE * rates.max())
+        if not is_drivable.any():
+            return None
+        start_index = int(
+            min(np.flatnonzero(is_drivable), key=lambda k: abs(int(k) - self.home_index))
+        )
+        lever_arms = self.lever_arms
+        is_driven = fits & (lever_arms * lever_arms[start_index] > 0)
+
+        def is_driven_at(q: Array) -> bool:
+            length = float(np.linalg.norm(vector_between(self.machine, self.points, q)))
+            if not min_length - tolerance <= length <= max_length + tolerance:
+                return False
+            return (
+                lever_arm(self.machine, self.points, q, self.joint) * lever_arms[start_index] > 0
+            )
+
+        first = last = start_index
+        while first > 0 and is_driven[first - 1]:
+            first -= 1
+        while last + 1 < len(is_driven) and is_driven[last + 1]:
+            last += 1
+        resolution = _ROUNDING_TOLERANCE * max(abs(self.values[0]), abs(self.values[-1]))
+        samples = list(zip(self.values, self.configurations, strict=True))
+        reached_samples = samples[first : last + 1]
+        if first > 0:
+            beyond = self.values[first - 1]
+            reached_samples.insert(
+                0,
+                last_closed_sample(
+                    self.machine, self.joint, reached_samples[0], beyond, resolution, is_driven_at
+                ),
+            )
+        if last + 1 < len(is_driven):
+            beyond = self.values[last + 1]
+            reached_samples.append(
+                last_closed_sample(
+                    self.machine, self.joint, reached_samples[-1], beyond, resolution, is_driven_at
+                )
+            )
+        start_in_reached = start_index - first + (first > 0)
+        return start_index, DistanceCurve.from_samples(
+            self.machine, self.points, self.joint, reached_samples, start_in_reached
+        )
+
+    @classmethod
+    def from_samples(
+        cls,
+        machine: Machine,
+        points: Sequence[AttachmentPoint],
+        joint: str,
+        samples: Sequence[RangeSample],
+        home_index: int,
+    ) -> "DistanceCurve":
+        """The span over some postures, that at home among them."""
+        values, q = (np.array(part) for part in zip(*samples, strict=True))
+        length = np.linalg.norm(vector_between(machine, points, q), axis=1)
+        return cls(machine, points, joint, values, q, length, home_index)
+
+
+def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> DistanceCurve:
+    """The span over the active joint that a cylinder between two eyes takes the place of.
+
+    That is an active joint between the two bodies, or one that turns and moves them by way of a
+    linkage; of several the one whose scaled coordinate changes the length the most, as the
+    condition of the drive wants it (see `crane.closure.active_joint_selection`).
+
+    Raises:
+        InputError: No joint changes the distance.
+    """
+    joints_in_path = [
+        joint.name for joint in joints_between(machine, points[0].link, points[1].link)
+    ]
+    if not joints_in_path:
+        raise InputError(
+            f"'{points[0]}' and '{points[1]}' are on one body, choose points of two that move "
+            "against each other"
+        )
+    coordinate_scales = machine.closure.equations.motion_scales
+    scaled_lever_arms: dict[str, float] = {}
+    for joint in machine.active:
+        coarse_curve = _scan_joint_range(machine, points, joint, _COARSE_SAMPLES)
+        change = np.ptp(coarse_curve.length) / max(coarse_curve.length.max(), 1e-300)
+        if len(coarse_curve.length) > 1 and change > _STANDSTILL_TOLERANCE:
+            home_lever_arm = abs(
+                lever_arm(
+                    machine, points, coarse_curve.configurations[coarse_curve.home_index], joint
+                )
+            )
+            scaled_lever_arms[joint] = home_lever_arm * coordinate_scales[machine.column(joint)]
+    if not scaled_lever_arms:
+        raise InputError(
+            f"no active joint changes the distance between '{points[0]}' and '{points[1]}' "
+            f"(between them: {', '.join(joints_in_path)}), choose other points"
+        )
+    preferred = {
+        joint
+        for joint in scaled_lever_arms
+        if joint in joints_in_path or machine.unit(joint) == "rad"
+    }
+    candidates = {
+        joint: value
+        for joint, value in scaled_lever_arms.items()
+        if joint in preferred or not preferred
+    }
+    best = max(candidates, key=lambda joint: candidates[joint])
+    alternative_joints = tuple(joint for joint in candidates if joint != best)
+    return dataclasses.replace(
+        _scan_joint_range(machine, points, best, _FINE_SAMPLES),
+        alternative_joints=alternative_joints,
+    )
+
+
+def _scan_joint_range(
+    machine: Machine, points: Sequence[AttachmentPoint], joint: str, count: int
+) -> DistanceCurve:
+    column, index = machine.column(joint), machine.active.index(joint)
+    home = float(machine.home[column])
+    default_range = (
+        np.pi if machine.unit(joint) == "rad" else float(coordinate_units(machine.model)[column])
+    )
+    lower, upper = (float(limits[index]) for limits in (machine.lower, machine.upper))
+    lower = lower if np.isfinite(lower) else min(home, upper) - default_range
+    upper = upper if np.isfinite(upper) else max(home, lower) + default_range
+    values = np.linspace(lower, upper, count + 1)
+    home_index = int(np.argmin(np.abs(values - home)))
+    values[home_index] = home  # between its neighbours: it is nearer to this value than to them
+    targets = np.tile(machine.home[machine.closure.active], (len(values), 1))
+    targets[:, index] = values
+    try:
+        samples = list(zip(values, machine.closure.solve(targets), strict=True))
+    except CraneError:  # part of the range cannot be closed
+        before, after = (
+            _samples_outwards(machine, joint, (home, np.array(machine.home)), rest.tolist())
+            for rest in (values[:home_index][::-1], values[home_index + 1 :])
+        )
+        samples, home_index = [*before[::-1], (home, np.array(machine.home)), *after], len(before)
+    return DistanceCurve.from_samples(machine, points, joint, samples, home_index)
+
+
+def _samples_outwards(
+    machine: Machine, joint: str, sample: RangeSample, values: Sequence[float]
+) -> list[RangeSample]:
+    """Postures behind one, at coordinates of a joint, and the last at which the machine closes."""
+    found: list[RangeSample] = []
+    for value in values:
+        configuration = _solve_at(machine, joint, value, sample[1])
+        if configuration is None:
+            resolution = _CLOSING_RESOLUTION * abs(value - sample[0])
+            return [*found, last_closed_sample(machine, joint, sample, value, resolution)]
+        sample = value, configuration
+        found.append(sample)
+    return found
+
+
+def last_closed_sample(
+    machine: Machine,
+    joint: str,
+    sample: RangeSample,
+    limit: float,
+    resolution: float,
+    condition: Callable[[Array], bool] = lambda q: True,
+) -> RangeSample:
+    """The last posture, between one and a coordinate beyond, that closes and where it holds.
+
+    By bisection, until it is known to `resolution`.
+    """
+    value, q = sample
+    while abs(limit - value) > resolution:
+        middle = (value + limit) / 2
+        configuration = _solve_at(machine, joint, middle, q)
+        if configuration is not None and condition(configuration):
+            value, q = middle, configuration
+        else:
+            limit = middle
+    return value, q
+
+
+def _solve_at(machine: Machine, joint: str, value: float, guess: Array) -> Array | None:
+    """Posture with a joint at a coordinate, others at home; None where it does not close."""
+    target = machine.home[machine.closure.active]
+    target[machine.active.index(joint)] = value
+    try:
+        return machine.closure.solve(target, guess)
+    except CraneError:
+        return None

@@ -1,0 +1,316 @@
+"""Loops that a description seems to leave open, with the gap that each has to close.
+
+Three things tell one: frames that are named as the two ends of a loop (see
+`crane.formats.machine_file_path.open_loop_warning`), ends of bodies that meet at home, and a
+barrel and a rod that hang on two bodies and point at each other.
+"""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.coordinates import Coordinates
+from crane.closure.loop_equations import frame_id
+from crane.common.samples import Array
+from crane.description import LoopSpec, MachineSpec
+from crane.description.kinematic_tree import Joint, Vector
+from crane.description.pinocchio_conversion import to_vector
+from crane.formats.machine_file.open_loop_warning import loop_end_pairs
+
+_MAX_GAP_SHARE = 0.05  # share of the machine's size within which two ends meet
+_MAX_GAP_SHARE_WITHOUT_PLANE = 0.01  # the same where no plane tells that they belong together
+_MIN_OFFSET_SHARE = (
+    1e-6  # share of the size away from a body's origin where a frame is a place of its own
+)
+_MAX_DUMMY_MASS = (
+    1e-6  # [kg] that CAD exporters give frames; of a light machine a share of its heaviest link
+)
+_PARALLEL_TOLERANCE = 1e-6  # sine of an angle that counts as none
+_MIN_LOOP_JOINTS = 3  # joints of the tree below which a loop would lock what it closes
+_BARREL_PATTERN = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
+_ROD_PATTERN = re.compile(r"piston_?rod|rod|piston|ram|plunger", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class LoopProposal:
+    """A loop that may be missing.
+
+    Attributes:
+        loop: It.
+        gap: Between its frames at home, without what their slides can cover [m].
+        is_named: Whether names say so, else places.
+    """
+
+    loop: LoopSpec
+    gap: float
+    is_named: bool
+
+    def __str__(self) -> str:
+        """An entry of `loops` in a machine file, with its gap as a comment."""
+        loop = self.loop
+        axis = ", ".join(f"{value:.9g}" for value in loop.axis)
+        axis_text = "" if loop.type in ("fixed", "spherical") else f", axis: [{axis}]"
+        return (
+            f"- {{name: {loop.name}, type: {loop.type}, predecessor: {loop.predecessor}, "
+            f"successor: {loop.successor}{axis_text}}}  # {1e3 * self.gap:.3g} mm apart at home"
+        )
+
+
+def propose_loops(spec: MachineSpec, model: pin.Model, q: Array) -> tuple[LoopProposal, ...]:
+    """Loops that nothing closes, those that are named first, then the narrowest.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        q: (nv,) its home, closed or as the file guesses it.
+    """
+    return tuple(_OpenLoopSearch(spec, model, q).find_proposals())
+
+
+class _OpenLoopSearch:
+    """Places and axes of a tree at home.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        q: (nv,) posture.
+    """
+
+    def __init__(self, spec: MachineSpec, model: pin.Model, q: Array):
+        self.spec, self.joints = spec, spec.tree.joints
+        self.parent_joints = {joint.child: joint for joint in self.joints.values()}
+        self.joints_by_parent = spec.tree.joints_by_parent()
+        self.ways, self.bodies = self._trace_tree()
+        data = model.createData()
+        pin.forwardKinematics(model, data, Coordinates(model).configuration(q))
+        self.placements = {
+            link: pin.updateFramePlacement(model, data, frame_id(model, link)).copy()
+            for link in spec.tree.links
+        }
+        points = np.array([place.translation for place in self.placements.values()])
+        self.characteristic_length = float(np.linalg.norm(np.ptp(points, axis=0)))
+        given = (link.inertial for link in spec.tree.links.values())
+        self.largest_mass = max((one.mass for one in given if one is not None), default=0.0)
+        self.loop_frames = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
+
+    def _trace_tree(self) -> tuple[dict[str, frozenset[str]], dict[str, str]]:
+        """By link the moving joints down to the root, and the link that its body begins with."""
+        root = self.spec.tree.root_link
+        joints_to_root, body_of_link, pending = {root: frozenset[str]()}, {root: root}, [root]
+        while pending:
+            link = pending.pop()
+            for joint in self.joints_by_parent.get(link, ()):
+                own_joint = {joint.name} if joint.is_movable else set()
+                joints_to_root[joint.child] = joints_to_root[link] | own_joint
+                body_of_link[joint.child] = joint.child if joint.is_movable else body_of_link[link]
+                pending.append(joint.child)
+        return joints_to_root, body_of_link
+
+    def find_proposals(self) -> list[LoopProposal]:
+        """All proposals; two bodies are joined once."""
+        proposed: list[LoopProposal] = []
+        closed_bodies = {self._bodies_of(pair) for pair in self.loop_frames}
+        used_frames = {frame for pair in self.loop_frames for frame in pair}
+        for group in (self._named_proposals(), self._slide_proposals(), self._meeting_proposals()):
+            for proposal in sorted(group, key=self._frame_distance):
+                ends = {proposal.loop.predecessor, proposal.loop.successor}
+                if self._bodies_of(ends) in closed_bodies or ends & used_frames:
+                    continue
+                proposed.append(self._with_unique_name(proposal, proposed))
+                closed_bodies.add(self._bodies_of(ends))
+                used_frames |= ends
+        return proposed
+
+    def _named_proposals(self) -> Iterator[LoopProposal]:
+        for name, first, second in loop_end_pairs(self.spec.tree):
+            if len(self._bodies_of((first, second))) == 2:
+                kind, axis = _type_from_name(name) or self._loop_type_and_axis(first, second)
+                yield self._create_proposal(name, kind, (first, second), axis, is_named=True)
+
+    def _slide_proposals(self) -> Iterator[LoopProposal]:
+        """A barrel and a rod, each on a pin of its own, whose loop slides from pin to pin."""
+        links = [link for link in self._leaf_links() if self._is_on_revolute_joint(link)]
+        rods = {_ROD_PATTERN.sub("", link): link for link in links if _ROD_PATTERN.search(link)}
+        for barrel in links:
+            rod = (
+                rods.get(_BARREL_PATTERN.sub("", barrel))
+                if _BARREL_PATTERN.search(barrel)
+                else None
+            )
+            if (
+                rod is None
+                or rod == barrel
+                or len(self._joints_between(barrel, rod)) < _MIN_LOOP_JOINTS
+            ):
+                continue
+            barrel_placement, rod_placement = self.placements[barrel], self.placements[rod]
+            vector = rod_placement.translation - barrel_placement.translation
+            length = float(np.linalg.norm(vector))
+            axes = [
+                place.rotation.T @ vector / max(length, 1e-300)
+                for place in (barrel_placement, rod_placement)
+            ]
+            if length > 0 and np.linalg.norm(axes[0] - axes[1]) < _MAX_GAP_SHARE:
+                yield LoopProposal(
+                    LoopSpec(barrel, "prismatic", barrel, rod, _round_direction(axes[0]), ""),
+                    0.0,
+                    True,
+                )
+
+    def _meeting_proposals(self) -> Iterator[LoopProposal]:
+        """Ends of two bodies that meet at home, or by what the slides above them may do."""
+        for first, second in self._nearby_pairs():
+            if self.joints_by_parent.get(first) and self.joints_by_parent.get(second):
+                continue
+            gap = self._gap(first, second)
+            if (
+                gap > _MAX_GAP_SHARE * self.characteristic_length
+                or len(self._joints_between(first, second)) < _MIN_LOOP_JOINTS
+            ):
+                continue
+            kind, axis = self._loop_type_and_axis(first, second)
+            are_separate_frames = (
+                gap <= _MAX_GAP_SHARE_WITHOUT_PLANE * self.characteristic_length
+                and self._is_away_from_origin(first)
+                and self._is_away_from_origin(second)
+            )
+            if kind != "spherical" or are_separate_frames:
+                yield self._create_proposal(second, kind, (first, second), axis, is_named=False)
+
+    def _nearby_pairs(self) -> Iterator[tuple[str, str]]:
+        """Pairs of frames that are near enough, or may be by their slides."""
+        frames = self._massless_frames()
+        points = np.array([self.placements[link].translation for link in frames]).reshape(-1, 3)
+        slide_ranges = np.array([self._slide_range(link) for link in frames])
+        for i, first in enumerate(frames[:-1]):
+            distances = np.linalg.norm(points[i + 1 :] - points[i], axis=1)
+            is_near = (
+                distances
+                <= _MAX_GAP_SHARE * self.characteristic_length
+                + slide_ranges[i]
+                + slide_ranges[i + 1 :]
+            )
+            yield from ((first, frames[i + 1 + int(k)]) for k in np.flatnonzero(is_near))
+
+    def _slide_range(self, link: str) -> float:
+        """How far a slide that ends in a link can move it [m]."""
+        joint = self.parent_joints.get(self.bodies[link])
+        if joint is None or joint.kind != "prismatic":
+            return 0.0
+        return joint.limits.upper - joint.limits.lower
+
+    def _leaf_links(self) -> list[str]:
+        """Links that carry nothing: frames, and what the last joints move."""
+        return [link for link in self.spec.tree.links if not self.joints_by_parent.get(link)]
+
+    def _massless_frames(self) -> list[str]:
+        """Frames without mass, and what slides at an end."""
+        return [link for link in self.spec.tree.links if self._is_frame(link)]
+
+    def _is_frame(self, link: str) -> bool:
+        if link in (self.spec.tip, self.spec.tree.root_link):
+            return False
+        if self.parent_joints[link].is_movable:
+            return self.parent_joints[link].kind == "prismatic" and not self.joints_by_parent.get(
+                link
+            )
+        inertial = self.spec.tree.links[link].inertial
+        return inertial is None or inertial.mass <= _MAX_DUMMY_MASS * min(1.0, self.largest_mass)
+
+    def _is_away_from_origin(self, link: str) -> bool:
+        """Whether a frame is not just the origin of its body."""
+        offset = self.placements[link].translation - self.placements[self.bodies[link]].translation
+        return bool(np.abs(offset).max() > _MIN_OFFSET_SHARE * self.characteristic_length)
+
+    def _is_on_revolute_joint(self, link: str) -> bool:
+        body = self.bodies[link]
+        return body in self.parent_joints and self.parent_joints[body].kind == "revolute"
+
+    def _bodies_of(self, pair: Collection[str]) -> frozenset[str]:
+        return frozenset(self.bodies[link] for link in pair)
+
+    def _joints_between(self, first: str, second: str) -> list[Joint]:
+        """Moving joints of the tree between two links."""
+        return [self.joints[name] for name in sorted(self.ways[first] ^ self.ways[second])]
+
+    def _gap(self, first: str, second: str) -> float:
+        """Between two links, moved towards each other by a slide that ends in one of them."""
+        vector = self.placements[second].translation - self.placements[first].translation
+        gaps = [float(np.linalg.norm(vector))]
+        for link, sign in ((first, 1.0), (second, -1.0)):
+            if slide_range := self._slide_range(link):
+                axis = sign * self._axis_in_world(self.parent_joints[self.bodies[link]])
+                slide_travel = float(np.clip(vector @ axis, -slide_range, slide_range))
+                gaps.append(float(np.linalg.norm(vector - slide_travel * axis)))
+        return min(gaps)
+
+    def _frame_distance(self, proposal: LoopProposal) -> float:
+        ends = proposal.loop.predecessor, proposal.loop.successor
+        first, second = (self.placements[end].translation for end in ends)
+        return float(np.linalg.norm(second - first))
+
+    def _axis_in_world(self, joint: Joint) -> Array:
+        return np.asarray(self.placements[joint.child].rotation @ np.array(joint.axis))
+
+    def _loop_type_and_axis(self, first: str, second: str) -> tuple[str, Vector]:
+        """A pin where the ring moves in a plane and both frames say the same of its normal.
+
+        Else a ball, which leaves a planar ring the same freedoms.
+        """
+        loop_joints = self._joints_between(first, second)
+        revolute_axes = [
+            self._axis_in_world(joint) for joint in loop_joints if joint.kind == "revolute"
+        ]
+        prismatic_axes = [
+            self._axis_in_world(joint) for joint in loop_joints if joint.kind == "prismatic"
+        ]
+        if not revolute_axes:
+            return "spherical", (0.0, 0.0, 1.0)
+        normal = revolute_axes[0]
+        deviation = np.linalg.norm(np.cross(revolute_axes, normal), axis=1).max()
+        deviation = max(
+            deviation, np.abs(np.reshape(prismatic_axes, (-1, 3)) @ normal).max(initial=0.0)
+        )
+        axes = [self.placements[link].rotation.T @ normal for link in (first, second)]
+        is_planar = (
+            deviation < _PARALLEL_TOLERANCE
+            and np.linalg.norm(axes[0] - axes[1]) < _PARALLEL_TOLERANCE
+        )
+        return (
+            ("revolute", _round_direction(axes[0]))
+            if is_planar
+            else ("spherical", (0.0, 0.0, 1.0))
+        )
+
+    def _create_proposal(
+        self, name: str, kind: str, frames: tuple[str, str], axis: Vector, is_named: bool
+    ) -> LoopProposal:
+        return LoopProposal(LoopSpec(name, kind, *frames, axis, ""), self._gap(*frames), is_named)
+
+    def _with_unique_name(
+        self, proposal: LoopProposal, earlier: Sequence[LoopProposal]
+    ) -> LoopProposal:
+        """The proposal under a name that no loop has."""
+        names = {loop.name for loop in self.spec.loops} | {one.loop.name for one in earlier}
+        name, number = proposal.loop.name, 2
+        while name in names:
+            name, number = f"{proposal.loop.name}_{number}", number + 1
+        return replace(proposal, loop=replace(proposal.loop, name=name))
+
+
+def _type_from_name(name: str) -> tuple[str, Vector] | None:
+    """The type that a name says: example-parallel-robots joins frames unless it writes 3D."""
+    if not re.match(r"closed?_?loop", name, re.IGNORECASE):
+        return None
+    return "spherical" if "3d" in name.lower() else "fixed", (0.0, 0.0, 1.0)
+
+
+def _round_direction(axis: Array) -> Vector:
+    """A direction without the rounding of zeros and ones, its largest number positive."""
+    axis = np.round(axis, 9)
+    if axis[np.abs(axis).argmax()] < 0:
+        axis = -axis
+    return to_vector(axis / np.linalg.norm(axis))

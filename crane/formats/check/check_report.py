@@ -1,0 +1,293 @@
+"""The check of a machine: reading, assembling and closing it, and whether its numbers fit."""
+
+import re
+import shlex
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from crane.closure import Closure
+from crane.common.atomic_output import portable_file_name
+from crane.common.errors import CraneWarning
+from crane.common.message_groups import message_kind
+from crane.common.package_search import (
+    check_argument_values,
+    check_package_folders,
+    load_options,
+    use_load_options,
+)
+from crane.description import MachineSpec, set_active_joints
+from crane.description.findings import Findings, collect_findings, error_recovery
+from crane.description.floating_bases import add_floating_base
+from crane.description.machine_lookup import command_line_arguments, find_machine_file
+from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
+from crane.formats.check.circuit_check import flow_shortages, warn_about_circuit
+from crane.formats.check.mechanism_check import check_mechanism
+from crane.formats.check.plausibility_check import warn_about_implausible_values
+from crane.formats.machine_file.machine_reader import read_machine_spec
+from crane.formats.robot_files import is_simulator_file
+from crane.machine.mass_checks import has_mass
+
+# "four_bar.yaml:12: what", or a file that has no line to point at
+_LOCATION_PATTERN = re.compile(
+    r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml|\.sdf)|"
+    r"(?<=\.xacro|\.world)): "
+)
+_MAX_FINDINGS = 500  # findings in a report
+_MAX_SHOWN_KINDS = 14  # kinds of findings on a screen
+_MAX_SHOWN_LOOPS = 8  # proposals on a screen
+_MAX_SHOWN_LINES = 6  # that have a finding of one kind
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong or unusual.
+
+    Attributes:
+        file: Name of the file, without its folder.
+        line: Its line; 0 where it is about the whole file.
+        is_error: Whether it keeps the machine from being loaded.
+        message: What it is, and what to do about it.
+    """
+
+    file: str
+    line: int
+    is_error: bool
+    message: str
+
+    def __str__(self) -> str:
+        location = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{location}: {'error' if self.is_error else 'warning'}: {self.message}"
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What a check found.
+
+    Attributes:
+        findings: By file and line.
+        summary: One line on the machine, None where it cannot be loaded.
+        is_truncated: Whether there was more than is listed.
+        next_command: The command to type next.
+        proposals: Loops that the description seems to leave open.
+        notes: What is worth knowing, and neither wrong nor unusual.
+    """
+
+    findings: tuple[Finding, ...]
+    summary: str | None
+    is_truncated: bool
+    next_command: str
+    proposals: tuple[LoopProposal, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """All of it as the command prints it: what to mend, the machine, and what comes next."""
+        texts = [*self.finding_lines, self.summary, *self.notes, self.counts * bool(self.findings)]
+        return "\n".join(
+            [*filter(None, texts), *self.proposed_loop_lines, f"next: {self.next_command}"]
+        )
+
+    @property
+    def proposed_loop_lines(self) -> list[str]:
+        """The proposed loops as they are pasted into a machine file."""
+        if not self.proposals:
+            return []
+        lines = [f"  {proposal}" for proposal in self.proposals[:_MAX_SHOWN_LOOPS]]
+        more = len(self.proposals) - len(lines)
+        remainder_lines = [f"  # and {more} more, all are written by crane add loops"] * bool(more)
+        return ["loops:  # proposed, nothing closes them yet", *lines, *remainder_lines]
+
+    @property
+    def finding_lines(self) -> list[str]:
+        """One screen: each kind of finding once, with the lines of those like it; errors first."""
+        groups: dict[tuple[str, bool, str], list[Finding]] = {}
+        for finding in sorted(self.findings, key=lambda one: not one.is_error):
+            groups.setdefault(
+                (finding.file, finding.is_error, message_kind(finding.message)), []
+            ).append(finding)
+        lines = [_format_group(some) for some in groups.values()]
+        if len(lines) > _MAX_SHOWN_KINDS:
+            remaining_count = sum(len(some) for some in list(groups.values())[_MAX_SHOWN_KINDS:])
+            lines[_MAX_SHOWN_KINDS:] = [
+                f"{remaining_count} more, of {len(groups) - _MAX_SHOWN_KINDS} other kinds"
+            ]
+        return lines
+
+    @property
+    def errors(self) -> int:
+        """Number of errors."""
+        return sum(finding.is_error for finding in self.findings)
+
+    @property
+    def warnings(self) -> int:
+        """Number of warnings."""
+        return len(self.findings) - self.errors
+
+    @property
+    def status(self) -> int:
+        """Exit status: 2 with errors, 1 with warnings only, else 0."""
+        return 2 if self.errors else 1 if self.findings else 0
+
+    @property
+    def counts(self) -> str:
+        """One line with the number of errors and of warnings."""
+        words = [
+            f"{number or 'no'} {word}{'s' * (number != 1)}"
+            for number, word in ((self.errors, "error"), (self.warnings, "warning"))
+        ]
+        return ", ".join(words) + (
+            "; there is more, mend these first" if self.is_truncated else ""
+        )
+
+
+def check(
+    name: str | Path,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    floating: bool = False,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
+) -> CheckReport:
+    """Read a machine as far as possible, and say all that is wrong or unusual about it.
+
+    The first error that `load` would raise is among the findings.
+
+    Args:
+        name: As for `load`.
+        active: As for `load`.
+        free: As for `load`.
+        floating: As for `load`.
+        packages: As for `load`.
+        arguments: As for `load`.
+
+    Returns:
+        Findings with file and line, a summary, and what to do next; printed as `crane check` does.
+
+    Raises:
+        DescriptionError: There is no such file.
+        InputError: A joint is unknown.
+    """
+    with use_load_options(
+        check_package_folders(packages), check_argument_values(arguments), floating
+    ):
+        return _check_machine(name, active, free, floating)
+
+
+def _check_machine(
+    name: str | Path, active: Sequence[str] | None, free: Sequence[str] | None, floating: bool
+) -> CheckReport:
+    path = find_machine_file(name)
+    spec: MachineSpec | None = None
+    closure: Closure | None = None
+    with warnings.catch_warnings(record=True) as caught, collect_findings() as collected:
+        warnings.simplefilter("always", CraneWarning)
+        with error_recovery():
+            spec = read_machine_spec(path)
+            spec = add_floating_base(spec) if floating else spec
+        if spec is not None and (active is not None or free is not None):
+            with error_recovery():
+                spec = set_active_joints(spec, active, free)
+        if spec is not None:
+            closure = _check_closure(spec, collected)
+        warn_about_implausible_values(collected.parsed_files, spec)
+        if spec is not None:
+            warn_about_circuit(spec)
+    findings = [_parse_finding(str(error), True, path.name) for error in collected.errors]
+    findings += [
+        _parse_finding(str(one.message), False, path.name)
+        for one in caught
+        if issubclass(one.category, CraneWarning)
+    ]
+    summary = None
+    if spec is not None and closure is not None and not collected.errors:
+        summary = _machine_summary(spec, closure)
+    ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.is_error, x.message))
+    is_truncated = collected.is_truncated or len(ordered) > _MAX_FINDINGS
+    open_loops: tuple[LoopProposal, ...] = ()
+    if spec is not None and closure is not None:
+        open_loops = propose_loops(spec, closure.model, closure.home)
+    notes = tuple(flow_shortages(spec)) if spec is not None and summary is not None else ()
+    command_arguments = command_line_arguments(name, active, free)
+    if open_loops and summary is not None:  # driven as the closed machine will be
+        command_arguments = command_line_arguments(
+            name, options=replace(load_options(), floating_root=False)
+        )
+    next_command = _next_command(command_arguments, spec, closure, summary, bool(open_loops))
+    return CheckReport(
+        tuple(ordered[:_MAX_FINDINGS]), summary, is_truncated, next_command, open_loops, notes
+    )
+
+
+def _format_group(findings: list[Finding]) -> str:
+    """Findings of one kind as one line."""
+    other_lines = [str(one.line) for one in findings[1:] if one.line]
+    if len(findings) == 1:
+        return str(findings[0])
+    dots = ["..."] if len(other_lines) > _MAX_SHOWN_LINES else []
+    lines = f", lines {', '.join(other_lines[:_MAX_SHOWN_LINES] + dots)}" if other_lines else ""
+    return f"{findings[0]} ({len(findings)} such{lines})"
+
+
+def _next_command(
+    command_arguments: str,
+    spec: MachineSpec | None,
+    closure: Closure | None,
+    summary: str | None,
+    is_open: bool,
+) -> str:
+    """What to type next, with a machine as `command_line_arguments` has it."""
+    if spec is None or closure is None or summary is None:
+        return f"crane check {command_arguments} again, once the errors are mended"
+    if is_open:
+        return f"crane add loops {command_arguments}"
+    if closure.home_search is not None and is_simulator_file(spec.path):
+        return f"crane convert {command_arguments} {portable_file_name(spec.name)}"
+    if closure.home_search is not None:
+        return f"crane check {command_arguments} --write-home"
+    if not has_mass(closure.model):
+        return f"crane live {command_arguments}"
+    for task in spec.tasks.values():
+        return (
+            f"crane simulate {command_arguments} --task {shlex.quote(task.name)} --out "
+            f"{portable_file_name(task.name)}"
+        )
+    return f"crane simulate {command_arguments} --duration 2 --out {portable_file_name(spec.name)}"
+
+
+def _check_closure(spec: MachineSpec, findings: Findings) -> Closure | None:
+    """The closure of what was read, None where what is wrong with it forbids one."""
+    if not findings.can_be_assembled:
+        return None
+    with error_recovery():
+        return check_mechanism(spec, findings)
+    return None
+
+
+def _parse_finding(message: str, is_error: bool, file: str) -> Finding:
+    message = _replace_unprintable(message)
+    location = _LOCATION_PATTERN.match(message)
+    if location is None:
+        return Finding(_replace_unprintable(file), 0, is_error, message)
+    problem = message[location.end() :]
+    return Finding(Path(location["file"]).name, int(location["line"] or 0), is_error, problem)
+
+
+def _replace_unprintable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _machine_summary(spec: MachineSpec, closure: Closure) -> str:
+    residual = float(closure.residual(closure.home))
+    joints, mobility = closure.model.njoints - 1, closure.degrees_of_freedom
+    frame_element_count = sum(x.between is not None for x in spec.force_elements)
+    elements_text = (
+        f"{frame_element_count} element{'s' * (frame_element_count > 1)} between frames, "
+        if frame_element_count
+        else ""
+    )
+    return (
+        f"{_replace_unprintable(spec.name)}: {joints} joints, {len(spec.loops)} loops, "
+        f"{mobility} degrees of "
+        f"freedom, {elements_text}loops closed to {residual:.1e} m at home"
+    )

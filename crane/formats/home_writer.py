@@ -1,0 +1,275 @@
+"""The home posture written into the file of a machine, whose other text stays as it is."""
+
+import re
+import shutil
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from xml.parsers import expat
+
+import numpy as np
+import yaml
+
+from crane.common.atomic_output import check_file_is_writable, replace_file
+from crane.common.errors import CraneError, CraneWarning, OutputError
+from crane.common.package_search import NEAREST_ASSEMBLY
+from crane.description.machine_lookup import bundled_machines, example_robots
+from crane.formats.machine_loading import load
+from crane.formats.robot_files import is_sdf_file, is_simulator_file
+from crane.machine import Machine
+
+TextEdit = tuple[int, int, str]  # from, to, what stands there then
+
+_SAME_HOME_TOLERANCE = 1e-9
+_TAG_PATTERN = re.compile(r"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
+_VALUE_PATTERN = re.compile(r"""(?<=\s)value\s*=\s*(?:"[^"]*"|'[^']*')""")
+
+
+def write_home(
+    name: str | Path,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
+) -> Path:
+    """Write the closed home posture of a machine into its file, all joints in full digits.
+
+    That also takes over an assembly that is far from what the file says, which `load` refuses.
+    A machine file and a robot.yaml get it under `home:`, a URDF in `<group_state name="home">`.
+    Numbers that stand there are replaced, joints that are missing are added; comments stay. A file
+    that does not give the same home when it is loaded again gets its old text back.
+
+    Args:
+        name: As for `load`.
+        active: As for `load`.
+        free: As for `load`.
+        packages: As for `load`.
+        arguments: As for `load`.
+
+    Returns:
+        The file.
+
+    Raises:
+        OutputError: The file belongs to a package, is a MJCF, or cannot be written.
+        CraneError: As `load`.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        lenient_arguments = {**(arguments or {}), NEAREST_ASSEMBLY: True}
+        machine = load(
+            name, active=active, free=free, packages=packages, arguments=lenient_arguments
+        )
+        path = machine.path.resolve()
+        _check_is_writable(machine, path)
+        try:
+            text = path.read_bytes().decode("utf-8")
+        except UnicodeDecodeError:
+            raise OutputError(f"{path}: is not UTF-8, save it so first") from None
+        home = dict(zip(machine.joints, machine.home.tolist(), strict=True))
+        is_urdf = path.suffix.lower() not in (".yaml", ".yml")
+        _replace_text(
+            path,
+            _apply_edits(text, _xml_edits(text, home) if is_urdf else _yaml_edits(text, home)),
+        )
+        try:
+            _check_written_home(path, machine)
+        except CraneError:
+            _replace_text(path, text)
+            raise
+    return path
+
+
+def _replace_text(path: Path, text: str) -> None:
+    with replace_file(path) as temporary_file:
+        temporary_file.write_bytes(text.encode("utf-8"))
+        shutil.copymode(path, temporary_file)
+
+
+def _file_arguments(machine: Machine) -> dict[str, str]:
+    """Those of its file, without the one that takes whatever home was found."""
+    return {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
+
+
+def _check_is_writable(machine: Machine, path: Path) -> None:
+    sought = machine.closure.home_search
+    if sought is None or not sought.is_far:
+        machine = replace(machine, arguments=MappingProxyType(_file_arguments(machine)))
+    copy_hint = f"write it into a copy: crane convert {machine.command_line_arguments} FOLDER"
+    packaged_files = {
+        place.resolve() for place in (*bundled_machines().values(), *example_robots().values())
+    }
+    if path in packaged_files:
+        raise OutputError(f"{path}: belongs to a package, {copy_hint}")
+    if is_simulator_file(path):
+        kind = "an SDF" if is_sdf_file(path) else "a MJCF"
+        raise OutputError(f"{path}: is {kind}, {copy_hint}")
+    check_file_is_writable(path)
+
+
+def _check_written_home(path: Path, expected: Machine) -> None:
+    """Load the file that was written, and compare."""
+    try:
+        machine = load(
+            path,
+            active=expected.chosen_joints.get("active"),
+            free=expected.chosen_joints.get("free"),
+            packages=expected.packages,
+            arguments=_file_arguments(expected),
+        )
+    except CraneError as error:
+        raise OutputError(f"{path}: home cannot be written into it ({error})") from None
+    is_same = machine.joints == expected.joints and machine.closure.home_search is None
+    if not is_same or np.abs(machine.home - expected.home).max(initial=0.0) > _SAME_HOME_TOLERANCE:
+        coordinates = zip(expected.joints, expected.home.tolist(), strict=True)
+        raise OutputError(
+            f"{path}: home is read differently than written into it, write it by hand: "
+            + ", ".join(f"{joint}: {value!r}" for joint, value in coordinates)
+        )
+
+
+def _apply_edits(text: str, edits: list[TextEdit]) -> str:
+    for start, end, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[end:]
+    return text
+
+
+# --- YAML ------------------------------------------------------------------------------------
+
+
+def _yaml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
+    """Edits of a machine file or robot.yaml."""
+    bom = text.startswith("\ufeff")
+    line_break = "\r\n" if "\r\n" in text else "\n"
+    top = yaml.compose(text[bom:], yaml.SafeLoader)
+    assert isinstance(top, yaml.MappingNode), "it was read before"
+    home_node = next((value for key, value in top.value if key.value == "home"), None)
+    if home_node is not None:
+        edits = _mapping_edits(text[bom:], home_node, home, line_break)
+    elif top.flow_style:
+        edits = [(top.end_mark.index - 1,) * 2 + (f", home: {{{_flow_text(home)}}}",)]
+    else:
+        end = top.end_mark.index
+        separator = "" if text[bom:][:end].endswith("\n") else line_break
+        edits = [(end, end, f"{separator}home:{_block_text(home, '  ', line_break)}{line_break}")]
+    return [(start + bom, end + bom, new) for start, end, new in edits]
+
+
+def _mapping_edits(
+    text: str, home_node: yaml.MappingNode, home: Mapping[str, float], line_break: str
+) -> list[TextEdit]:
+    span = range(home_node.start_mark.index, home_node.end_mark.index)
+    has_shared_values = any(value.start_mark.index not in span for _, value in home_node.value)
+    if has_shared_values or "&" in text[span.start : span.stop]:
+        raise OutputError(
+            "'home' shares values with other keys (&, *), write its numbers out first"
+        )
+    edits: list[TextEdit] = [
+        (value.start_mark.index, value.end_mark.index, _yaml_number(home[key.value]))
+        for key, value in home_node.value
+    ]
+    missing = {
+        joint: home[joint] for joint in home if joint not in {k.value for k, _ in home_node.value}
+    }
+    if not missing:
+        return edits
+    if home_node.flow_style:
+        comma = ", " if home_node.value else ""
+        end = text.rindex("}", 0, home_node.end_mark.index)
+        return [*edits, (end, end, comma + _flow_text(missing))]
+    key, last = home_node.value[-1]
+    after = text.find("\n", last.end_mark.index)
+    end = len(text) if after < 0 else after - text[:after].endswith("\r")
+    return [*edits, (end, end, _block_text(missing, " " * key.start_mark.column, line_break))]
+
+
+def _block_text(home: Mapping[str, float], indent: str, line_break: str) -> str:
+    return "".join(
+        f"{line_break}{indent}{_yaml_name(x)}: {_yaml_number(value)}" for x, value in home.items()
+    )
+
+
+def _flow_text(home: Mapping[str, float]) -> str:
+    return ", ".join(
+        f"{_yaml_name(joint)}: {_yaml_number(value)}" for joint, value in home.items()
+    )
+
+
+def _yaml_name(joint: str) -> str:
+    return str(yaml.safe_dump([joint], default_flow_style=True, width=10**6)).strip()[1:-1]
+
+
+def _yaml_number(value: float) -> str:
+    return str(yaml.safe_dump(value)).split("\n", 1)[0]
+
+
+# --- XML -------------------------------------------------------------------------------------
+
+
+def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
+    """Edits of a URDF."""
+    data = text.encode("utf-8")
+    line_break = "\r\n" if "\r\n" in text else "\n"
+    home_elements: list[tuple[int, int]] = []  # where a state's start tag begins, and its end tag
+    joints: dict[str, int] = {}
+    is_home_element: list[bool] = []  # whether an element on the way down is a state of home
+    end = 0
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        name = attributes.get("name", "").strip()
+        if is_home_element and is_home_element[-1] and tag == "joint":
+            joints[name] = parser.CurrentByteIndex
+        is_home_element.append(
+            len(is_home_element) == 1 and tag == "group_state" and name == "home"
+        )
+        if is_home_element[-1]:
+            home_elements.append((parser.CurrentByteIndex, -1))
+
+    def finish(_: str) -> None:
+        nonlocal end
+        if is_home_element.pop():
+            home_elements[-1] = (home_elements[-1][0], parser.CurrentByteIndex)
+        end = parser.CurrentByteIndex
+
+    parser.StartElementHandler, parser.EndElementHandler = start, finish
+    parser.Parse(data, True)
+
+    def place(index: int) -> int:
+        return len(data[:index].decode("utf-8"))
+
+    edits = [_value_edit(text, place(joints[joint]), home[joint]) for joint in joints]
+    missing = {joint: home[joint] for joint in home if joint not in joints}
+    if not missing:
+        return edits
+    if not home_elements:
+        new_element = (
+            f'  <group_state name="home" group="all">{_joint_elements(missing, line_break)}'
+        )
+        return [*edits, (*(place(end),) * 2, f"{new_element}  </group_state>{line_break}")]
+    first, last = map(place, home_elements[0])
+    tag = _TAG_PATTERN.match(text, first)
+    assert tag is not None, "it was parsed"
+    if tag[0].endswith("/>"):
+        new = f"{tag[0][:-2].rstrip()}>{_joint_elements(missing, line_break)}  </group_state>"
+        return [*edits, (tag.start(), tag.end(), new)]
+    return [*edits, (last, last, f"{_joint_elements(missing, line_break).lstrip()}  ")]
+
+
+def _value_edit(text: str, position: int, value: float) -> TextEdit:
+    """The edit of the value in a `<joint>` tag."""
+    tag = _TAG_PATTERN.match(text, position)
+    old = None if tag is None else _VALUE_PATTERN.search(text, tag.start(), tag.end())
+    assert old is not None, "it was read before"
+    return old.start(), old.end(), f'value="{value!r}"'
+
+
+def _joint_elements(home: Mapping[str, float], line_break: str) -> str:
+    from xml.sax.saxutils import quoteattr  # which imports what the network needs
+
+    tags = (
+        f'    <joint name={quoteattr(x)} value="{value!r}"/>{line_break}'
+        for x, value in home.items()
+    )
+    return line_break + "".join(tags)

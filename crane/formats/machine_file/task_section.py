@@ -1,0 +1,250 @@
+"""The section `tasks` of a machine file."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from crane.description.findings import UnknownNames, error_recovery, report_error
+from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES, Task, ViaPoint
+from crane.formats.machine_file.external_force_sections import read_loads
+from crane.formats.machine_file.phase_section import read_phased_task
+from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.yaml_section import YamlSection
+
+_MOTION_KEYS = "'tip', 'active', 'via', 'joystick', 'phases'"
+
+
+def read_tasks(
+    top: YamlSection,
+    tree: TreeBuilder,
+    active: tuple[str, ...],
+    tip: str | None,
+    valves: tuple[str, ...],
+    home: dict[str, float],
+) -> dict[str, Task]:
+    """Named motions.
+
+    Raises:
+        DescriptionError: With file, line, and what is wrong.
+    """
+    tasks = {}
+    keys = (
+        "description", "duration", "tip", "active", "via", "joystick", "phases", "ramp", "start",
+        "loads",
+    )  # fmt: skip
+    for name, item in top.mappings("tasks", "task", *keys):
+        with error_recovery():
+            spaces = {"tip": TIP_COORDINATES, "active": active, "joystick": valves}
+            has_phases = "phases" in item
+            lever_key = "phases" if has_phases else "joystick"
+            if lever_key in item and not valves:
+                problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
+                raise item.error_at(lever_key, problem)
+            if has_phases:
+                task = read_phased_task(
+                    name, item, _read_start(name, item, active), valves, tree, home
+                )
+            else:
+                task = _read_task(name, item, spaces, tip)
+            tasks[name] = dataclasses.replace(
+                task, loads=tuple(read_loads(item, tree, has_phases))
+            )
+    return tasks
+
+
+def _read_task(
+    name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
+) -> Task:
+    """A task of one of the spaces, each of which is given with the names of its coordinates."""
+    if "ramp" in item:
+        raise item.error_at("ramp", f"task '{name}' has no phases, leave 'ramp' to these")
+    if "via" in item:
+        return _read_via_task(name, item, spaces, tip)
+    duration = item.number("duration", minimum=0.0)
+    if duration == 0:
+        report_error(item.error_at("duration", f"task '{name}' takes no time, give a duration"))
+    given_motions = [
+        (space, section)
+        for space in spaces
+        if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
+    ]
+    if len(given_motions) != 1:
+        count = "more than one" if given_motions else "none"
+        raise item.error_at(None, f"task '{name}' has {count} of {_MOTION_KEYS}, give one")
+    space, motion = given_motions[0]
+    if space == "tip":
+        _check_has_tip(name, item, "tip", tip)
+    if not isinstance(spaces[space], UnknownNames):
+        motion.check_keys(*spaces[space])
+    description = item.text("description", "")
+    if space == "joystick":
+        start = _read_start(name, item, spaces["active"])
+        return Task(
+            name, description, duration, space, {}, _read_levers(motion, duration), start=start
+        )
+    if "start" in item:
+        raise item.error_at(
+            "start", f"task '{name}' starts where its motion does, leave 'start' to levers"
+        )
+    return Task(name, description, duration, space, _read_polynomials(motion, spaces[space]))
+
+
+def _check_has_tip(name: str, item: YamlSection, key: str, tip: str | None) -> None:
+    if tip is None:
+        raise item.error_at(key, f"task '{name}' moves the tip, name its frame under 'tip:'")
+
+
+def _read_start(name: str, item: YamlSection, active: tuple[str, ...]) -> dict[str, float]:
+    """Active coordinates where levers begin."""
+    section = item.section("start", f"'start' of task '{name}'")
+    if section is None:
+        return {}
+    if not isinstance(active, UnknownNames):
+        section.check_keys(*active)
+    return {joint: section.number(joint) for joint in section}
+
+
+def _read_via_task(
+    name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
+) -> Task:
+    """A task through points, in the space of the coordinates that these name."""
+    for key in ("tip", "active", "joystick"):
+        if key in item:
+            raise item.error_at(
+                key, f"task '{name}' has more than one of {_MOTION_KEYS}, give one"
+            )
+    for key, why in {"duration": "ends at its last point", "start": "starts at its first"}.items():
+        if key in item:
+            raise item.error_at(key, f"task '{name}' {why}, leave '{key}' out")
+    active, attitude = spaces["active"], tuple(x for group in ATTITUDE_COORDINATES for x in group)
+    coordinate_names = active
+    if not isinstance(active, UnknownNames):
+        coordinate_names = (
+            *active,
+            *(x for x in (*TIP_COORDINATES, *attitude) if x not in active),
+        )
+    title = f"via point of task '{name}'"
+    keys = () if isinstance(active, UnknownNames) else ("time", "rates", *coordinate_names)
+    points = list(item.sections("via", title, *keys))
+    if len(points) < 2:
+        raise item.error_at(
+            "via", f"task '{name}' has {len(points)} via points, give two at least"
+        )
+    via_points = [_read_via_point(point, title, coordinate_names) for point in points]
+    point_of_coordinate = {
+        x: point for point, one in zip(points, via_points, strict=True) for x in one.point
+    }
+    joint_names = [x for x in point_of_coordinate if x in active]
+    if joint_names and len(joint_names) < len(point_of_coordinate):
+        other = next(x for x in point_of_coordinate if x not in active)
+        problem = f"task '{name}' mixes '{joint_names[0]}' with '{other}', name joints or x, y, z"
+        raise point_of_coordinate[other].error_at(other, problem)
+    for previous, via_point, point in zip(via_points, via_points[1:], points[1:], strict=False):
+        if via_point.time <= previous.time:
+            problem = f"times of task '{name}' go from {previous.time:g} to {via_point.time:g} s"
+            raise point.error_at("time", f"{problem}, let them increase")
+    if via_points[0].time != 0:
+        problem = (
+            f"task '{name}' begins at {via_points[0].time:g} s, give its first point the time 0"
+        )
+        raise points[0].error_at("time", problem)
+    space, required = "active", active
+    if not joint_names:
+        _check_has_tip(name, item, "via", tip)
+        space = "tip"
+        required = (
+            *TIP_COORDINATES,
+            *_attitude_coordinates(
+                name, point_of_coordinate, list(zip(points, via_points, strict=True))
+            ),
+        )
+    for point, via_point, which in (
+        (points[0], via_points[0], "first"),
+        (points[-1], via_points[-1], "last"),
+    ):
+        missing = [x for x in required if x not in via_point.point]
+        if missing:
+            raise point.error_at(None, f"the {which} {title} has no '{missing[0]}', add it")
+    ordered = tuple(
+        ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
+        for one in via_points
+    )
+    return Task(name, item.text("description", ""), via_points[-1].time, space, {}, via=ordered)
+
+
+def _read_via_point(point: YamlSection, title: str, coordinate_names: tuple[str, ...]) -> ViaPoint:
+    """A via point with the coordinates that it names."""
+    time = point.number("time", minimum=0.0)
+    coordinates = {x: point.number(x) for x in point if x not in ("time", "rates")}
+    if not coordinates:
+        raise point.error_at(None, f"a {title} has no coordinate, name some")
+    rates = point.section("rates", f"'rates' of a {title}")
+    if rates is None:
+        return ViaPoint(time, coordinates)
+    if not isinstance(coordinate_names, UnknownNames):
+        rates.check_keys(*(x for x in coordinate_names if x in coordinates))
+    return ViaPoint(time, coordinates, {x: rates.number(x) for x in rates})
+
+
+def _attitude_coordinates(
+    name: str,
+    point_of_coordinate: dict[str, YamlSection],
+    points: Sequence[tuple[YamlSection, ViaPoint]],
+) -> tuple[str, ...]:
+    """Coordinates of the attitude that the points of a task name."""
+    groups = [
+        group for group in ATTITUDE_COORDINATES if any(x in point_of_coordinate for x in group)
+    ]
+    if not groups:
+        return ()
+    if len(groups) > 1:
+        problem = f"task '{name}' has an inclination and roll, pitch, yaw, give one of both"
+        raise point_of_coordinate["inclination"].error_at("inclination", problem)
+    for point, via in points:
+        for values in (via.point, via.rates):
+            if 0 < sum(x in values for x in groups[0]) < len(groups[0]):
+                x = next(x for x in groups[0] if x in values)
+                problem = f"task '{name}' has '{x}' without the others of roll, pitch, yaw"
+                raise point.error_at(x if values is via.point else "rates", f"{problem}, add them")
+    return groups[0]
+
+
+def _read_polynomials(
+    section: YamlSection, names: tuple[str, ...]
+) -> dict[str, tuple[float, ...]]:
+    found = {}
+    for name in names:
+        with error_recovery():
+            found[name] = section.numbers(name)
+    return found
+
+
+def _read_levers(
+    section: YamlSection, duration: float
+) -> dict[str, tuple[tuple[float, float], ...]]:
+    found = {}
+    for joint in section:
+        with error_recovery():
+            found[joint] = _read_lever(section, joint, duration)
+    return found
+
+
+def _read_lever(
+    section: YamlSection, joint: str, duration: float
+) -> tuple[tuple[float, float], ...]:
+    """A polygon [time, lever, time, lever, ...]."""
+    numbers = section.numbers(joint)
+    times, levers = numbers[::2], numbers[1::2]
+    if len(times) != len(levers):
+        raise section.error_at(
+            joint, f"'{joint}' has {len(numbers)} numbers, give time, lever, time .."
+        )
+    is_increasing = all(a < b for a, b in zip(times, times[1:], strict=False))
+    if not is_increasing or times[0] < 0 or times[-1] > duration:
+        raise section.error_at(
+            joint, f"times of '{joint}' do not increase within 0 to {duration:g} s"
+        )
+    if max(map(abs, levers)) > 1:
+        raise section.error_at(
+            joint, f"a lever of '{joint}' is beyond -1 to 1, the valve's whole flow"
+        )
+    return tuple(zip(times, levers, strict=True))

@@ -1,0 +1,337 @@
+"""From a description to a machine."""
+
+import json
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from weakref import WeakKeyDictionary
+
+import pinocchio as pin
+
+from crane.closure import Closure
+from crane.closure.constraint_structure import OpenLoopError
+from crane.common.errors import CraneWarning, DescriptionError, InputError
+from crane.common.message_groups import summarize_warnings
+from crane.common.package_search import (
+    check_argument_values,
+    check_package_folders,
+    use_load_options,
+)
+from crane.description import (
+    Coupling,
+    LoopSpec,
+    MachineSpec,
+    apply_parameter_changes,
+    lock_joints,
+    parameters,
+    set_active_joints,
+)
+from crane.description.floating_bases import add_floating_base, check_freedoms
+from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_file
+from crane.formats.assembly_warnings import warn_about_assembly_modes
+from crane.formats.home_warnings import add_remedy, check_home
+from crane.formats.machine_file.machine_reader import read_machine_spec
+from crane.machine.drive_selection import select_free_joints, select_motors
+from crane.machine.frame_element_checks import check_frame_elements
+from crane.machine.machine import Machine, read_only_copy
+from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
+from crane.machine.mass_checks import check_masses, replace_infeasible_inertias
+
+
+def load(
+    name: str | Path,
+    changes: Mapping[str, float] | None = None,
+    lock: Mapping[str, float] | None = None,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    floating: bool | Sequence[str] = False,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
+    strict: bool = False,
+) -> Machine:
+    """Load a machine, perhaps with some of its numbers changed, or joints locked.
+
+    Args:
+        name: A bundled machine's name, a robot of example-robot-data by its file's name, or the
+            path of a machine file (.yaml), URDF (.urdf, .xacro, with `<loop>` elements if it has
+            loops), SDF (.sdf, .world) or MJCF (.xml).
+        changes: New values by the names of `crane.description.parameters`, such as
+            {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
+        lock: Coordinates [m], [rad] of joints to be fixed, by name.
+        active: Driven joints in the order of q_A, if not those of the file. Where there are more
+            than degrees of freedom, all of them are drives, see `Dynamics.drive_forces`.
+        free: Coordinates that nothing drives, if not those of the file. What the active joints
+            leave open is free anyway, with a warning.
+        floating: Whether the root floats instead of standing on the ground: a vehicle, a humanoid.
+            Its six freedoms, base_x to base_rz, are free, see `crane.description.floating_bases`;
+            of some freedoms their names, such as ("z", "ry") for one that heaves and pitches.
+        packages: Folders of the packages that files name by `package://`, `model://` and
+            `$(find ...)`, or folders in which these are, see `crane.common.package_search`.
+        arguments: Values of the arguments of a xacro file; `model` of an SDF with several models;
+            `urdf_constraint`, true where a URDF's `<constraint>` elements, as proposed upstream,
+            are to be read as loops, see `crane.formats.urdf.constraint_elements`;
+            `nearest_assembly`, true to take an assembly that is far from the home that a file
+            says.
+        strict: Whether to refuse, as `check` does, what can be computed with in spite of its
+            form: inertias that no body has, see `crane.machine.mass_checks`.
+
+    Returns:
+        The machine, its home posture closed.
+
+    Raises:
+        DescriptionError: A file is wrong; the message has file and line.
+        MechanismError: The parts do not make a machine that can be driven.
+        InputError: A change of a parameter that is not there, or to what cannot be.
+    """
+    package_paths, values = check_package_folders(packages), check_argument_values(arguments)
+    floating = floating if isinstance(floating, bool) else check_freedoms(floating)
+    with (
+        summarize_warnings(),
+        use_load_options(package_paths, values, bool(floating), strict) as options,
+    ):
+        machine = _load_machine(name, changes, lock, active, free, floating)
+        return replace(
+            machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
+        )
+
+
+ClosureProvider = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
+_MAX_KNOWN_CLOSURES = (
+    3  # closures of variants: what is looked at beside one shares its loops or has its own
+)
+# What machines were made of before changes and locks, so that `MachineVariants` need not read it
+# again.
+_SPEC_BEFORE_CHANGES: WeakKeyDictionary[Closure, MachineSpec] = WeakKeyDictionary()
+
+
+class MachineVariants:
+    """The machines that differ from one in their numbers alone.
+
+    Its files are not read again, unless its loops were closed anew since it was loaded.
+
+    Args:
+        machine: As it was loaded; what was put onto it or replaced since is not in its files.
+
+    Attributes:
+        spec: Its description, with its own changes.
+        parameters: Its numbers by name, see `crane.description.parameters`.
+    """
+
+    def __init__(self, machine: Machine):
+        self._machine = machine
+        with summarize_warnings(), self._load_options():
+            spec_before_changes = _SPEC_BEFORE_CHANGES.get(machine.closure) or _read_spec(
+                machine.load_name,
+                machine.chosen_joints.get("active"),
+                machine.chosen_joints.get("free"),
+                machine.floating_base,
+            )
+            self.spec = apply_parameter_changes(spec_before_changes, machine.parameter_changes)
+        # of a payload the description does not say that it is one
+        self.values = parameters(self.spec) | dict(machine.parameter_changes)
+        self._spec_before_changes = spec_before_changes
+        self._known_closures = [machine.closure] if machine.closure in _SPEC_BEFORE_CHANGES else []
+
+    def machine(self, changes: Mapping[str, float]) -> Machine:
+        """The machine with some of its numbers changed, see `load`."""
+        known_closures = self._known_closures
+        variant = self._build_variant(changes, lambda *tree: _reuse_closure(known_closures, *tree))
+        if all(variant.closure.structure is not closure.structure for closure in known_closures):
+            self._known_closures = [variant.closure, *known_closures][:_MAX_KNOWN_CLOSURES]
+        return variant
+
+    def perturbed_machine(self, changes: Mapping[str, float]) -> Machine:
+        """The machine with numbers changed so little that its loops are the same.
+
+        A look at its numbers, of which nothing is told: see `Closure.perturbed_machine`.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CraneWarning)
+            return self._build_variant(changes, self._machine.closure.with_perturbed_model)
+
+    def _build_variant(
+        self, changes: Mapping[str, float], closure_provider: ClosureProvider
+    ) -> Machine:
+        original, all_changes = self._machine, {**self._machine.parameter_changes, **changes}
+        chosen_joints = original.chosen_joints.get("active"), original.chosen_joints.get("free")
+        with summarize_warnings(), self._load_options():
+            variant = _assemble_machine(
+                self._spec_before_changes,
+                all_changes,
+                original.locked_joints,
+                *chosen_joints,
+                original.floating_base,
+                closure_provider,
+            )
+        return replace(variant, packages=original.packages, arguments=original.arguments)
+
+    def _load_options(self) -> AbstractContextManager[object]:
+        original = self._machine
+        folders, parameters = (
+            check_package_folders(original.packages),
+            check_argument_values(original.arguments),
+        )
+        return use_load_options(folders, parameters, bool(original.floating_base))
+
+
+def _load_machine(
+    name: str | Path,
+    changes: Mapping[str, float] | None,
+    lock: Mapping[str, float] | None,
+    active: Sequence[str] | None,
+    free: Sequence[str] | None,
+    floating: bool | tuple[str, ...],
+) -> Machine:
+    spec = _read_spec(name, active, free, floating)
+    return _assemble_machine(spec, changes, lock, active, free, floating)
+
+
+def _read_spec(
+    name: str | Path,
+    active: Sequence[str] | None,
+    free: Sequence[str] | None,
+    floating: bool | tuple[str, ...],
+) -> MachineSpec:
+    spec = add_floating_base(read_machine_spec(name), floating)
+    if active is not None or free is not None:
+        spec = set_active_joints(
+            spec, _check_joint_list(active, "active"), _check_joint_list(free, "free")
+        )
+    return spec
+
+
+def _assemble_machine(
+    spec: MachineSpec,
+    changes: Mapping[str, float] | None,
+    lock: Mapping[str, float] | None,
+    active: Sequence[str] | None,
+    free: Sequence[str] | None,
+    floating: bool | tuple[str, ...],
+    closure_provider: ClosureProvider = lambda *_: None,
+) -> Machine:
+    chosen_joints, spec_before_changes = {"active": active, "free": free}, spec
+    if changes:
+        spec = apply_parameter_changes(spec, changes)
+    if lock:
+        spec = lock_joints(spec, lock)
+    model = assemble_tree(spec)
+    closure = closure_provider(model, spec.loops, spec.couplings) or _build_closure(
+        spec, model, bool(changes or lock)
+    )
+    _SPEC_BEFORE_CHANGES[closure] = spec_before_changes
+    spec, model = replace_infeasible_inertias(spec, model, closure)
+    check_masses(spec, model, closure)
+    check_frame_elements(spec, closure)
+    coordinates = closure.equations.coordinates
+    lower, upper = coordinates.lower, coordinates.upper
+    machine = Machine(
+        name=spec.name,
+        source=spec.source,
+        path=spec.path,
+        chains=spec.chains,
+        tree=spec.tree,
+        model=model,
+        closure=closure,
+        active=closure.active_names,
+        lower=read_only_copy(lower[closure.active]),
+        upper=read_only_copy(upper[closure.active]),
+        friction=MappingProxyType(dict(spec.friction)),
+        forces=spec.forces,
+        gas_springs=spec.gas_springs,
+        ropes=spec.ropes,
+        end_stops=spec.end_stops,
+        estimation=spec.estimation,
+        tip=spec.tip,
+        tasks=MappingProxyType(dict(spec.tasks)),
+        control=MappingProxyType(dict(spec.control)),
+        hydraulics=spec.hydraulics,
+        sensors=MappingProxyType(dict(spec.sensors)),
+        chosen_joints=MappingProxyType(
+            {key: tuple(names) for key, names in chosen_joints.items() if names is not None}
+        ),
+        floating_base=floating,
+        packages=(),
+        arguments=MappingProxyType({}),
+        parameter_changes=MappingProxyType(
+            {name: float(value) for name, value in (changes or {}).items()}
+        ),
+        free=select_free_joints(spec, closure.active_names),
+        external_forces=(),
+        supports=spec.supports,
+        pin_capacities=MappingProxyType(dict(spec.pin_capacities)),
+        explicit_drives=select_motors(spec, closure.active_names),
+        locked_joints=MappingProxyType(
+            {name: float(value) for name, value in (lock or {}).items()}
+        ),
+    )
+    return machine.with_external_forces(*spec.external_forces) if spec.external_forces else machine
+
+
+def _reuse_closure(
+    closures: Sequence[Closure],
+    model: pin.Model,
+    loops: Sequence[LoopSpec],
+    couplings: Sequence[Coupling],
+) -> Closure | None:
+    """One of some closures if the tree is at the same places as its own."""
+    variants = (closure.with_other_masses(model, loops, couplings) for closure in closures)
+    return next((closure for closure in variants if closure is not None), None)
+
+
+def _build_closure(spec: MachineSpec, model: pin.Model, is_modified: bool) -> Closure:
+    initial_guess = home_initial_guess(spec, model)
+    try:
+        closure = build_closure(spec, model, initial_guess)
+    except OpenLoopError as error:
+        raise error if is_modified else add_remedy(spec, model, initial_guess, error) from None
+    check_home(spec, closure, initial_guess, is_modified)
+    warn_about_assembly_modes(spec, closure, initial_guess)
+    return closure
+
+
+def _check_joint_list(joints: object, label: str) -> Sequence[str] | None:
+    if joints is None:
+        return None
+    if isinstance(joints, str) or not isinstance(joints, Sequence):
+        raise InputError(f"{label} is {joints!r}, give a list of joints such as ['lift', 'tilt']")
+    return tuple(map(str, joints))
+
+
+def load_from_expression(expression: str) -> Machine:
+    """Load a machine by what `Machine.expression` says of it.
+
+    Raises:
+        InputError: It says nothing that can be understood; otherwise as `load`.
+    """
+    try:
+        find_machine_file(expression)
+    except DescriptionError:
+        if CHANGES_SEPARATOR not in expression:
+            raise
+    else:
+        return load(expression)  # a path may hold anything
+    name, _, text = expression.partition(CHANGES_SEPARATOR)
+    try:
+        options = json.loads(text)
+        changes, lock = (
+            {key: float(value) for key, value in options.pop(kind, {}).items()}
+            for kind in ("changes", "lock")
+        )
+        active, free = (
+            [str(joint) for joint in options.pop(kind)] if kind in options else None
+            for kind in ("active", "free")
+        )
+        floating = options.pop("floating", False)
+        packages = [str(folder) for folder in options.pop("packages", [])]
+        arguments = {key: str(value) for key, value in options.pop("arguments", {}).items()}
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        options = {"": None}
+    if options:
+        example = '{"changes": {"payload.mass": 200}, "lock": {"slew": 0}}'
+        raise InputError(
+            f"'{expression}' names no machine, write NAME{CHANGES_SEPARATOR}{example}"
+        )
+    return load(name, changes, lock, active, free, floating, packages, arguments)

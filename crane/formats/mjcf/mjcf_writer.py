@@ -1,0 +1,387 @@
+"""A MJCF file for MuJoCo."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import CraneWarning, InputError
+from crane.description import Coupling, Drive, ForceElement, LoopSpec, Rope
+from crane.description.specification import element_name
+from crane.formats.urdf_output import (
+    finite_limits,
+    format_document,
+    format_numbers,
+    origin_text,
+    solve_coupling,
+    unsupported_friction,
+    unsupported_sections,
+    warn_about_unsupported,
+)
+from crane.machine import Machine
+
+_HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that make a hinge
+_ROUNDING_TOLERANCE = 1e-9  # share of an inertia that counts as rounding
+_MIN_MOMENT = 1e-14  # [kg m2] moment of inertia that MuJoCo still takes
+
+
+def write_mjcf(machine: Machine, path: str | Path) -> None:
+    """Write a machine as a MJCF file with equality constraints between sites.
+
+    Spherical loops become `connect`, fixed ones `weld`, revolute ones two `connect` at points of
+    the axis; couplings `joint`, of more than two joints `tendon`. Drives have a motor each, by a
+    fixed tendon where they act along more than one joint; where drives are not the active joints,
+    a text names these. Frames are sites, the home posture is the key "home". Coulomb and viscous
+    friction, springs and rotor inertias are there; the damping of force elements on joints becomes
+    viscous friction; force elements and ropes between frames are spatial tendons. A warning names
+    what else is left out. There are no shapes, so nothing collides.
+
+    Args:
+        machine: The machine, as it is: with its changes, locks and payload.
+        path: The file, .xml.
+
+    Raises:
+        InputError: A loop or a joint is of a kind that MJCF has not.
+        OutputError: It cannot be written.
+    """
+    writer = _MjcfWriter(machine)
+    content = writer.build_content()
+    with replace_file(path) as temporary_file:
+        temporary_file.write_bytes(content)
+    unsupported = unsupported_friction(machine) + unsupported_sections(machine)
+    floating = [
+        machine.joints[column + i]
+        for column in machine.coordinates.floating_base_columns
+        for i in range(6)
+    ]
+    unsupported += [f"the friction of {joint}" for joint in floating if joint in machine.friction]
+    unsupported += [
+        f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint
+    ]
+    unsupported += writer.unsupported
+    warn_about_unsupported(machine, "MJCF", unsupported)
+
+
+class _MjcfWriter:
+    """The document as it grows.
+
+    Args:
+        machine: The machine.
+    """
+
+    def __init__(self, machine: Machine):
+        self.machine, self.model, self.tree = machine, machine.model, machine.tree
+        self.joints = range(1, self.model.njoints)
+        body_elements = machine.coordinates.body_of_joint[
+            1:
+        ]  # by index of the joint the last of its columns
+        self.moved_links = [
+            self.tree.root_link,
+            *(self.tree.joints[machine.joints[body - 1]].child for body in body_elements),
+        ]
+        self.frames = [  # all other links
+            frame
+            for frame in self.model.frames
+            if frame.type == pin.FrameType.BODY
+            and frame.name not in self.moved_links
+            and self.tree.links[frame.name].composite_joint is None
+        ]
+        self.root = etree.Element("mujoco", model=machine.name)
+        self.bodies: dict[int, etree._Element] = {}  # by index of the joint
+        self.home_coordinates: list[float] = []
+        self.site_names: set[str] = set()  # of sites
+        self.unsupported: list[str] = []
+
+    def build_content(self) -> bytes:
+        """All of the file."""
+        add = etree.SubElement
+        add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
+        add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
+        self._add_texts()
+        self.bodies[0] = add(self.root, "worldbody")
+        self._add_bodies()
+        if self.tree.root_link != "world":
+            self._add_site(self.bodies[0], self.tree.root_link, pin.SE3.Identity())
+        for frame in self.frames:
+            if frame.parentJoint in self.bodies:
+                self._add_site(self.bodies[frame.parentJoint], frame.name, frame.placement)
+        equations = self.machine.closure.equations
+        tendons, equality, actuator = map(etree.Element, ("tendon", "equality", "actuator"))
+        for loop in equations.loops:
+            self._add_loop(equality, loop)
+        for coupling in equations.couplings:
+            self._add_coupling(equality, tendons, coupling)
+        for drive in self.machine.drives:
+            self._add_drive(actuator, tendons, drive)
+        force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
+        for item in force_elements:
+            if item.between is not None:
+                self._add_spatial_tendon(tendons, item, item.between)
+        self.root.extend(part for part in (tendons, equality, actuator) if len(part))
+        key = add(
+            add(self.root, "keyframe"),
+            "key",
+            name="home",
+            qpos=format_numbers(self.home_coordinates),
+        )
+        assert key is not None
+        return format_document(self.root, origin_text(self.machine))
+
+    def _add_texts(self) -> None:
+        machine = self.machine
+        texts = {"name": machine.name, "source": machine.source, "tip": machine.tip or ""}
+        if not machine.tip and len(self._leaf_links()) == 1:
+            texts["tip"] = "none"
+        if [drive.name for drive in machine.drives] != list(machine.active):
+            # else the drives say which joints are active
+            texts |= {"active": ", ".join(machine.active), "free": ", ".join(machine.free)}
+        custom = etree.SubElement(self.root, "custom")
+        for name, data in texts.items():
+            if data:
+                etree.SubElement(custom, "text", name=name, data=data)
+
+    def _leaf_links(self) -> list[str]:
+        parents = {joint.parent for joint in self.tree.joints.values()}
+        return [link for link in self.tree.links if link not in parents]
+
+    def _child_joints(self, joint: int) -> list[int]:
+        """The joints on the link that a joint moves."""
+        return [i for i in self.joints if self.model.parents[i] == joint]
+
+    def _add_bodies(self) -> None:
+        """Bodies with the series of joints that move each, parents before children."""
+        pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
+        while pending:
+            joint, parent = pending.pop()
+            series = self._joints_of_body(joint)
+            body = self.bodies[series[-1]] = self._add_body(series, parent)
+            pending += [(i, body) for i in reversed(self._child_joints(series[-1]))]
+
+    def _joints_of_body(self, joint: int) -> list[int]:
+        """Joints that move one body: a joint, and those above it as long as there is no mass."""
+        series = [joint]
+        while not self.model.inertias[series[-1]].mass:
+            last = series[-1]
+            child_joints = self._child_joints(last)
+            if len(child_joints) != 1 or any(frame.parentJoint == last for frame in self.frames):
+                raise InputError(
+                    f"link '{self.moved_links[last]}' has no mass, which MuJoCo asks of every "
+                    f"body "
+                    "with frames or several joints on it: give it some, or write URDF+"
+                )
+            series += child_joints
+        return series
+
+    def _add_body(self, series: list[int], parent: etree._Element) -> etree._Element:
+        """A body with the series of joints that moves it."""
+        body_placement = pin.SE3.Identity()
+        for i in series:
+            body_placement = body_placement * self.model.jointPlacements[i]
+        name = self.moved_links[series[-1]]
+        body = etree.SubElement(
+            parent, "body", {"name": name} | _placement_attributes(body_placement)
+        )
+        _add_inertial(body, self.model.inertias[series[-1]])
+        joint_placement = pin.SE3.Identity()
+        for i in series:
+            joint_placement = joint_placement * self.model.jointPlacements[i]
+            self._add_joint(body, i, body_placement.actInv(joint_placement))
+        return body
+
+    def _add_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
+        """A joint, placed in its body's frame at zero."""
+        machine, name = self.machine, self.model.names[joint]
+        column = self.model.joints[joint].idx_v
+        if column in machine.coordinates.floating_base_columns:
+            self._add_free_joint(body, joint)
+            return
+        tree_joint = self.tree.joints[name]
+        values = {
+            "name": name,
+            "type": "hinge" if tree_joint.kind == "revolute" else "slide",
+            **_placement_attributes(pin.SE3(np.eye(3), placement.translation)),
+            "axis": format_numbers(placement.rotation @ np.array(tree_joint.axis)),
+        }
+        if (limits := finite_limits(tree_joint.limits)) is not None:
+            values |= {"limited": "true", "range": format_numbers(limits)}
+        if tree_joint.rotor_inertia:
+            values["armature"] = format_numbers([tree_joint.rotor_inertia])
+        friction = machine.friction.get(name)
+        joint_elements = [item for item in machine.forces if item.joint == name]
+        stiffness = sum(item.stiffness for item in joint_elements)
+        damping = sum(item.damping for item in joint_elements) + (
+            friction.viscous if friction else 0.0
+        )
+        if damping:
+            values["damping"] = format_numbers([damping])
+        if friction and friction.coulomb:
+            values["frictionloss"] = format_numbers([friction.coulomb])
+        if stiffness:
+            rest = sum(item.stiffness * item.rest for item in joint_elements) / stiffness
+            values |= {
+                "stiffness": format_numbers([stiffness]),
+                "springref": format_numbers([rest]),
+            }
+        etree.SubElement(body, "joint", values)
+        self.home_coordinates.append(float(machine.home[column]))
+
+    def _add_free_joint(self, body: etree._Element, joint: int) -> None:
+        """A free joint, whose position is the body's pose in the world."""
+        machine = self.machine
+        etree.SubElement(body, "freejoint", name=self.model.names[joint])
+        data = self.model.createData()
+        pin.forwardKinematics(self.model, data, machine.coordinates.configuration(machine.home))
+        *position, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])
+        self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
+
+    def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
+        """A site, under a name that no other has."""
+        while name in self.site_names:
+            name += "_"
+        self.site_names.add(name)
+        site = etree.Element("site", {"name": name} | _placement_attributes(placement))
+        first = body.find("body")
+        if first is None:
+            body.append(site)
+        else:
+            first.addprevious(site)
+        return name
+
+    def _frame_site(self, link: str) -> tuple[etree._Element, pin.SE3, str]:
+        """Body of a link, its placement there, and its site."""
+        frame = self.model.frames[self.machine.frame(link)]
+        if frame.parentJoint not in self.bodies:
+            raise InputError(f"link '{link}' has no mass, which MuJoCo asks for: write URDF+")
+        body = self.bodies[frame.parentJoint]
+        site = link if link in self.site_names else self._add_site(body, link, frame.placement)
+        return body, frame.placement, site
+
+    def _add_loop(self, equality: etree._Element, loop: LoopSpec) -> None:
+        ends = [self._frame_site(link) for link in (loop.predecessor, loop.successor)]
+        sites = {"site1": ends[0][2], "site2": ends[1][2], "solref": "0.002 1"}
+        if loop.type in ("spherical", "fixed"):
+            tag = "connect" if loop.type == "spherical" else "weld"
+            etree.SubElement(equality, tag, {"name": loop.name, **sites})
+            return
+        if loop.type != "revolute":
+            raise InputError(
+                f"loop '{loop.name}' is {loop.type}, for which MJCF has no constraint, write "
+                "URDF+ or a machine file"
+            )
+        etree.SubElement(equality, "connect", {"name": f"{loop.name}_1", **sites})
+        axis_offset = pin.SE3(np.eye(3), _HINGE_POINT_DISTANCE * np.array(loop.axis))
+        for i, (body, placement, _) in enumerate(ends, start=1):
+            end = ("predecessor", "successor")[i - 1]
+            sites[f"site{i}"] = self._add_site(
+                body, f"{loop.name}_{end}_axis", placement * axis_offset
+            )
+        etree.SubElement(equality, "connect", {"name": f"{loop.name}_2", **sites})
+
+    def _add_coupling(
+        self, equality: etree._Element, tendons: etree._Element, coupling: Coupling
+    ) -> None:
+        joints, derivatives, offset = solve_coupling(coupling)
+        attributes = {"name": coupling.name, "solref": "0.002 1"}
+        if len(joints) <= 2:
+            named = {f"joint{i}": joint for i, joint in enumerate(joints, start=1)}
+            polynomial = format_numbers([offset, derivatives[0] if derivatives else 0.0, 0, 0, 0])
+            etree.SubElement(equality, "joint", {**attributes, **named, "polycoef": polynomial})
+            return
+        tendon = _add_fixed_tendon(tendons, coupling.name, coupling.factors)
+        polynomial = format_numbers([coupling.offset, 0, 0, 0, 0])
+        etree.SubElement(
+            equality, "tendon", {**attributes, "tendon1": tendon, "polycoef": polynomial}
+        )
+
+    def _add_spatial_tendon(
+        self, tendons: etree._Element, item: ForceElement | Rope, links: tuple[str, str]
+    ) -> None:
+        """A tendon straight from frame to frame.
+
+        MuJoCo's springs have no constant force, so that of an element moves the length at which
+        its spring is slack. Damping of a rope acts while it is taut, that of a tendon always.
+        """
+        name, values = element_name(item), {}
+        if isinstance(item, Rope):
+            values = {"stiffness": [item.stiffness], "springlength": [0.0, item.length]}
+            self.unsupported += [f"the damping of the {name}"] * bool(item.damping)
+        else:
+            slack_force = item.force + item.stiffness * item.rest
+            if slack_force < 0 or (slack_force and not item.stiffness):
+                self.unsupported.append(f"the constant force of the {name}")
+            if item.stiffness:
+                rest = (
+                    max(slack_force, 0.0) / item.stiffness if item.force else max(item.rest, 0.0)
+                )
+                values = {"stiffness": [item.stiffness], "springlength": [rest]}
+            if item.damping:
+                values["damping"] = [item.damping]
+        if not values:
+            return
+        tendon = _add_tendon(tendons, "spatial", "_".join(links))
+        for key, numbers in values.items():
+            tendon.set(key, format_numbers(numbers))
+        for link in links:
+            etree.SubElement(tendon, "site", site=self._frame_site(link)[2])
+
+    def _add_drive(self, actuator: etree._Element, tendons: etree._Element, drive: Drive) -> None:
+        target = {"joint": drive.name}
+        if dict(drive.factors) != {drive.name: 1.0}:
+            target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
+        etree.SubElement(actuator, "motor", {"name": drive.name, **target})
+
+
+def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:
+    """Add a tendon, under a name that no other has."""
+    while any(tendon.get("name") == name for tendon in tendons):
+        name += "_"
+    return etree.SubElement(tendons, tag, name=name)
+
+
+def _add_fixed_tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
+    """Add a fixed tendon."""
+    tendon = _add_tendon(tendons, "fixed", name)
+    for joint, factor in factors.items():
+        etree.SubElement(tendon, "joint", joint=joint, coef=format_numbers([factor]))
+    return str(tendon.get("name"))
+
+
+def _placement_attributes(placement: pin.SE3) -> dict[str, str]:
+    """Attributes of a placement, without those that say nothing."""
+    found = {}
+    if placement.translation.any():
+        found["pos"] = format_numbers(placement.translation)
+    if not np.array_equal(placement.rotation, np.eye(3)):
+        found["quat"] = _quaternion_text(placement.rotation)
+    return found
+
+
+def _quaternion_text(rotation: np.ndarray) -> str:
+    x, y, z, w = pin.Quaternion(rotation).normalize().coeffs()
+    return format_numbers([w, x, y, z])
+
+
+def _add_inertial(body: etree._Element, inertia: pin.Inertia) -> None:
+    """Principal moments and axes; MuJoCo asks for moments of a possible body that are not zero."""
+    moments, axes = np.linalg.eigh(inertia.inertia)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    moments = np.maximum(moments, _MIN_MOMENT)
+    violation = moments[2] - moments[0] - moments[1]
+    if violation > _ROUNDING_TOLERANCE * moments[2]:
+        warnings.warn(
+            f"the inertia of '{body.get('name')}' is of no possible body by {violation:.2g} kg "
+            f"m2, "
+            "which MuJoCo refuses: two moments are written larger",
+            CraneWarning,
+            stacklevel=5,
+        )
+    if violation > 0:
+        moments[:2] += (0.5 + 1e-15) * violation
+    values = {"pos": format_numbers(inertia.lever), "mass": format_numbers([inertia.mass])}
+    values |= _placement_attributes(pin.SE3(axes, np.zeros(3)))
+    etree.SubElement(body, "inertial", {**values, "diaginertia": format_numbers(moments)})

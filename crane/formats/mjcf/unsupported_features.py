@@ -1,0 +1,180 @@
+"""What MuJoCo would compute with and a machine does not have: noted, to be told in one line.
+
+The list follows the fields of MuJoCo's mjModel that act on the motion. Softness of constraints
+(solref, solimp) is not told: loops close exactly here, whatever it says. Limits are not either: a
+run says which it passed.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from crane.formats.mjcf.joint_effects import fixed_tendon_factors, straight_tendon_sites
+from crane.formats.mjcf.mujoco_file import MujocoFile, nonzero_rows
+
+_STANDARD_GRAVITY = (0.0, 0.0, -9.81)
+_COUNTED_FEATURES = {"sensor": "nsensor", "camera": "ncam", "skin": "nskin", "plugin": "nplugin"}
+
+
+def note_unsupported_features(mjcf: MujocoFile) -> None:
+    """Note all that is left out, or taken otherwise."""
+    disabled = mjcf.disabled_features
+    if "CONTACT" not in disabled:
+        _note_contacts(mjcf, disabled)
+    _note_world(mjcf, disabled)
+    _note_joints(mjcf, disabled)
+    _note_actuators(mjcf, disabled)
+    model = mjcf.model
+    spatial_tendons = [
+        i
+        for i in range(model.ntendon)
+        if fixed_tendon_factors(mjcf, i) is None and straight_tendon_sites(mjcf, i) is None
+    ]
+    if spatial_tendons:
+        mjcf.note_unsupported(
+            "tendons that are not straight from a site to one of another body",
+            *map(mjcf.tendon_name, spatial_tendons),
+        )
+    for feature, field in _COUNTED_FEATURES.items():
+        if count := int(getattr(model, field, 0)):
+            mjcf.note_unsupported(f"{count} {feature}{'s' * (count > 1)}")
+
+
+def _note_world(mjcf: MujocoFile, disabled: set[str]) -> None:
+    model = mjcf.model
+    gravity = np.zeros(3) if "GRAVITY" in disabled else model.opt.gravity
+    if not np.allclose(gravity, _STANDARD_GRAVITY, rtol=0, atol=1e-9):
+        given = " ".join(f"{x:g}" for x in gravity)
+        mjcf.note_difference(f"gravity is {given} m/s2, a machine's is 0 0 -9.81")
+    if np.any(model.body_gravcomp):
+        mjcf.note_unsupported("gravity compensation")
+    if model.opt.density or model.opt.viscosity:
+        mjcf.note_unsupported("forces of the air")
+    if model.nmocap:
+        mocap_bodies = [
+            mjcf.body_name(body) for body in np.flatnonzero(model.body_mocapid >= 0).tolist()
+        ]
+        mjcf.note_difference("what a program moves stands still (mocap)", *mocap_bodies)
+    if (model.neq and "EQUALITY" in disabled) or "CONSTRAINT" in disabled:
+        mjcf.note_difference("the file switches its constraints off, loops are closed here")
+
+
+def _note_contacts(mjcf: MujocoFile, disabled: set[str]) -> None:
+    geoms = colliding_geoms(mjcf.model, disabled)
+    if not geoms:
+        return
+    body_of_geom = mjcf.model.geom_bodyid
+    geoms.sort(
+        key=lambda geom: mjcf.model.body_weldid[body_of_geom[geom]] != 0
+    )  # floors and walls first
+    names = [
+        mjcf.element_name("GEOM", x).strip() or f"one of {mjcf.body_name(int(body_of_geom[x]))}"
+        for x in geoms
+    ]
+    count = f"{len(geoms)} geom{'s' * (len(geoms) > 1)}"
+    mjcf.note_unsupported(f"contacts of {count}", *names)
+
+
+def colliding_geoms(model: Any, disabled: set[str]) -> list[int]:
+    """Numbers of the geoms that can touch another one, as MuJoCo decides on it.
+
+    Two geoms can, if a bit of the contype of one is in the conaffinity of the other, they move
+    against each other, their bodies are not parent and child (unless one stands still), and no
+    exclude names them; or if a pair names them.
+
+    Args:
+        model: MuJoCo's model.
+        disabled: What is switched off, of `MujocoFile.disabled_features`.
+    """
+    body_weld_ids = model.body_weldid
+    parent_bodies = body_weld_ids[
+        model.body_parentid[body_weld_ids]
+    ]  # of the body that each is a part of
+    unique_geoms, unique_index = np.unique(
+        np.column_stack([model.geom_bodyid, model.geom_contype, model.geom_conaffinity]).reshape(
+            -1, 3
+        ),
+        axis=0,
+        return_inverse=True,
+    )
+    body, contype, conaffinity = unique_geoms.T
+    rigid_bodies = body_weld_ids[body]
+    excluded = {divmod(int(x), 1 << 16) for x in model.exclude_signature}
+    excluded |= {(two, one) for one, two in excluded}
+    is_touching = np.zeros(len(unique_geoms), dtype=bool)
+    filtered = "FILTERPARENT" not in disabled
+    for i in range(len(unique_geoms)):
+        can_touch = ((contype[i] & conaffinity) | (contype & conaffinity[i])) != 0
+        can_touch &= rigid_bodies != rigid_bodies[i]
+        if filtered:
+            are_parent_and_child = (parent_bodies[rigid_bodies] == rigid_bodies[i]) | (
+                rigid_bodies == parent_bodies[rigid_bodies[i]]
+            )
+            can_touch &= ~(are_parent_and_child & (rigid_bodies != 0) & (rigid_bodies[i] != 0))
+        others = np.flatnonzero(can_touch)
+        if excluded:
+            others = np.array(
+                [j for j in others if (int(body[i]), int(body[j])) not in excluded], dtype=int
+            )
+        is_touching[i] = len(others) > 0
+    found = is_touching[np.ravel(unique_index)]
+    found[np.concatenate([model.pair_geom1, model.pair_geom2]).astype(int)] = True
+    return np.flatnonzero(found).tolist()
+
+
+def _note_joints(mjcf: MujocoFile, disabled: set[str]) -> None:
+    model = mjcf.model
+    for field, feature in (
+        ("dof_dampingpoly", "nonlinear damping of joints"),
+        ("jnt_stiffnesspoly", "nonlinear stiffness of joints"),
+        ("jnt_springyield", "yielding of springs"),
+        ("jnt_actfrclimited", "limits of the force on joints (actuatorfrcrange)"),
+    ):
+        of_dofs = field.startswith("dof")
+        found = [int(model.dof_jntid[i]) if of_dofs else i for i in nonzero_rows(model, field)]
+        if found:
+            mjcf.note_unsupported(feature, *map(mjcf.joint_name, found))
+    for switch, fields in (
+        ("SPRING", ("jnt_stiffness", "tendon_stiffness")),
+        ("DAMPER", ("dof_damping", "tendon_damping")),
+        ("FRICTIONLOSS", ("dof_frictionloss", "tendon_frictionloss")),
+    ):
+        passive = switch in disabled or ("PASSIVE" in disabled and switch != "FRICTIONLOSS")
+        if passive and any(np.any(getattr(model, field)) for field in fields):
+            mjcf.note_difference(
+                f"the file switches off what it calls {switch.lower()}, it acts here"
+            )
+    limited = [] if "LIMIT" in disabled else nonzero_rows(model, "jnt_limited")
+    ball_joints = [
+        i for i in limited if mjcf.enumeration_name("Joint", model.jnt_type[i]) == "BALL"
+    ]
+    if ball_joints:
+        mjcf.note_unsupported(
+            "limits of the angle of ball joints", *map(mjcf.joint_name, ball_joints)
+        )
+
+
+def _note_actuators(mjcf: MujocoFile, disabled: set[str]) -> None:
+    """Those that are no motors: their force is not what they are told, in N or N m."""
+    model = mjcf.model
+    count = len(model.actuator_trntype)
+    nonstandard = set()
+    for field in (
+        "actuator_gaintype", "actuator_biastype", "actuator_dyntype", "actuator_forcelimited",
+        "actuator_ctrllimited", "actuator_actlimited", "actuator_dampingpoly", "actuator_delay",
+    ):  # fmt: skip
+        nonstandard.update(nonzero_rows(model, field))
+    nonstandard.update(i for i in range(count) if model.actuator_gainprm[i, 0] != 1)
+    nonstandard.update(
+        i for i in range(count) if abs(np.linalg.norm(model.actuator_gear[i]) - 1) > 1e-9
+    )
+    if nonstandard:
+        mjcf.note_difference(
+            "drives take forces in N and N m, without gains, gears, dynamics and limits of the "
+            "actuators",
+            *map(mjcf.actuator_name, sorted(nonstandard)),
+        )
+    if count and "ACTUATION" in disabled:
+        mjcf.note_difference(
+            "the file switches its actuators off, what they act on is driven here"
+        )

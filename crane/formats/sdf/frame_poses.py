@@ -1,0 +1,165 @@
+"""Where links, joints and frames of SDF are, and which link each is fixed to.
+
+Every pose is relative to a frame: that which it names, or by default that of its model, for a
+joint its child, for a frame what it is attached to, for a model that of the model above. A model
+with a placement frame P is where its pose puts P: X_SM = X_SP (X_MP)^-1.
+"""
+
+import numpy as np
+import pinocchio as pin
+
+from crane.formats.sdf.model_scope import MergedFrame, ModelScope, find_scope
+from crane.formats.sdf.sdf_element import SdfElement
+
+_MODEL_FRAME, _WORLD_FRAME = "__model__", "world"
+_MAX_DEPTH = 200  # frames relative to each other
+
+
+class SdfFramePoses:
+    """Poses of one file, found once each."""
+
+    def __init__(self) -> None:
+        self._known_poses: dict[tuple[int, str], pin.SE3] = {}
+        self._open_keys: list[tuple[int, str]] = []
+
+    def pose_in_scope(self, scope: ModelScope, name: str, referrer: SdfElement) -> pin.SE3:
+        """Pose of what has a name in a scope, relative to the frame of that scope.
+
+        Args:
+            scope: The scope.
+            name: A name in it, perhaps with `::`.
+            referrer: What names it, for errors.
+
+        Raises:
+            DescriptionError: It is unknown, or frames are relative to each other in a ring.
+        """
+        if name in ("", _MODEL_FRAME) or (name == _WORLD_FRAME and scope.parent is None):
+            return pin.SE3.Identity()
+        key = (id(scope), name)
+        if key in self._known_poses:
+            return self._known_poses[key]
+        if key in self._open_keys or len(self._open_keys) > _MAX_DEPTH:
+            raise referrer.xml.error_at(
+                referrer.element, f"{referrer.label} is relative to '{name}' in a ring, break it"
+            )
+        self._open_keys.append(key)
+        try:
+            self._known_poses[key] = self._find_pose(scope, name, referrer)
+        finally:
+            self._open_keys.pop()
+        return self._known_poses[key]
+
+    def _find_pose(self, scope: ModelScope, name: str, referrer: SdfElement) -> pin.SE3:
+        inner, rest = find_scope(scope, name, referrer)
+        if inner is not scope:
+            return self._nested_model_pose(scope, inner, referrer) * self.pose_in_scope(
+                inner, rest, referrer
+            )
+        if rest in scope.links:
+            return self.element_pose(scope, scope.links[rest], scope.links[rest].base_frame)
+        if rest in scope.frames:
+            return self._frame_pose(scope, scope.frames[rest])
+        if rest in scope.models:
+            model = scope.models[rest]
+            return self._model_pose(scope, model, model.item.base_frame)
+        joint = scope.joints[rest]
+        return self.element_pose(scope, joint, joint.text("child"))
+
+    def _nested_model_pose(
+        self, scope: ModelScope, inner: ModelScope, referrer: SdfElement
+    ) -> pin.SE3:
+        """Pose of a model that is anywhere within a scope."""
+        steps = []
+        while inner is not scope and inner.parent is not None:
+            steps.append((inner.parent, inner.name))
+            inner = inner.parent
+        placement = pin.SE3.Identity()
+        for parent, name in reversed(steps):
+            placement = placement * self.pose_in_scope(parent, name, referrer)
+        return placement
+
+    def _frame_pose(self, scope: ModelScope, frame: SdfElement) -> pin.SE3:
+        if isinstance(frame, MergedFrame) and frame.merged_model is not None:
+            return self._model_pose(scope, frame.merged_model, frame.base_frame)
+        return self.element_pose(scope, frame, attached_to(frame))
+
+    def _model_pose(self, scope: ModelScope, model: ModelScope, base: str) -> pin.SE3:
+        """Pose of a model's frame in the scope that it is in."""
+        placement = self.element_pose(scope, model.pose_element, base)
+        placement_frame = model.placement_frame
+        if placement_frame in ("", _MODEL_FRAME):
+            return placement
+        return placement * self.pose_in_scope(model, placement_frame, model.item).inverse()
+
+    def element_pose(self, scope: ModelScope, item: SdfElement, default: str) -> pin.SE3:
+        """Pose of an element relative to the frame of its scope.
+
+        Args:
+            scope: The scope.
+            item: An element that may have a `<pose>`.
+            default: The frame that this is relative to if it does not say.
+        """
+        placement, relative = item.read_pose()
+        if relative == _MODEL_FRAME:
+            relative = item.base_frame
+        return self.pose_in_scope(scope, relative or default, item) * placement
+
+    def rotation_in_scope(self, scope: ModelScope, name: str, referrer: SdfElement) -> np.ndarray:
+        """(3, 3) axes of a frame in those of its scope."""
+        return np.asarray(self.pose_in_scope(scope, name, referrer).rotation)
+
+    def pose_in_top(self, scope: ModelScope, top: ModelScope) -> pin.SE3:
+        """Pose of a scope's frame relative to that of one above."""
+        return self._nested_model_pose(top, scope, scope.item)
+
+
+def attached_to(frame: SdfElement) -> str:
+    """What a frame is fixed to."""
+    given = str(frame.element.get("attached_to", "")).strip()
+    return frame.base_frame if given in ("", _MODEL_FRAME) else given
+
+
+def find_link(
+    scope: ModelScope, name: str, referrer: SdfElement, depth: int = 0
+) -> tuple[ModelScope, str] | None:
+    """The link that a name stands for or is fixed to; None for the world.
+
+    Raises:
+        DescriptionError: It is unknown, or fixed to itself in a ring.
+    """
+    if depth > _MAX_DEPTH:
+        raise referrer.xml.error_at(
+            referrer.element, f"{referrer.label} is attached to itself, break the ring"
+        )
+    if name == _WORLD_FRAME and name not in scope.links:
+        return None
+    inner, rest = find_scope(scope, name, referrer)
+    if rest in inner.links:
+        return inner, rest
+    if rest in inner.frames:
+        frame = inner.frames[rest]
+        merged = isinstance(frame, MergedFrame)
+        return find_link(
+            inner, _MODEL_FRAME if merged else attached_to(frame), referrer, depth + 1
+        )
+    if rest in inner.joints:
+        return find_link(inner, inner.joints[rest].text("child"), referrer, depth + 1)
+    if rest in inner.models:
+        inner, rest = inner.models[rest], _MODEL_FRAME
+    return canonical_link(inner, referrer, depth)
+
+
+def canonical_link(
+    scope: ModelScope, referrer: SdfElement, depth: int = 0
+) -> tuple[ModelScope, str] | None:
+    """The link that a model's frame is fixed to: that which it names, else its first.
+
+    Raises:
+        DescriptionError: It has none.
+    """
+    if given := str(scope.item.element.get("canonical_link", "")).strip():
+        return find_link(scope, given, referrer, depth + 1)
+    for inner in scope.nested_scopes():
+        if inner.links:
+            return inner, next(iter(inner.links))
+    raise scope.item.xml.error_at(scope.item.element, f"{scope.item.label} has no link, add one")

@@ -1,0 +1,301 @@
+"""Strict reading of URDF files: what other readers swallow silently is caught here."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lxml import etree
+
+from crane.common.errors import suggest_names
+from crane.description.findings import (
+    FollowUpError,
+    error_recovery,
+    record_parsed_file,
+    report_error,
+)
+from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.specification import Coupling, ForceElement, Friction, LoopSpec
+from crane.formats.joint_series import MULTI_FREEDOM_TYPES
+from crane.formats.robot_files import open_robot
+from crane.formats.urdf.constraint_elements import read_constraints
+from crane.formats.urdf.coupling_elements import read_coupling
+from crane.formats.urdf.home_elements import read_home, read_tip
+from crane.formats.urdf.joint_graph import MOVABLE_TYPES, read_graph
+from crane.formats.urdf.link_joint_elements import (
+    read_friction,
+    read_joint,
+    read_limits,
+    read_link,
+    read_multi_freedom_joint,
+)
+from crane.formats.urdf.loop_elements import independent_joints, read_loops
+from crane.formats.urdf.unknown_elements import warn_about_unknown_elements
+from crane.formats.xml_file import XmlFile
+
+_CHILDREN = {
+    "robot": {
+        "link", "joint", "loop", "coupling", "material", "transmission", "gazebo", "group_state",
+        "end_effector",
+    },
+    "link": {"origin", "inertial", "visual", "collision"},
+    "joint": {
+        "origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "calibration",
+        "safety_controller",
+    },
+    "loop": {"predecessor", "successor", "axis", "limit", "dynamics"},
+    "coupling": {"predecessor", "successor", "ratio"},
+    "group_state": {"joint"},
+    "predecessor": {"origin"},
+    "successor": {"origin"},
+    "inertial": {"origin", "mass", "inertia"},
+    "visual": {"origin", "geometry", "material"},
+    "collision": {"origin", "geometry", "material"},
+}  # fmt: skip
+_ATTRIBUTES = {
+    "link": {"name", "between"},
+    "joint": {"name", "type", "independent"},
+    "loop": {"name", "type"},
+    "coupling": {"name", "type"},
+    "ratio": {"value"},
+    "parent": {"link"},
+    "child": {"link"},
+    "predecessor": {"link"},
+    "successor": {"link"},
+    "origin": {"xyz", "rpy"},
+    "axis": {"xyz"},
+    "mass": {"value"},
+    "inertia": {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"},
+    "limit": {"lower", "upper", "effort", "velocity"},
+    "dynamics": {"damping", "friction"},
+}
+_CLOSED_ELEMENTS = {"origin", "axis", "mass", "inertia"}
+_OBSOLETE_ELEMENTS = {
+    "loop_constraint": "loop",
+    "joint_constraint": "coupling",
+}  # before URDF+ was published
+
+
+@dataclass(frozen=True)
+class UrdfModel:
+    """A checked URDF.
+
+    Attributes:
+        file: The file.
+        name: The robot's.
+        tree: Its links and joints.
+        root_link: Name of the root link.
+        loops: Loops of `<loop>` elements.
+        independent_joints: Joints marked `independent="true"`; None where no joint has the
+            attribute.
+        friction: Friction of `<dynamics>` elements.
+        couplings: Joints that mimic another, and `<coupling>` elements.
+        home: Coordinates of the group state "home".
+        home_locations: File and line of each.
+        tip: Link of the end effector "tip".
+        is_complete: Whether all elements have names of their own, if not only some are here.
+        springs: Of a format that has some.
+    """
+
+    file: Path
+    name: str
+    tree: Tree
+    root_link: str
+    loops: tuple[LoopSpec, ...]
+    independent_joints: tuple[str, ...] | None
+    friction: Mapping[str, Friction]
+    couplings: tuple[Coupling, ...]
+    home: Mapping[str, float] = field(default_factory=dict)
+    home_locations: Mapping[str, str] = field(default_factory=dict)
+    tip: str | None = None
+    is_complete: bool = True
+    springs: tuple[ForceElement, ...] = ()
+
+    @property
+    def moving_joints(self) -> tuple[str, ...]:
+        """Its moving joints."""
+        return tuple(joint.name for joint in self.tree.moving_joints)
+
+
+def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> UrdfModel:
+    """Read and check one URDF, or what stands for one, see `crane.formats.robot_files`.
+
+    Args:
+        file: The file.
+        edit: Changes its elements before they are read.
+
+    Raises:
+        DescriptionError: With file, line, and what is wrong.
+    """
+    source = open_robot(file)
+    xml = source.xml
+    record_parsed_file(xml)
+    if xml.root.tag != "robot":
+        raise xml.error_at(
+            xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>"
+        )
+    read_constraints(xml)
+    xml.check_elements(xml.root, _CHILDREN, _ATTRIBUTES, _CLOSED_ELEMENTS)
+    if edit is not None:
+        edit(xml)
+    for tag, replacement_tag in _OBSOLETE_ELEMENTS.items():
+        for element in xml.root.iterfind(tag):
+            report_error(
+                xml.error_at(
+                    element,
+                    f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one",
+                )
+            )
+    links, joints = _elements_by_name(xml, "link"), _elements_by_name(xml, "joint")
+    warn_about_unknown_elements(xml, _CHILDREN, _ATTRIBUTES, joints)
+    if not links:
+        raise xml.error_at(xml.root, "no <link> in this file, add one")
+    end_links, root, cut = read_graph(xml, links, joints)
+    moved_links = {
+        end_links[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"
+    }
+    parts: list[Link | Joint] = []
+    for name, link in links.items():
+        with error_recovery():
+            parts.append(read_link(xml, name, link, name in moved_links))
+    friction: dict[str, Friction | None] = {}
+    for name, joint in joints.items():
+        if joint.get("type") in MULTI_FREEDOM_TYPES:
+            parts += _read_joint_series(xml, name, end_links[name], links, joints)
+            continue
+        parts += _read_single_freedom_joint(xml, name, joint, end_links[name], name in cut)
+        with error_recovery(harmless=True):
+            friction[name] = read_friction(xml, name, joint)
+    independent_names = independent_joints(xml, joints)
+    loops, frames = read_loops(xml, _elements_by_name(xml, "loop"), links)
+    for frame in frames:
+        parts.append(Link(frame.child, frame.source_location))
+        if (same_named := joints.get(frame.name)) is not None:
+            report_error(
+                xml.error_at(
+                    same_named, f"joint '{frame.name}' has the name of a loop's, rename it"
+                )
+            )
+            continue
+        parts.append(frame)
+    couplings = _read_mimics(xml, joints, independent_names)
+    for name, element in _elements_by_name(xml, "coupling").items():
+        with error_recovery():
+            couplings += (read_coupling(xml, name, element, joints, end_links, links),)
+    tree = Tree({}, {}).with_parts(*parts)
+    home, home_lines = read_home(xml, {joint.name for joint in tree.moving_joints})
+    return UrdfModel(
+        file,
+        xml.root.get("name") or file.stem,
+        tree,
+        root,
+        loops,
+        independent_names,
+        {name: found for name, found in friction.items() if found is not None},
+        couplings,
+        home,
+        home_lines,
+        read_tip(xml, links),
+        is_complete=not xml.unnamed_kinds,
+        springs=source.springs,
+    )
+
+
+def _read_single_freedom_joint(
+    xml: XmlFile, name: str, joint: etree._Element, end_links: tuple[str, str], is_cut: bool
+) -> list[Link | Joint]:
+    """A joint with one freedom, or none; without limits where they are wrong."""
+    found: list[Link | Joint] = []
+    with error_recovery():
+        read = dataclasses.replace(read_joint(xml, name, joint, end_links), is_cut=is_cut)
+        found = [read]
+        if read.is_movable:
+            found = [dataclasses.replace(read, limits=read_limits(xml, name, joint))]
+    return found
+
+
+def _read_joint_series(
+    xml: XmlFile,
+    name: str,
+    end_links: tuple[str, str],
+    links: Mapping[str, etree._Element],
+    joints: Mapping[str, etree._Element],
+) -> list[Link | Joint]:
+    """What a joint with several freedoms becomes, without parts whose names are taken."""
+    series_parts: list[Link | Joint] = []
+    with error_recovery():
+        series_parts = read_multi_freedom_joint(xml, name, joints[name], end_links)
+    found = []
+    for part in series_parts:
+        kind, used_names = ("link", links) if isinstance(part, Link) else ("joint", joints)
+        if part.name in used_names:
+            problem = f"its {kind} '{part.name}' is there already, rename one"
+            report_error(xml.error_at(joints[name], problem))
+        else:
+            found.append(part)
+    return found
+
+
+def _read_mimics(
+    xml: XmlFile, joints: Mapping[str, etree._Element], independent_names: tuple[str, ...] | None
+) -> tuple[Coupling, ...]:
+    """Couplings q = multiplier q_other + offset of joints that mimic another."""
+    moving = [name for name, joint in joints.items() if joint.get("type") in MOVABLE_TYPES]
+    found = []
+    for name, joint in joints.items():
+        mimic = xml.single_child(joint, "mimic", f"joint '{name}'")
+        if mimic is None or name not in moving:
+            continue
+        with error_recovery():
+            found.append(_read_mimic(xml, name, mimic, joints, moving, independent_names or ()))
+    return tuple(found)
+
+
+def _read_mimic(
+    xml: XmlFile,
+    name: str,
+    mimic: etree._Element,
+    joints: Mapping[str, etree._Element],
+    movable_joints: Sequence[str],
+    independent_names: Sequence[str],
+) -> Coupling:
+    other = mimic.get("joint", "")
+    if other not in joints and "joint" in xml.unnamed_kinds:
+        raise FollowUpError(f"joint '{other}' may be one without a name")
+    if other not in movable_joints:
+        problem = (
+            f"mimics '{other}', which does not move"
+            if other in joints
+            else (f"mimics the unknown joint '{other}'")
+        )
+        raise xml.error_at(
+            mimic, f"joint '{name}' {problem}, {suggest_names(movable_joints, other)}"
+        )
+    if other == name:
+        raise xml.error_at(mimic, f"joint '{name}' mimics itself, name another")
+    if name in independent_names:
+        raise xml.error_at(
+            mimic, f"joint '{name}' mimics '{other}' and is independent, keep one of the two"
+        )
+    multiplier = xml.number(mimic, "multiplier", f"the mimic of '{name}'", 1.0)
+    offset = xml.number(mimic, "offset", f"the mimic of '{name}'", 0.0)
+    factors = {name: 1.0, other: -multiplier} if multiplier else {name: 1.0}
+    return Coupling(f"{name}_mimic", factors, offset, xml.source_location(mimic))
+
+
+def _elements_by_name(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
+    """Elements of one kind by their names."""
+    found: dict[str, etree._Element] = {}
+    for element in xml.root.iterfind(kind):
+        name = element.get("name", "").strip()
+        if not name:
+            xml.unnamed_kinds.add(kind)
+            report_error(xml.error_at(element, f'a {kind} has no name, add name="..."'))
+        elif name in found:
+            xml.unnamed_kinds.add(kind)
+            first = xml.source_location(found[name]).rpartition(":")[2]
+            problem = f"{kind} '{name}' is there twice (first in line {first}), rename one"
+            report_error(xml.error_at(element, problem))
+        else:
+            found[name] = element
+    return found

@@ -1,0 +1,172 @@
+"""One URDF with the elements of URDF+."""
+
+from pathlib import Path
+
+from lxml import etree
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import InputError
+from crane.description import Coupling, LoopSpec
+from crane.description.kinematic_tree import Tree
+from crane.formats.urdf_output import (
+    add_friction,
+    add_joint,
+    add_link,
+    add_origin,
+    compound_drive_factors,
+    copy_shapes,
+    format_document,
+    format_numbers,
+    origin_text,
+    rotor_inertias,
+    solve_coupling,
+    unsupported_friction,
+    unsupported_sections,
+    warn_about_unsupported,
+    with_floating_joints,
+)
+from crane.machine import Machine
+
+
+def write_urdf_plus(machine: Machine, path: str | Path) -> None:
+    """Write a machine as one URDF with `<loop>` and `<coupling>` elements.
+
+    The home posture, which names the assembly branch, becomes a `<group_state name="home">`, as
+    SRDF has it; other readers of URDF ignore it. Of friction there are Coulomb and viscous
+    friction. A warning names what else is left out.
+
+    Args:
+        machine: The machine, as it is: with its changes, locks and payload.
+        path: The file, .urdf.
+
+    Raises:
+        InputError: A coupling binds several joints in a way that no `<coupling>` says.
+        OutputError: It cannot be written.
+    """
+    tree = with_floating_joints(machine)
+    robot = etree.Element("robot", name=machine.name)
+    loop_frames = {  # which reading a loop makes again
+        f"{loop.name}_{end}": frame
+        for loop in machine.closure.equations.loops
+        for end, frame in (("predecessor", loop.predecessor), ("successor", loop.successor))
+        if frame == f"{loop.name}_{end}"
+    }
+    for link in tree.links.values():
+        if link.name not in loop_frames:
+            add_link(robot, link)
+    for joint in tree.joints.values():
+        if not joint.is_movable and joint.child not in loop_frames:
+            add_joint(robot, joint)
+    passive = [joint for joint in machine.joints if joint not in machine.active]
+    for name in (*machine.active, *passive):
+        if name in tree.joints:
+            _add_moving_joint(machine, robot, name)
+    for joint in tree.joints.values():
+        if joint.kind == "floating":
+            add_joint(robot, joint).set("independent", "true")
+    for loop in machine.closure.equations.loops:
+        _add_loop(tree, robot, loop)
+    for coupling in machine.closure.equations.couplings:
+        _add_coupling(machine, robot, coupling)
+    state = etree.SubElement(robot, "group_state", name="home", group="all")
+    for name, value in zip(machine.joints, machine.home, strict=True):
+        etree.SubElement(state, "joint", name=name, value=format_numbers([value]))
+    if machine.tip is not None:
+        tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
+        etree.SubElement(robot, "end_effector", tip)
+    copy_shapes(robot, machine)
+    unsupported = unsupported_friction(machine) + unsupported_sections(machine)
+    unsupported += ["springs and forces"] if machine.forces else []
+    unsupported += ["ropes"] if machine.ropes else []
+    unsupported += ["rotor inertias"] if rotor_inertias(machine) else []
+    unsupported += ["drives along several joints"] if compound_drive_factors(machine) else []
+    with replace_file(path) as temporary_file:
+        temporary_file.write_bytes(format_document(robot, origin_text(machine)))
+    warn_about_unsupported(machine, "URDF+", unsupported)
+
+
+def _add_moving_joint(machine: Machine, robot: etree._Element, name: str) -> None:
+    element = add_joint(robot, machine.tree.joints[name])
+    element.set("independent", str(name in machine.active).lower())
+    add_friction(element, machine, name)
+
+
+def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
+    element = etree.SubElement(robot, "loop", name=loop.name, type=loop.type)
+    parent_joints = {joint.child: joint for joint in tree.joints.values()}
+    for end, name in (("predecessor", loop.predecessor), ("successor", loop.successor)):
+        if name != f"{loop.name}_{end}":
+            etree.SubElement(element, end, link=name)
+            continue
+        add_origin(
+            etree.SubElement(element, end, link=parent_joints[name].parent), parent_joints[name]
+        )
+    etree.SubElement(element, "axis", xyz=format_numbers(loop.axis))
+
+
+def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -> None:
+    """A <coupling> where one says the same, else a <mimic>."""
+    joints, derivatives, offset = solve_coupling(coupling)
+    is_mimic = len(joints) <= 2 and coupling.name == f"{joints[0]}_mimic"
+    ends = None if is_mimic or offset else _coupling_ends(machine, joints, derivatives)
+    if ends is not None:
+        element = etree.SubElement(robot, "coupling", name=coupling.name, type="rolling")
+        etree.SubElement(element, "predecessor", link=ends[0])
+        etree.SubElement(element, "successor", link=ends[1])
+        etree.SubElement(element, "ratio", value=format_numbers([ends[2]]))
+        return
+    if len(joints) > 2:
+        raise InputError(
+            f"coupling '{coupling.name}' of {len(joints)} joints has no place in URDF+, write a "
+            "machine file"
+        )
+    others = [name for name in machine.joints if name != joints[0]]
+    other = (
+        joints[1] if derivatives else others[0]
+    )  # that of a joint which is held counts for nothing
+    (follower,) = (j for j in robot.iterfind("joint") if j.get("name") == joints[0])
+    multiplier = format_numbers([derivatives[0] if derivatives else 0.0])
+    mimic = {"joint": other, "multiplier": multiplier, "offset": format_numbers([offset])}
+    if follower.get("independent") == "true":
+        raise InputError(
+            f"'{joints[0]}' is active and follows '{other}' by the coupling '{coupling.name}', "
+            "write a machine file"
+        )
+    etree.SubElement(follower, "mimic", mimic)
+
+
+def _coupling_ends(
+    machine: Machine, joints: list[str], derivatives: list[float]
+) -> tuple[str, str, float] | None:
+    """Predecessor, successor and ratio with ratio sum_P q = sum_S q, if there are such links.
+
+    Joints of one way have one factor: those of the successor's that of the first joint.
+    """
+    model = machine.model
+    successor_joints = [joints[0]] + [
+        x for x, slope in zip(joints[1:], derivatives, strict=True) if slope == -1
+    ]
+    predecessor_joints = [x for x in joints if x not in successor_joints]
+    ratios = {
+        slope for x, slope in zip(joints[1:], derivatives, strict=True) if x in predecessor_joints
+    }
+    if len(ratios) > 1:
+        return None
+    joint_paths = [
+        sorted(model.getJointId(x) for x in way) for way in (predecessor_joints, successor_joints)
+    ]
+    for path in joint_paths:  # depth-first numbers rise from parent to child
+        if any(model.parents[b] != a for a, b in zip(path, path[1:], strict=False)):
+            return None
+    top_joints = [model.parents[way[0]] for way in joint_paths if way]
+    if len(set(top_joints)) > 1:
+        return None
+    links = [_moved_link(machine, way[-1] if way else top_joints[0]) for way in joint_paths]
+    return links[0], links[1], ratios.pop() if ratios else 1.0
+
+
+def _moved_link(machine: Machine, joint: int) -> str:
+    """The link that a joint of the model moves, the root link for the world."""
+    return (
+        machine.tree.joints[machine.model.names[joint]].child if joint else machine.tree.root_link
+    )

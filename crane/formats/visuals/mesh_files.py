@@ -1,0 +1,176 @@
+"""Mesh files: where they are, and their triangles."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crane.common import file_cache
+from crane.common.package_search import find_file
+from crane.common.samples import Array
+from crane.formats.visuals import mesh_process
+
+_MAX_FILE_SIZE = 200e6  # bytes of a file
+_MAX_CACHED_SIZE = 4 << 20  # bytes of a file, and of what it holds, that is kept
+_MAX_ATTEMPTS = 3
+_TIMEOUT_PER_FILE = (
+    10 * mesh_process.MAX_SECONDS
+)  # [s] per file, for systems that do not limit computing
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles of one colour.
+
+    Attributes:
+        vertices: (V, 3) [units of the file].
+        faces: (F, 3) numbers of vertices.
+        colour: Red, green, blue, opacity, 0 to 1; None where the file has none.
+    """
+
+    vertices: Array
+    faces: np.ndarray
+    colour: tuple[float, float, float, float] | None
+
+
+def find_mesh_file(name: str, folder: Path) -> Path | None:
+    """The file that a mesh's name stands for, None if there is none, see `find_file`.
+
+    Args:
+        name: As `<mesh filename>` has it.
+        folder: Of the URDF.
+    """
+    found = find_file(name, folder)
+    return found if found is not None and found.is_file() else None
+
+
+def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]:
+    """Triangles of mesh files by their paths, or what is wrong with a file, in a few words.
+
+    Files may be damaged, or declare sizes beyond all memory: another process reads them, with 20 s
+    of computing and 2 GB per file. Where it ends at a file, it begins anew after that, twice. What
+    it says of small files is kept: it takes longer to start than to read a robot's meshes.
+    """
+    found: dict[Path, tuple[MeshPart, ...] | str] = {}
+    entry_names: dict[Path, str | None] = {}  # and under which name to keep what is said
+    for file in dict.fromkeys(files):
+        size = file.stat().st_size
+        if size > _MAX_FILE_SIZE:
+            found[file] = f"{size / 1e6:.0f} MB, more than {_MAX_FILE_SIZE / 1e6:.0f}"
+            continue
+        name = _cache_entry_name(file) if size <= _MAX_CACHED_SIZE else None
+        cached = None if name is None else file_cache.read_entry(name)
+        if cached is None:
+            entry_names[file] = name
+        else:
+            found[file] = _parse_answer(cached)
+    for _ in range(_MAX_ATTEMPTS):
+        remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
+            map(_count_triangles, found.values())
+        )
+        answers = _run_mesh_process(list(entry_names), remaining_triangles) if entry_names else []
+        for (file, name), answer in zip(list(entry_names.items()), answers, strict=False):
+            found[file] = _parse_answer(answer)
+            del entry_names[file]
+            is_self_contained = len(answer) <= _MAX_CACHED_SIZE and _answer_header(answer).get(
+                "alone"
+            )
+            if name is not None and is_self_contained and name == _cache_entry_name(file):
+                file_cache.write_entry(name, answer)
+    return found | dict.fromkeys(
+        entry_names, f"not tried after {_MAX_ATTEMPTS} that ended the reader"
+    )
+
+
+def _cache_entry_name(file: Path) -> str:
+    """Under which what is said of a file is kept: by the content, and by who reads it."""
+    builds = [file_cache.package_build(package) for package in ("trimesh", "collada")]
+    program = Path(mesh_process.__file__).read_bytes()
+    return file_cache.entry_name(
+        repr((sys.version, builds, program, file.suffix, file.read_bytes())), "mesh"
+    )
+
+
+def _count_triangles(parts_or_problem: tuple[MeshPart, ...] | str) -> int:
+    return (
+        0
+        if isinstance(parts_or_problem, str)
+        else sum(len(part.faces) for part in parts_or_problem)
+    )
+
+
+def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
+    """What the process says, of at least one file."""
+    program = [sys.executable, "-P", mesh_process.__file__]  # its folder has an xml.py
+    request = {"files": [str(file.resolve()) for file in files], "triangles": max_triangles}
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # threads count as memory
+    try:
+        completed = subprocess.run(
+            program,
+            input=json.dumps(request).encode(),
+            capture_output=True,
+            env=environment,
+            timeout=_TIMEOUT_PER_FILE * len(files),
+        )
+        output, status = completed.stdout, completed.returncode
+    except subprocess.TimeoutExpired as late:
+        output, status = late.stdout or b"", -signal.SIGTERM
+    answers = list(_split_answers(output))
+    if len(answers) < len(files):
+        is_too_slow = status in (-signal.SIGTERM, -getattr(signal, "SIGXCPU", 0))
+        reason = (
+            f"reading it takes more than {mesh_process.MAX_SECONDS} s"
+            if is_too_slow
+            else "damaged"
+        )
+        answers.append(json.dumps({"wrong": reason}).encode() + b"\n")
+    return answers
+
+
+def _split_answers(output: bytes) -> Iterator[bytes]:
+    """Whole answers of the process."""
+    position = 0
+    while (end := output.find(b"\n", position)) >= 0:
+        parts = json.loads(output[position:end]).get("parts", ())
+        end += 1 + sum(map(_part_size, parts))
+        if end > len(output):
+            break
+        yield output[position:end]
+        position = end
+
+
+def _answer_header(answer: bytes) -> dict[str, Any]:
+    head: dict[str, Any] = json.loads(answer[: answer.index(b"\n")])
+    return head
+
+
+def _parse_answer(answer: bytes) -> tuple[MeshPart, ...] | str:
+    """The triangles of an answer, or what is wrong."""
+    header = _answer_header(answer)
+    if "wrong" in header:
+        return str(header["wrong"])
+    return tuple(_parse_parts(header["parts"], answer, answer.index(b"\n") + 1))
+
+
+def _part_size(part: dict[str, Any]) -> int:
+    """How many bytes the triangles of a part take."""
+    return 8 * 3 * int(part["vertices"] + part["faces"])
+
+
+def _parse_parts(
+    part_headers: list[dict[str, Any]], output: bytes, position: int
+) -> Iterator[MeshPart]:
+    """The parts that stand one after the other in an answer from a byte on."""
+    for part in part_headers:
+        v, f = 3 * part["vertices"], 3 * part["faces"]
+        vertices = np.frombuffer(output, np.float64, v, position).reshape(-1, 3)
+        faces = np.frombuffer(output, np.int64, f, position + 8 * v).reshape(-1, 3)
+        yield MeshPart(vertices, faces, part["colour"] and tuple(part["colour"]))
+        position += _part_size(part)

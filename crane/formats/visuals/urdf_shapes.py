@@ -1,0 +1,338 @@
+"""What URDFs draw: the shapes of visuals and collisions, read in one place.
+
+A shape that cannot be drawn is no reason to refuse a machine: it is told and left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.common.errors import DescriptionError
+from crane.common.samples import Array
+from crane.description.findings import raise_errors
+from crane.formats.visuals.mesh_files import MeshPart, find_mesh_file, read_meshes
+from crane.formats.xml_file import XmlFile
+
+Colour = tuple[float, float, float, float]
+
+DEFAULT_COLOUR: Colour = (0.62, 0.64, 0.67, 1.0)  # where a URDF names no colour
+_SHAPE_TAGS = ("box", "cylinder", "sphere", "capsule", "mesh")
+_MAX_DISTANCE = 1e6  # [m], beyond which nothing is drawn
+_MAX_NAME_LENGTH = 100  # characters of a name that are shown
+
+
+@dataclass(frozen=True)
+class BoxShape:
+    """Box about the origin, edges (3,) [m]."""
+
+    size: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class CylinderShape:
+    """Cylinder about the origin along z [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True)
+class SphereShape:
+    """Sphere about the origin [m]."""
+
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class MeshShape:
+    """Triangles: vertices (V, 3) [m], faces (F, 3)."""
+
+    vertices: Array
+    faces: np.ndarray
+
+
+Shape = BoxShape | CylinderShape | SphereShape | MeshShape
+
+
+@dataclass(frozen=True)
+class Visual:
+    """One coloured shape on a link.
+
+    Attributes:
+        link: Name of the link.
+        shape: What is drawn.
+        placement: (4, 4) pose of the shape in the link's frame.
+        colour: Red, green, blue, opacity, 0 to 1.
+        mesh_label: Name of the mesh that the shape is a part of, with file and line before it; ""
+            for other shapes.
+    """
+
+    link: str
+    shape: Shape
+    placement: Array
+    colour: Colour
+    mesh_label: str = ""
+
+    def bounding_corners(self) -> Array:
+        """(8, 3) corners, in the link's frame, of a box that encloses the shape."""
+        match self.shape:
+            case BoxShape(size):
+                high = np.array(size) / 2
+            case CylinderShape(radius, length):
+                high = np.array([radius, radius, length / 2])
+            case SphereShape(radius):
+                high = np.full(3, radius)
+            case MeshShape(vertices):
+                high = vertices.max(axis=0)
+        low = self.shape.vertices.min(axis=0) if isinstance(self.shape, MeshShape) else -high
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(8, 3)
+        return corners @ self.placement[:3, :3].T + self.placement[:3, 3]
+
+
+@dataclass(frozen=True)
+class UrdfShapes:
+    """What a URDF draws.
+
+    Attributes:
+        shapes: Of each tag that was asked for.
+        missing_meshes: Names of the meshes whose files are not there, each with its place, file
+            and line.
+        problems: What else cannot be drawn as it is, with file and line, what becomes of it, and
+            what to do.
+    """
+
+    shapes: Mapping[str, Sequence[Visual]]
+    missing_meshes: Mapping[str, str]
+    problems: Sequence[str]
+
+
+@dataclass(frozen=True)
+class _MeshReference:
+    """A mesh that is to be read: its scale (3,) and file."""
+
+    name: str
+    scale: tuple[float, ...]
+    file: Path | None
+
+
+def read_shapes(
+    xml: XmlFile, tags: Sequence[str] = ("visual",), replacement: BoxShape | None = None
+) -> UrdfShapes:
+    """The shapes in a URDF that can be drawn.
+
+    Args:
+        xml: The file.
+        tags: Of elements in links that have shapes, visual and collision.
+        replacement: Is drawn in the place of a mesh that cannot be read; None to leave it out.
+    """
+    reader = _ShapeReader(xml)
+    shapes = {tag: reader.read_elements(tag) for tag in tags}
+    meshes = read_meshes(
+        shape.shape.file
+        for unloaded in shapes.values()
+        for shape in unloaded
+        if isinstance(shape.shape, _MeshReference) and shape.shape.file is not None
+    )
+    return UrdfShapes(
+        {
+            tag: [
+                visual
+                for drawn in found
+                for visual in reader.create_visuals(drawn, meshes, replacement)
+            ]
+            for tag, found in shapes.items()
+        },
+        reader.missing_meshes,
+        tuple(dict.fromkeys(reader.problems)),
+    )
+
+
+@dataclass(frozen=True)
+class _UnloadedShape:
+    """A shape where it stands, before its mesh is read."""
+
+    link: str
+    shape: Shape | _MeshReference
+    placement: Array
+    colour: Colour | None
+    source_location: str
+
+
+class _ShapeReader:
+    """Reads a file, and remembers what is wrong with it."""
+
+    def __init__(self, xml: XmlFile):
+        self.xml = xml
+        self.missing_meshes: dict[str, str] = {}
+        self._damaged_meshes: dict[str, str] = {}
+        self.problems: list[str] = []
+        with raise_errors():
+            self._colours = {
+                material.get("name", "").strip(): colour
+                for material in reversed(list(xml.root.iter("material")))  # the first one counts
+                if (colour := self._read_colour(material)) is not None
+            }
+        self.problems.clear()  # which are told where they are used
+
+    def read_elements(self, tag: str) -> list[_UnloadedShape]:
+        """Shapes of elements with a tag."""
+        found: list[_UnloadedShape] = []
+        for element in self.xml.root.iterfind(f"link/{tag}"):
+            link = element.getparent().get("name", "").strip()
+            try:
+                found += self._read_element(element, link, f"a {tag} of link '{link}'")
+            except DescriptionError as error:
+                self.problems.append(f"{error}; it is not drawn")
+        return found
+
+    @raise_errors()
+    def _read_element(
+        self, element: etree._Element, link: str, label: str
+    ) -> list[_UnloadedShape]:
+        xyz, rpy = self.xml.placement(element, label)
+        self._check_distance(element, label, xyz)
+        placement = _pose_matrix(xyz, rpy)
+        material = self.xml.single_child(element, "material", label)
+        colour = None
+        if material is not None:
+            colour = self._read_colour(material) or self._colours.get(
+                material.get("name", "").strip()
+            )
+        geometry = self.xml.single_child(element, "geometry", label)
+        shapes = [] if geometry is None else [x for x in geometry if isinstance(x.tag, str)]
+        if len(shapes) != 1 or shapes[0].tag not in _SHAPE_TAGS:
+            shape_text = ", ".join(f"<{shape.tag}>" for shape in shapes[:4]) or "no shape"
+            listed = ", ".join(f"<{shape}>" for shape in _SHAPE_TAGS)
+            raise self.xml.error_at(element, f"{label} has {shape_text}, give one of {listed}")
+        source_location = self.xml.source_location(shapes[0])
+        return [
+            _UnloadedShape(link, shape, placement @ offset, colour, source_location)
+            for shape, offset in self._read_shape(shapes[0], label)
+        ]
+
+    def _read_shape(
+        self, shape: etree._Element, label: str
+    ) -> list[tuple[Shape | _MeshReference, Array]]:
+        """A shape, each part with its pose (4, 4) in it."""
+        identity = np.eye(4)
+        if shape.tag == "mesh":
+            name = shape.get("filename", "")
+            if not name:
+                raise self.xml.error_at(shape, f'{label} names no mesh, add filename="..."')
+            scale = self.xml.vector(shape, "scale", label, 3, (1.0, 1.0, 1.0))
+            folder = self.xml.file.parent
+            return [(_MeshReference(name, scale, find_mesh_file(name, folder)), identity)]
+        if shape.tag == "box":
+            x, y, z = self._read_sizes(shape, "size", label, 3)
+            return [(BoxShape((x, y, z)), identity)]
+        (radius,) = self._read_sizes(shape, "radius", label, 1)
+        if shape.tag == "sphere":
+            return [(SphereShape(radius), identity)]
+        (length,) = self._read_sizes(shape, "length", label, 1)
+        parts: list[tuple[Shape | _MeshReference, Array]] = [
+            (CylinderShape(radius, length), identity)
+        ]
+        if shape.tag == "capsule":  # whose length is that between the centres of its balls
+            for end in (-length / 2, length / 2):
+                parts.append((SphereShape(radius), _pose_matrix((0.0, 0.0, end))))
+        return parts
+
+    def _read_sizes(
+        self, shape: etree._Element, key: str, label: str, count: int
+    ) -> tuple[float, ...]:
+        sizes = self.xml.vector(shape, key, label, count)
+        if min(sizes) <= 0:
+            given = f'{key}="{shape.get(key)}"'
+            raise self.xml.error_at(shape, f"{given} of {label} is not positive, give metres")
+        self._check_distance(shape, label, sizes)
+        return sizes
+
+    def _check_distance(
+        self, element: etree._Element, label: str, lengths: Sequence[float]
+    ) -> None:
+        largest = max(lengths, key=abs)
+        if abs(largest) > _MAX_DISTANCE:
+            raise self.xml.error_at(element, f"{label} has a length of {largest:g} m, give metres")
+
+    def _read_colour(self, material: etree._Element) -> Colour | None:
+        """The colour of a material, if it has one that is one."""
+        colour = material.find("color")
+        if colour is None:
+            return None
+        try:
+            rgba = self.xml.vector(colour, "rgba", "a colour", 4)
+            if not 0 <= min(rgba) <= max(rgba) <= 1:
+                given = f'rgba="{colour.get("rgba")}"'
+                raise self.xml.error_at(
+                    colour, f"{given} of a colour is not within 0 to 1, correct it"
+                )
+        except DescriptionError as error:
+            self.problems.append(f"{error}; grey is drawn")
+            return None
+        red, green, blue, opacity = rgba
+        return red, green, blue, opacity
+
+    def create_visuals(
+        self,
+        unloaded: _UnloadedShape,
+        meshes: Mapping[Path, tuple[MeshPart, ...] | str],
+        replacement: BoxShape | None,
+    ) -> list[Visual]:
+        """A shape with what its mesh holds, if it is one."""
+        shape = unloaded.shape
+        if not isinstance(shape, _MeshReference):
+            return [
+                Visual(unloaded.link, shape, unloaded.placement, unloaded.colour or DEFAULT_COLOUR)
+            ]
+        short_name = (
+            shape.name
+            if len(shape.name) < _MAX_NAME_LENGTH
+            else f"...{shape.name[-_MAX_NAME_LENGTH:]}"
+        )
+        mesh_label = f"{unloaded.source_location}: mesh '{short_name}'"
+        parts = () if shape.file is None else meshes[shape.file]
+        if shape.file is None:
+            self.missing_meshes.setdefault(short_name, unloaded.source_location)
+        elif isinstance(parts, str):
+            first_location = self._damaged_meshes.setdefault(short_name, unloaded.source_location)
+            self.problems.append(
+                f"{first_location}: mesh file '{short_name}' cannot be read ({parts}), export "
+                f"it again; a box "
+                "is drawn instead"
+            )
+        elif any(_largest_coordinate(part, shape.scale) > _MAX_DISTANCE for part in parts):
+            self.problems.append(
+                f"{mesh_label} is far larger than a machine, scale it; a box is drawn instead"
+            )
+        else:
+            return [
+                Visual(
+                    unloaded.link,
+                    MeshShape(part.vertices * shape.scale, part.faces),
+                    unloaded.placement,
+                    unloaded.colour or part.colour or DEFAULT_COLOUR,
+                    mesh_label,
+                )
+                for part in parts
+            ]
+        if replacement is None:
+            return []
+        return [
+            Visual(
+                unloaded.link, replacement, unloaded.placement, unloaded.colour or DEFAULT_COLOUR
+            )
+        ]
+
+
+def _largest_coordinate(part: MeshPart, scale: tuple[float, ...]) -> float:
+    with np.errstate(over="ignore"):
+        return float(np.abs(part.vertices * scale).max())
+
+
+def _pose_matrix(xyz: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
+    """(4, 4) pose; angles about the fixed axes x, y, z."""
+    return np.asarray(pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz)).homogeneous)

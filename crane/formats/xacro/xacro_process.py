@@ -1,0 +1,163 @@
+"""A process that expands a xacro file: whatever is in it can end this process, and nothing else.
+
+Run by crane.formats.xacro.xacro_expansion with what it needs as JSON on its input; it writes a
+line of JSON. xacro computes with Python's expressions, without bounds, so time and memory are
+limited.
+
+Every element of the result says where it was written: the attribute `LOCATION_ATTRIBUTE` has the
+number of its file and its line.
+"""
+
+import json
+import os
+import sys
+import types
+from pathlib import Path
+from typing import Any
+from xml.dom import expatbuilder
+from xml.parsers.expat import ExpatError
+
+MAX_MEMORY, MAX_SECONDS = 2 << 30, 20  # [bytes], [s] of computing
+MAX_LENGTH = 50_000_000  # characters of an expanded file
+LOCATION_ATTRIBUTE = "crane_place"
+_XACRO_PREFIX = "xacro:"
+
+
+def main() -> None:
+    """Expand what is asked for."""
+    output = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null_device, 1)  # the output is ours alone
+    os.dup2(null_device, 2)
+    request = json.load(sys.stdin)
+    sys.path.insert(0, request["root"])
+    try:
+        import xacro
+    except ImportError:
+        answer: dict[str, Any] = {"missing": True}
+    else:
+        _limit_resources()
+        answer = _expand(xacro, request)
+    output.write(json.dumps(answer) + "\n")
+    output.flush()
+
+
+def _limit_resources() -> None:
+    """Bound time and memory, where the system can."""
+    try:
+        import resource
+    except ImportError:
+        return
+    for resource_kind, maximum in (
+        (resource.RLIMIT_CPU, MAX_SECONDS),
+        (resource.RLIMIT_AS, MAX_MEMORY),
+    ):
+        hard_limit = resource.getrlimit(resource_kind)[1]
+        resource.setrlimit(
+            resource_kind, (maximum if hard_limit < 0 else min(maximum, hard_limit), hard_limit)
+        )
+
+
+class _ReadFiles:
+    """The files that were read, with the lines of their elements, and the arguments they have."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.arguments: dict[str, None] = {}
+
+    def parse_file(self, file: str) -> Any:
+        """The document of a file, each element but those of xacro with its place."""
+        number = len(self.names)
+        self.names.append(file)
+        files = self
+
+        class Marking(expatbuilder.ExpatBuilderNS):
+            def start_element_handler(self, name: str, attributes: list[str]) -> None:
+                super().start_element_handler(name, attributes)
+                files.set_location(self.curNode, number, self.getParser().CurrentLineNumber)
+
+        return Marking().parseString(Path(file).read_bytes())
+
+    def set_location(self, element: Any, number: int, line: int) -> None:
+        """Note where an element was written."""
+        if not element.tagName.startswith(_XACRO_PREFIX):
+            element.setAttribute(LOCATION_ATTRIBUTE, f"{number}:{line}")
+        elif element.localName == "arg":
+            self.arguments[element.getAttribute("name")] = None
+
+
+def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
+    files = _ReadFiles()
+    missing: list[str] = []
+    _provide_package_search(Path(request["file"]).parent, request["packages"], missing, xacro)
+
+    def parse(inp: Any, filename: str | None = None) -> Any:
+        if filename is None:
+            return inp
+        try:
+            return files.parse_file(filename)
+        except OSError as error:
+            xacro.filestack.pop()
+            raise xacro.XacroException(f"{error.strerror}: {filename}", exc=error) from None
+
+    xacro.parse = parse
+    found: dict[str, Any] = {}
+    try:
+        text = xacro.process_file(request["file"], mappings=dict(request["arguments"])).toxml()
+        if len(text) > MAX_LENGTH:
+            return {"wrong": f"it grows beyond {MAX_LENGTH} characters", "file": request["file"]}
+        found["text"] = text
+    except ExpatError as error:
+        words = str(error).partition(": line")[0]
+        found = {"wrong": f"not XML, {words}", "file": files.names[-1], "line": error.lineno}
+    except MemoryError:
+        found["wrong"] = f"expanding it takes more than {MAX_MEMORY >> 30} GB"
+    except RecursionError:
+        found["wrong"] = "its macros or files use themselves without end"
+    except Exception as error:  # whatever xacro and the expressions in a file raise
+        found["wrong"] = " ".join(str(error).split())[:300] or type(error).__name__
+    if "wrong" in found and missing:
+        found |= {"package": missing[0]}
+    stack = [name for name in (getattr(xacro, "filestack", None) or []) if name]
+    return {"file": stack[-1] if stack else request["file"], "files": files.names,
+            "arguments": list(files.arguments), **found}  # fmt: skip
+
+
+def _provide_package_search(
+    folder: Path, packages: list[str], missing_packages: list[str], xacro: Any
+) -> None:
+    """Let xacro find packages as this program does, whether ROS is installed or not."""
+    from crane.common.package_search import find_file, find_package, use_load_options
+
+    def share(name: str) -> str:
+        here = Path(next((x for x in reversed(xacro.filestack or []) if x), folder / "x")).parent
+        with use_load_options(packages):
+            found = find_package(name, here) or find_package(name, folder)
+        if found is None:
+            missing_packages.append(name)
+            raise LookupError(f"package '{name}' is not found")
+        return str(found)
+
+    original_function = xacro.abs_filename_spec
+
+    def absolute(name: str) -> str:
+        if "://" not in name:
+            return str(original_function(name))
+        package = name.partition("://")[2].partition("/")[0]
+        with use_load_options(packages):
+            found = find_file(name, folder)
+            if found is None and find_package(package, folder) is None:
+                missing_packages.append(package)
+        if found is None:
+            raise LookupError(f"there is no '{name}'")
+        return str(found)
+
+    replacement_module = types.ModuleType("ament_index_python.packages")
+    replacement_module.get_package_share_directory = share  # type: ignore[attr-defined]
+    sys.modules["ament_index_python"] = types.ModuleType("ament_index_python")
+    sys.modules["ament_index_python.packages"] = replacement_module
+    xacro.abs_filename_spec = absolute
+
+
+if __name__ == "__main__":
+    main()

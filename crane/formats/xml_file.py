@@ -1,0 +1,344 @@
+"""Strict reading of XML: nothing is expanded or fetched, every error has its line."""
+
+import math
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from lxml import etree
+
+from crane.common.errors import DescriptionError, suggest_names
+from crane.common.file_contents import read_plain_file
+from crane.description.findings import report_error
+from crane.description.kinematic_tree import Placement, Vector
+from crane.description.specification import AXISLESS_TYPES, unit_vector
+
+MAX_FILE_SIZE = 50_000_000  # bytes of a file
+_X = (1.0, 0.0, 0.0)
+_ROOT_ELEMENTS = {  # what a file holds by its suffix, if not a <robot>
+    ".sdf": "an <sdf>", ".world": "an <sdf>", ".mjcf": "a <mujoco>",
+    ".xml": "a <robot>, an <sdf> or a <mujoco>",
+}  # fmt: skip
+_MAX_LINE_NUMBER = 1 << 16
+_MAX_VALUE_LENGTH = 60  # characters of a value in an error
+_REPEATABLE_ELEMENTS = {
+    "link",
+    "joint",
+    "loop",
+    "visual",
+    "collision",
+}  # elements that there may be more of
+
+
+class SourceLocations:
+    """Where elements were written that come from several files.
+
+    Args:
+        file: Name of the file for all that has no place of its own.
+
+    Attributes:
+        locations: Files and lines.
+    """
+
+    def __init__(self, file: str):
+        self.locations = [file]
+        self._location_numbers = {file: 0}
+
+    def set_location(self, element: etree._Element, location: str) -> None:
+        """Say where an element was written."""
+        number = self._location_numbers.setdefault(location, len(self.locations))
+        if number == len(self.locations):
+            self.locations.append(location)
+        element.sourceline = (
+            number if number < _MAX_LINE_NUMBER else 0
+        )  # all that the parser holds
+
+
+class _RootDetector:
+    """What a parser finds up to the root element, in whatever encoding the file is."""
+
+    class RootFound(Exception):  # noqa: N818
+        """The root element is there."""
+
+    class DocumentTypeFound(Exception):  # noqa: N818
+        """There is one."""
+
+    def doctype(self, *_: object) -> None:
+        """Called before anything of it is declared."""
+        raise self.DocumentTypeFound
+
+    def start(self, *_: object) -> None:
+        """Called at each element."""
+        raise self.RootFound
+
+    def end(self, *_: object) -> None:
+        """Never called."""
+
+    def close(self) -> None:
+        """Called at the end of a file without elements."""
+
+
+def _refuse_document_type(file: Path, data: bytes) -> None:
+    """Raise for <!DOCTYPE>, whose entities may grow without bounds, or fetch."""
+    try:
+        etree.fromstring(data, etree.XMLParser(target=_RootDetector(), no_network=True))
+    except _RootDetector.DocumentTypeFound:
+        line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
+        raise DescriptionError(
+            f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
+        ) from None
+    except (_RootDetector.RootFound, etree.XMLSyntaxError):  # told by whoever reads all
+        pass
+
+
+class XmlFile:
+    """An XML file.
+
+    Args:
+        file: The file.
+
+    Attributes:
+        file: The file.
+        root: Its root element, without comments.
+        unnamed_kinds: Kinds of elements of which one has no name of its own.
+        locations: Where elements were written, if they come from several files: `sourceline` of an
+            element is a number in this list then.
+
+    Raises:
+        DescriptionError: The file cannot be read, is not XML, or has a document type.
+    """
+
+    def __init__(self, file: Path):
+        self.file = file
+        self.unnamed_kinds: set[str] = set()
+        self.locations: Sequence[str] = ()
+        try:
+            data = read_plain_file(file, MAX_FILE_SIZE)
+        except OSError as error:
+            raise DescriptionError(
+                f"{file}: cannot be read ({error.strerror}), check the path"
+            ) from None
+        if not data.strip():
+            root = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
+            raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
+        _refuse_document_type(file, data)
+        if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
+            try:
+                data.decode("utf-8")
+            except UnicodeDecodeError as error:
+                line = data.count(b"\n", 0, error.start) + 1
+                raise DescriptionError(
+                    f"{file.name}:{line}: not UTF-8, save it as UTF-8 or declare its encoding"
+                ) from None
+        parser = etree.XMLParser(
+            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+        )
+        try:
+            self.root = etree.fromstring(data, parser)
+        except etree.XMLSyntaxError as error:
+            text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
+            raise DescriptionError(
+                f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
+            ) from None
+
+    @classmethod
+    def from_root(cls, file: Path, root: etree._Element, locations: Sequence[str]) -> "XmlFile":
+        """What a file stands for: a root element made of it, and where each part was written."""
+        xml = cls.__new__(cls)
+        xml.file, xml.root, xml.unnamed_kinds, xml.locations = file, root, set(), locations
+        return xml
+
+    def source_location(self, element: etree._Element) -> str:
+        """File and line of an element."""
+        if self.locations:
+            number = element.sourceline or 0
+            return self.locations[number if number < len(self.locations) else 0]
+        return f"{self.file.name}:{element.sourceline}"
+
+    def error_at(self, element: etree._Element, problem: str) -> DescriptionError:
+        """An error that points at an element."""
+        return DescriptionError(f"{self.source_location(element)}: {problem}")
+
+    def check_elements(
+        self,
+        element: etree._Element,
+        children: Mapping[str, set[str]],
+        attributes: Mapping[str, set[str]],
+        closed_elements: set[str],
+    ) -> None:
+        """Raise for tags and attributes that are slips of known ones, or in a wrong place.
+
+        Foreign ones (sensors, settings of simulators) are common and ignored, apart from
+        attributes of the elements `closed_elements`. Where findings are collected, slips are
+        mended, so that what stands there is read, too.
+
+        Args:
+            element: Where to begin.
+            children: Tags that an element may contain.
+            attributes: Attributes that an element may have.
+            closed_elements: Elements that have no others.
+
+        Raises:
+            DescriptionError: There is a slip.
+        """
+        self._check_attributes(element, attributes.get(element.tag, set()), closed_elements)
+        tags = children.get(element.tag, set())
+        for child in element:
+            if not isinstance(child.tag, str):  # an entity, not expanded
+                continue
+            if child.tag not in tags:
+                self._check_unknown_child(element, child, children)
+            if child.tag in tags:  # now
+                self.check_elements(child, children, attributes, closed_elements)
+
+    def _check_attributes(
+        self, element: etree._Element, known_attributes: set[str], closed_elements: set[str]
+    ) -> None:
+        for key in element.keys() if known_attributes else ():
+            if key in known_attributes:
+                continue
+            similar = get_close_matches(key.lower(), known_attributes, 1, 0.75)
+            is_correctable = bool(similar) and element.get(similar[0]) is None
+            if element.tag in closed_elements or is_correctable:
+                hint = suggest_names(known_attributes, key.lower())
+                problem = f'unknown {key}="..." in <{element.tag}>, {hint}'
+                report_error(self.error_at(element, problem), harmless=is_correctable)
+            if is_correctable:
+                element.set(similar[0], element.attrib.pop(key))
+
+    def _check_unknown_child(
+        self, element: etree._Element, child: etree._Element, children: Mapping[str, set[str]]
+    ) -> None:
+        """A child whose tag its parent does not have: a slip, in a wrong place, or foreign."""
+        tags = children.get(element.tag, set())
+        similar = get_close_matches(child.tag.lower(), tags, 1, 0.75)
+        if similar:
+            hint = suggest_names(tags, child.tag.lower())
+            is_correctable = similar[0] in _REPEATABLE_ELEMENTS or element.find(similar[0]) is None
+            problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
+            report_error(self.error_at(child, problem), harmless=is_correctable)
+            if is_correctable:
+                child.tag = similar[0]
+        elif any(child.tag in x for x in children.values() if tags):
+            report_error(
+                self.error_at(child, f"<{child.tag}> has no place in <{element.tag}>, move it")
+            )
+
+    def single_child(self, element: etree._Element, tag: str, label: str) -> etree._Element | None:
+        """The child with a tag, if there is one.
+
+        Raises:
+            DescriptionError: There are several.
+        """
+        found = element.findall(tag)
+        if len(found) > 1:
+            report_error(self.error_at(found[1], f"{label} has {len(found)} <{tag}>, keep one"))
+        return found[0] if found else None
+
+    def number(
+        self, element: etree._Element, name: str, label: str, default: float | None = None
+    ) -> float:
+        """A finite number.
+
+        Args:
+            element: The element.
+            name: Its attribute.
+            label: What it describes, for errors.
+            default: Value of a missing attribute; None if it must not be missing.
+
+        Raises:
+            DescriptionError: Missing, not a number or not finite. Where findings are collected,
+                it is noted, and the number is NaN.
+        """
+        return self.vector(element, name, label, 1, None if default is None else (default,))[0]
+
+    def vector(
+        self,
+        element: etree._Element,
+        name: str,
+        label: str,
+        length: int,
+        default: tuple[float, ...] | None = None,
+    ) -> tuple[float, ...]:
+        """Finite numbers, as `number`."""
+        try:
+            return self._read_vector(element, name, label, length, default)
+        except DescriptionError as error:
+            report_error(error)
+            return (math.nan,) * length
+
+    def _read_vector(
+        self,
+        element: etree._Element,
+        name: str,
+        label: str,
+        length: int,
+        default: tuple[float, ...] | None,
+    ) -> tuple[float, ...]:
+        text = element.get(name)
+        if text is None:
+            if default is None:
+                raise self.error_at(element, f'{label} has no {name}, add {name}="..."')
+            return default
+        short_text = text if len(text) < _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "..."
+        return self.parse_numbers(element, text, f'{name}="{short_text}" of {label}', length)
+
+    def parse_numbers(
+        self, element: etree._Element, text: str, label: str, length: int
+    ) -> tuple[float, ...]:
+        """Finite numbers in a text.
+
+        Args:
+            element: Where it stands.
+            text: The text.
+            label: What it describes, for errors.
+            length: How many numbers there have to be.
+
+        Raises:
+            DescriptionError: There are others.
+        """
+        words = text.split()
+        try:
+            values = tuple(float(word) for word in words)
+        except ValueError:
+            hint = "write digits"
+            if "," in text:
+                hint = "write a decimal point"
+            if "${" in text:
+                hint = "expand the file with xacro"
+            raise self.error_at(element, f"{label} is not a number, {hint}") from None
+        if len(values) != length:
+            raise self.error_at(element, f"{label} has {len(values)} numbers, give {length}")
+        if not all(math.isfinite(value) for value in values):
+            raise self.error_at(element, f"{label} is not finite, give a number")
+        return values
+
+    def direction(self, element: etree._Element, label: str, default: tuple[float, ...]) -> Vector:
+        """Unit vector of the child `<axis xyz="..."/>`; not read where the type uses none.
+
+        Raises:
+            DescriptionError: It is zero or malformed.
+        """
+        if element.get("type") in AXISLESS_TYPES:
+            return _X
+        axis = self.single_child(element, "axis", label)
+        xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {label}", 3)
+        if (unit := unit_vector(xyz)) is None:
+            report_error(self.error_at(axis, f"the axis of {label} is zero, give a direction"))
+            return _X
+        return unit
+
+    def placement(self, element: etree._Element, label: str) -> Placement:
+        """Numbers xyz [m] and rpy [rad] of the child `<origin/>`, zeros without one.
+
+        Raises:
+            DescriptionError: They are malformed.
+        """
+        origin = self.single_child(element, "origin", label)
+        zero = (0.0, 0.0, 0.0)
+        if origin is None:
+            return zero, zero
+        (x, y, z), (roll, pitch, yaw) = (
+            self.vector(origin, key, f"the origin of {label}", 3, zero) for key in ("xyz", "rpy")
+        )
+        return (x, y, z), (roll, pitch, yaw)

@@ -1,0 +1,281 @@
+"""What a calibration found, how well it is known, and how well the machine follows now."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.identification.calibration.calibration_problem import noise_std
+from crane.identification.calibration.correlated_parameters import correlated_directions
+from crane.identification.calibration.profile_likelihood import ProfileEnds
+from crane.identification.calibration.score_test import ScoreTestResult
+from crane.machine import Machine
+
+_DEGRADATION_FACTOR = 1.1  # times what was left before
+LOWER_MINIMUM_WARNING = (
+    "Near these numbers the machine follows better still, where the search did not end: calibrate "
+    "again from there, or fit fewer numbers."
+)
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """One number.
+
+    Attributes:
+        name: Its name.
+        start: Before.
+        value: Fitted.
+        interval_half_width: Half of its interval of 95 %, as if there were no bounds.
+        at_bound: Whether it is on a bound.
+        is_unidentifiable: Whether the recordings do not tell it.
+        unit: Its SI unit, "" of a common factor.
+        members: Numbers of the machine and its sensors that it changed, as they were.
+        profile_ends: What the simulation says of the interval's ends.
+    """
+
+    name: str
+    start: float
+    value: float
+    interval_half_width: float
+    at_bound: bool
+    is_unidentifiable: bool
+    unit: str = ""
+    members: tuple[tuple[str, float], ...] = ()
+    profile_ends: ProfileEnds = ProfileEnds()
+
+    @property
+    def is_common_factor(self) -> bool:
+        """Whether it is a common factor of several numbers."""
+        return "*" in self.name
+
+    @property
+    def initial_value(self) -> float:
+        """What the machine had, 1 of a common factor."""
+        return 1.0 if self.is_common_factor or not self.members else self.members[0][1]
+
+    @property
+    def changed_significantly(self) -> bool:
+        """Whether what the machine had is outside of the interval of what is told."""
+        return (
+            not (self.is_unidentifiable or self.at_bound)
+            and abs(self.value - self.initial_value) > self.interval_half_width
+        )
+
+    @property
+    def remark(self) -> str:
+        """What is to be known beside the interval."""
+        status = (
+            "on its bound"
+            if self.at_bound
+            else "not told by the recordings" * self.is_unidentifiable
+        )
+        return ", ".join(filter(None, (status, self.profile_ends.remark)))
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Words for each number of the machine, as comments of a file have them."""
+        interval_text, remark = (
+            f"±{self.interval_half_width:.2g}, 95 %",
+            self.remark and f", {self.remark}",
+        )
+        if not self.is_common_factor:
+            return {
+                name: f"fitted {interval_text}{remark} (was {was:.6g})"
+                for name, was in self.members
+            }
+        factor_text = f"{self.value:.5g} {interval_text}{remark}"
+        return {
+            name: f"fitted by {self.name} = {factor_text} (was {was:.6g})"
+            for name, was in self.members
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationChannel(OneLineRepr):
+    """A channel of a recording, SI units.
+
+    Attributes:
+        recording: Name of its file.
+        name: Of the column.
+        unit: Its unit.
+        time: (N,) [s].
+        train_mask: (N,) which instants were fitted.
+        measured: (N,).
+        simulated_before: (N,) simulated as the machine was.
+        simulated_after: (N,) as it is now.
+    """
+
+    recording: str
+    name: str
+    unit: str
+    time: Array
+    train_mask: NDArray[np.bool_]
+    measured: Array
+    simulated_before: Array
+    simulated_after: Array
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of its noise, see `noise_std`."""
+        return noise_std(self.measured)
+
+    def rms(self, simulated: Array, training: bool) -> float:
+        """Root mean square of simulated less measured, over what was fitted or held out."""
+        mask = self.train_mask if training else np.logical_not(self.train_mask)
+        residual = (simulated - self.measured)[mask]
+        return float(np.sqrt(np.mean(residual**2))) if len(residual) else float("nan")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(OneLineRepr):
+    """A machine fitted to recordings.
+
+    Attributes:
+        machine: With the fitted numbers.
+        parameters: Numbers, in the order in which they were named.
+        channels: Channels before and after.
+        changes: Numbers of the machine that differ, as `crane.load(changes=)` takes them.
+        correlated_pairs: Pairs of names that the recordings tell apart badly, with their
+            correlation.
+        simulation_count: Simulations it took.
+        score_tests: Numbers that were not fitted and would help.
+        correlation: (n, n) of the numbers.
+        states: By recording, velocities and chamber pressures of the drives of the fitted machine.
+        is_lowest_minimum: Whether no lower minimum was seen at the ends of the intervals.
+        unobserved_parameters: Numbers that were chosen and of which nothing was seen; they stay as
+            they were.
+    """
+
+    machine: Machine
+    parameters: tuple[FittedParameter, ...]
+    channels: tuple[CalibrationChannel, ...]
+    changes: Mapping[str, float]
+    correlated_pairs: tuple[tuple[str, str, float], ...]
+    simulation_count: int
+    score_tests: tuple[ScoreTestResult, ...] = ()
+    correlation: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    states: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+    is_lowest_minimum: bool = True
+    unobserved_parameters: tuple[str, ...] = ()
+
+    def _one_line(self) -> str:
+        """What was fitted to, and the numbers that are told."""
+        identifiable = [x for x in self.parameters if not (x.at_bound or x.is_unidentifiable)]
+        values = ", ".join(f"{x.name} = {x.value:.5g}" for x in identifiable)
+        numbers, channels = format_count(len(self.parameters), "number"), len(self.channels)
+        return (
+            f"Calibration of '{self.machine.name}': {len(identifiable)} of {numbers} told by "
+            f"{format_count(channels, 'channel')}{': ' * bool(identifiable)}{values}"
+        )
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What is to be said of the fitted numbers beside them, by name."""
+        return {name: text for one in self.parameters for name, text in one.notes.items()}
+
+    @property
+    def correlated_directions(self) -> list[dict[str, float]]:
+        """What the recordings cannot tell apart, see `together`."""
+        half_widths = [one.interval_half_width for one in self.parameters]
+        return correlated_directions(
+            [one.name for one in self.parameters], self.correlation, np.array(half_widths)
+        )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Fitted numbers by name."""
+        return {one.name: one.value for one in self.parameters}
+
+    @property
+    def degraded_channels(self) -> list[str]:
+        """Channels that were held out and are followed worse than before."""
+        several = len({x.recording for x in self.channels}) > 1
+        return [
+            f"{x.recording}: {x.name}" if several else x.name
+            for x in self.channels
+            if x.rms(x.simulated_after, False)
+            > max(_DEGRADATION_FACTOR * x.rms(x.simulated_before, False), x.noise)
+        ]
+
+    @property
+    def cautions(self) -> list[str]:
+        """What is to be said of it as a whole."""
+        texts = [] if self.is_lowest_minimum else [LOWER_MINIMUM_WARNING]
+        if self.degraded_channels:
+            texts.append(
+                f"Held out, the machine follows worse than before in "
+                f"{', '.join(self.degraded_channels)}: fit "
+                "fewer numbers, or record more."
+            )
+        if self.unobserved_parameters:
+            texts.append(
+                "Nothing of these was seen, they are left as the machine has them: "
+                f"{', '.join(self.unobserved_parameters)}."
+            )
+        return texts
+
+    @property
+    def command_line_options(self) -> str:
+        """What the command line takes for the same machine."""
+        return " ".join(f"--set {name}={value:.8g}" for name, value in self.changes.items())
+
+    def describe_direction(self, direction: Mapping[str, float]) -> str:
+        """A direction in words: numbers that may change together."""
+        units = {one.name: one.unit for one in self.parameters}
+        return ", ".join(f"{x} by {by:+.2g} {units[x]}".rstrip() for x, by in direction.items())
+
+    def to_text(self) -> str:
+        """A report, Markdown."""
+        lines = [
+            "| number | before | fitted | 95 % interval | |",
+            "| --- | ---: | ---: | ---: | --- |",
+        ]
+        for one in self.parameters:
+            width = f"± {one.interval_half_width:.2g}"
+            lines.append(
+                f"| {one.name} | {one.start:.5g} | {one.value:.5g} | {width} | {one.remark} |"
+            )
+        for caution in self.cautions:
+            lines += ["", caution]
+        if self.correlated_pairs:
+            lines += ["", "Told apart badly, of which a combination alone is known:", ""]
+            lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.correlated_pairs]
+        if self.correlated_directions:
+            lines += ["", "What changes together without the recordings telling it:", ""]
+            lines += [
+                f"- {self.describe_direction(direction)}"
+                for direction in self.correlated_directions
+            ]
+        if self.score_tests:
+            lines += ["", "What would take away more of what is left, if it were fitted, too:", ""]
+            lines += [
+                f"- {x.name} at about {x.value:.3g}: {100 * x.cost_reduction:.0f} %"
+                for x in self.score_tests
+            ]
+        has_held_out = any(not sensor.train_mask.all() for sensor in self.channels)
+        lines += [
+            "",
+            "| channel | unit | before | fitted |"
+            + " held out, before | held out |" * has_held_out,
+            "| --- | --- | ---: | ---: |" + " ---: | ---: |" * has_held_out,
+        ]
+        several = len({sensor.recording for sensor in self.channels}) > 1
+        for sensor in self.channels:
+            unit, scale = display_unit(sensor.unit, float(np.ptp(sensor.measured)))
+            words = [
+                f"{scale * sensor.rms(simulated, train):.3g}"
+                for train in ((True, False) if has_held_out else (True,))
+                for simulated in (sensor.simulated_before, sensor.simulated_after)
+            ]
+            name = f"{sensor.recording}: {sensor.name}" if several else sensor.name
+            words = ["" if word == "nan" else word for word in words]
+            lines.append(f"| {name} | {unit} | {' | '.join(words)} |")
+        lines += ["", f"RMS of simulated less measured; {self.simulation_count} simulations."]
+        if self.changes:
+            lines += ["", f"    {self.command_line_options}"]
+        return "\n".join(lines)

@@ -1,0 +1,409 @@
+"""The search for a calibration: Levenberg and Marquardt's method within bounds."""
+
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from crane.common.errors import CraneError
+from crane.common.samples import Array
+from crane.dynamics.joint_forces import find_stick_slip_columns
+from crane.identification.calibration.calibration_problem import (
+    DERIVATIVE_TOLERANCE,
+    CalibrationProblem,
+    RecordingCase,
+    noise_std,
+)
+from crane.identification.calibration.score_test import ScoreTestResult, score_test
+from crane.identification.calibration.unknowns import Unknown
+
+Progress = Callable[[float], None]
+
+_MAX_WEIGHT_ROUNDS = 3  # of weights
+_SCALE_TOLERANCE = 0.05  # change of a channel's size, as a share, that ends them
+# shares of the smoothing of friction, and of that of derivatives: first, and in the end
+_SMOOTHING_SCHEDULE, _FINAL_SMOOTHING = (
+    ((1.0, 1.0), (0.3, 0.3), (0.1, 0.1), (0.0, 0.3)),
+    (0.0, 0.03),
+)
+_COVARIANCE_SMOOTHING = 0.1  # of derivatives that tell how well all is known
+_MAX_ITERATIONS = 40  # of Gauss-Newton between them
+_COST_TOLERANCE, _INITIAL_COST_TOLERANCE = (
+    1e-4,
+    1e-2,
+)  # change of the cost, as a share, that ends them
+_MIN_RELATIVE_SCALE, _MIN_SCALE = (
+    1e-6,
+    1e-9,
+)  # of a channel's largest value, and of one that is zero [SI]
+_MAX_SCALE_SHARE = 0.2  # of a channel's variation, that no channel may be off by for nothing
+_INITIAL_DAMPING, _CAUTIOUS_DAMPING = (
+    1e-3,
+    1.0,
+)  # Levenberg's damping at first, and far from the end
+_DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of it
+_PART_DURATION = 2.0  # [s] of recordings that are begun with
+_COARSE_DERIVATIVE_TOLERANCE = 1e-2  # error of derivatives far from the end
+_BLOCK_COUNT_RANGE = 8, 40  # least and most blocks of a covariance
+
+
+class LevenbergMarquardt:
+    """Levenberg and Marquardt's method within bounds, and the channels' weights.
+
+    Attributes:
+        channel_scales: (k,) by sensor, what is left of its channel.
+        jacobian: (M, p) weighted derivatives at the end, of what is fitted.
+        residual: (M,) weighted, likewise.
+        blocks: (M,) block of each row.
+    """
+
+    def __init__(
+        self, problem: CalibrationProblem, progress: Progress | None, iteration_count: int = 0
+    ):
+        self._problem, self._progress = problem, progress
+        unknowns = problem.unknowns
+        start_count = problem.unknown_count - len(unknowns)
+        self.low = np.array(
+            [(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * start_count
+        )
+        self.high = np.array(
+            [(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * start_count
+        )
+        self.prior = np.array([x.prior for x in unknowns] + [1.0] * start_count)
+        self.channel_scales: dict[str, float] = {}
+        self.jacobian = self.residual = self.blocks = np.zeros(0)
+        self._iteration_count = iteration_count
+        self._initial_guess: Array | None = None
+        self._has_stiction = bool(find_stick_slip_columns(problem.machine))
+
+    def restricted_search(self, problem: CalibrationProblem, z: Array) -> "LevenbergMarquardt":
+        """A search of fewer numbers that begins near where this one ended."""
+        search = LevenbergMarquardt(problem, self._progress, self._iteration_count)
+        search.channel_scales, search._initial_guess = self.channel_scales, z
+        return search
+
+    def run(self) -> Array:
+        """The unknowns."""
+        problem = self._problem
+        z = self.smoothed_minimum() if self._initial_guess is None else self._initial_guess
+        problem.derivative_tolerance = DERIVATIVE_TOLERANCE
+        # what smoothed friction leaves is no measure of what is left in the end: it is taken anew
+        for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
+            z = self._minimize(z, _INITIAL_COST_TOLERANCE)
+            self.channel_scales = self._updated_channel_scales(z)
+        return self.nearest_minimum(z)
+
+    def smoothed_minimum(self) -> Array:
+        """About the unknowns, with friction that is smoothed, and linearized there."""
+        problem = self._problem
+        self.channel_scales = self._max_channel_scales()
+        problem.smooth, problem.derivative_tolerance = (
+            float(self._has_stiction),
+            _COARSE_DERIVATIVE_TOLERANCE,
+        )
+        z = self._best_initial_minimum(np.zeros(problem.unknown_count))
+        self.channel_scales = self._updated_channel_scales(z)
+        z = self._minimize(z, _INITIAL_COST_TOLERANCE)
+        self._linearize(z)
+        return z
+
+    def nearest_minimum(self, z: Array) -> Array:
+        """The unknowns of the minimum that is nearest to others, with its own weights."""
+        problem = self._problem
+        problem.smooth, problem.slopes = _FINAL_SMOOTHING
+        for _ in range(_MAX_WEIGHT_ROUNDS):
+            z = self._minimize(z)
+            before, self.channel_scales = self.channel_scales, self._updated_channel_scales(z)
+            if all(
+                abs(np.log(x / before[name])) < _SCALE_TOLERANCE
+                for name, x in self.channel_scales.items()
+            ):
+                break
+        problem.slopes = _COVARIANCE_SMOOTHING
+        self._linearize(z)
+        if self._progress is not None:
+            self._progress(1.0)
+        return z
+
+    def _max_channel_scales(self) -> dict[str, float]:
+        """The largest size of each channel, by its variation and its noise."""
+        noise, spread = self._channel_noise(), self._channel_variation()
+        return {name: max(noise[name], _MAX_SCALE_SHARE * spread[name]) for name in noise}
+
+    def _updated_channel_scales(self, z: Array) -> dict[str, float]:
+        """Sizes of the channels by what is left of them."""
+        noise, max_scales = self._channel_noise(), self._max_channel_scales()
+        residual_rms = self._channel_rms(
+            [self._problem.residuals(case, z) for case in self._training_cases]
+        )
+        return {
+            name: min(max(noise[name], residual_rms[name]), max_scales[name])
+            for name in residual_rms
+        }
+
+    def _best_initial_minimum(self, z: Array) -> Array:
+        """The better one of two minima: from the file's numbers, and from those of short parts.
+
+        Over long motions, one swing more or less is a minimum, too, and so is what never moves.
+        """
+        problem, count = self._problem, len(self._problem.unknowns)
+        minima = [self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            parts = [
+                x
+                for case in self._training_cases
+                for x in case.split_training(problem.machine, _PART_DURATION)
+            ]
+        if parts:
+            part_problem = CalibrationProblem(problem.machine, problem.unknowns, parts)
+            part_problem.smooth, part_problem.derivative_tolerance = (
+                problem.smooth,
+                problem.derivative_tolerance,
+            )
+            search = LevenbergMarquardt(part_problem, self._progress, self._iteration_count)
+            search.channel_scales = self.channel_scales
+            part_minimum = search._minimize(
+                np.zeros(part_problem.unknown_count), _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING
+            )
+            self._iteration_count = search._iteration_count
+            problem.simulation_count += part_problem.simulation_count
+            z = z.copy()
+            z[:count] = part_minimum[:count]
+            if np.isfinite(self._cost(z)):
+                minima.append(self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING))
+        return min(minima, key=self._cost)
+
+    @property
+    def _training_cases(self) -> list[RecordingCase]:
+        return [case for case in self._problem.cases if case.train_mask.any()]
+
+    def _channel_noise(self) -> dict[str, float]:
+        """Of each channel, by its third differences, and no less than its digits."""
+        variances: dict[str, list[float]] = {}
+        largest: dict[str, float] = {}
+        for case in self._training_cases:
+            for name, x in zip(case.sensors, case.measured.T, strict=True):
+                known_noise = case.known_sensors[name].noise if name in case.known_sensors else 0.0
+                variances.setdefault(name, []).append((known_noise or noise_std(x)) ** 2)
+                largest[name] = max(largest.get(name, 0.0), float(np.abs(x).max()))
+        return {
+            name: max(float(np.sqrt(np.mean(x))), _MIN_RELATIVE_SCALE * largest[name], _MIN_SCALE)
+            for name, x in variances.items()
+        }
+
+    def _channel_variation(self) -> dict[str, float]:
+        """Of each channel, the largest variation of those in its unit.
+
+        How far a model is off depends on what moves, not on which channel does.
+        """
+        variation_by_unit: dict[str, float] = {}
+        units: dict[str, str] = {}
+        for case in self._training_cases:
+            for name, x in zip(case.sensors, case.measured[case.train_mask].T, strict=True):
+                units[name] = case.table.units[name]
+                variation_by_unit[units[name]] = max(
+                    variation_by_unit.get(units[name], 1e-12), float(np.std(x))
+                )
+        return {name: variation_by_unit[unit] for name, unit in units.items()}
+
+    def _channel_rms(self, residuals: list[Array]) -> dict[str, float]:
+        """Root mean square of each channel over what is fitted."""
+        residuals_by_channel: dict[str, list[Array]] = {}
+        for case, residual in zip(self._training_cases, residuals, strict=True):
+            for name, x in zip(case.sensors, residual[case.train_mask].T, strict=True):
+                residuals_by_channel.setdefault(name, []).append(x)
+        return {
+            name: max(float(np.sqrt(np.mean(np.concatenate(x) ** 2))), _MIN_SCALE)
+            for name, x in residuals_by_channel.items()
+        }
+
+    def _weights(self, case: RecordingCase) -> Array:
+        """(N, k) one over the channels' sizes, 0 of what is held out."""
+        return case.train_mask[:, None] / np.array(
+            [self.channel_scales[name] for name in case.sensors]
+        )
+
+    def weighted_residuals(self, z: Array) -> Array:
+        """(M,) weighted residuals.
+
+        Raises:
+            CraneError: The machine cannot be, or its simulation fails.
+        """
+        residuals = [
+            self._problem.residuals(case, z, training_only=True) * self._weights(case)
+            for case in self._training_cases
+        ]
+        return np.concatenate(
+            [
+                left[case.train_mask].ravel()
+                for left, case in zip(residuals, self._training_cases, strict=True)
+            ]
+        )
+
+    def _cost(self, z: Array) -> float:
+        """Half the sum of squares, infinite where the machine cannot be."""
+        total = float(np.sum((self.prior * z) ** 2))
+        for case in self._training_cases:
+            try:
+                residual = self._problem.residuals(case, z, training_only=True) * self._weights(
+                    case
+                )
+            except CraneError:
+                return np.inf
+            total += float(np.sum(residual**2))
+        return 0.5 * total
+
+    def _linearize(self, z: Array) -> None:
+        rows, weighted, blocks = [], [], []
+        for number, case in enumerate(self._training_cases):
+            residual, derivatives = self._problem.linearize(case, z)
+            weights = self._weights(case)
+            mask = case.train_mask
+            rows.append(
+                (derivatives * weights[:, :, None])[mask].reshape(-1, self._problem.unknown_count)
+            )
+            weighted.append((residual * weights)[mask].ravel())
+            time = np.repeat(case.inputs.time[mask], len(case.sensors))
+            blocks.append(time + 1e9 * number)
+        self.jacobian, self.residual = np.vstack(rows), np.concatenate(weighted)
+        self.blocks = np.concatenate(blocks)
+
+    def score_test(self, candidates: Sequence[Unknown], z: Array) -> list[ScoreTestResult]:
+        """Numbers that are not fitted and would help, see `ScoreTestResult`."""
+        problem = self._problem
+        if not candidates:
+            return []
+        extended_problem = CalibrationProblem(
+            problem.machine, [*problem.unknowns, *candidates], problem.cases
+        )
+        extended_problem.smooth, extended_problem.slopes = problem.smooth, problem.slopes
+        count, candidate_count = len(problem.unknowns), len(candidates)
+        extended_unknowns = np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
+        rows = []
+        for case, extended_case in zip(problem.cases, extended_problem.cases, strict=True):
+            if not case.train_mask.any():
+                continue
+            try:
+                _, derivatives = extended_problem.linearize(
+                    extended_case, extended_unknowns, set(range(count))
+                )
+            except CraneError:  # a hint is not worth what was found
+                return []
+            candidate_derivatives = (derivatives * self._weights(case)[:, :, None])[
+                case.train_mask
+            ]
+            rows.append(
+                candidate_derivatives.reshape(-1, extended_problem.unknown_count)[
+                    :, count : count + candidate_count
+                ]
+            )
+        return score_test(candidates, self.jacobian, np.vstack(rows), self.residual, self.prior)
+
+    def _minimize(
+        self, z: Array, cost_tolerance: float = _COST_TOLERANCE, damping: float = _INITIAL_DAMPING
+    ) -> Array:
+        """The nearest minimum for the present weights."""
+        cost = self._cost(z)
+        if not np.isfinite(cost):  # say why
+            for case in self._training_cases:
+                self._problem.residuals(case, z)
+        for _ in range(_MAX_ITERATIONS):
+            self._linearize(z)
+            hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+            gradient = self.jacobian.T @ self.residual + self.prior**2 * z
+            before = cost
+            while True:
+                trial = self._step(z, hessian, gradient, damping)
+                trial_cost = self._cost(trial)
+                self._report_progress()
+                if trial_cost < cost:
+                    z, cost, damping = trial, trial_cost, max(damping * _DAMPING_DECREASE, 1e-9)
+                    break
+                damping *= _DAMPING_INCREASE
+                if damping > _MAX_DAMPING:
+                    return z
+            if before - cost < cost_tolerance * before:
+                break
+        return z
+
+    def _step(self, z: Array, hessian: Array, gradient: Array, damping: float) -> Array:
+        """A damped step, of which what would leave its bounds stays on them."""
+        size = np.diag(hessian)
+        scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max()))
+        free = np.ones(len(z), dtype=bool)
+        step = np.zeros(len(z))
+        for _ in range(len(z)):
+            free_indices = np.flatnonzero(free)
+            right_side = (
+                -gradient[free_indices] - scaled[np.ix_(free_indices, ~free)] @ step[~free]
+            )
+            step[free_indices] = np.linalg.lstsq(
+                scaled[np.ix_(free_indices, free_indices)], right_side, rcond=1e-12
+            )[0]
+            trial = z + step
+            outside = free & ((trial < self.low) | (trial > self.high))
+            if not outside.any():
+                break
+            step[outside] = np.clip(trial, self.low, self.high)[outside] - z[outside]
+            free &= ~outside
+        return np.clip(z + step, self.low, self.high)
+
+    def _report_progress(self) -> None:
+        self._iteration_count += 1
+        if self._progress is not None:
+            self._progress(1.0 - 0.97**self._iteration_count)
+
+    def covariance(self, z: Array) -> tuple[Array, int]:
+        """(p, p) of the unknowns in their scales, and the number of blocks.
+
+        H^-1 (sum_b g_b g_b^T) H^-1 with g_b the gradient of a block, and at least that of white
+        noise; as if there were no bounds.
+        """
+        hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+        inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
+        length, count = self._block_duration()
+        numbers = np.unique(np.floor(self.blocks / length), return_inverse=True)[1]
+        row_gradients = self.jacobian * self.residual[:, None]
+        sums = np.zeros((numbers.max() + 1, len(z)))
+        np.add.at(sums, numbers, row_gradients)
+        count = len(sums)
+        meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
+        robust = inverse @ meat @ inverse
+        degrees_of_freedom = max(len(self.residual) - len(z), 1)
+        white = inverse * float(self.residual @ self.residual) / degrees_of_freedom
+        inflation = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
+        return robust * np.outer(inflation, inflation), count
+
+    def _block_duration(self) -> tuple[float, int]:
+        """Of a block [s]: four times over which what is left remembers itself."""
+        correlation_time, duration = 0.0, 0.0
+        for case in self._training_cases:
+            time = case.inputs.time[case.train_mask]
+            duration += float(time[-1] - time[0])
+        start = 0
+        for case in self._training_cases:
+            k, count = len(case.sensors), int(case.train_mask.sum())
+            rows = self.residual[start : start + k * count].reshape(count, k)
+            start += k * count
+            step = float(np.median(np.diff(case.inputs.time)))
+            for x in rows.T:
+                correlation_time = max(correlation_time, step * _correlation_time(x))
+        length = min(
+            max(4.0 * correlation_time, duration / _BLOCK_COUNT_RANGE[1]),
+            duration / _BLOCK_COUNT_RANGE[0],
+        )
+        return max(length, 1e-9), int(duration / length) if length else 1
+
+
+def _correlation_time(x: Array) -> float:
+    """Samples over which a sequence remembers itself: its integral correlation time."""
+    x = x - x.mean()
+    power = float(x @ x)
+    if not power:
+        return 0.0
+    size = 1 << (2 * len(x) - 1).bit_length()
+    spectrum = np.fft.rfft(x, size)
+    correlation = np.fft.irfft(spectrum * spectrum.conj(), size)[: len(x)] / power
+    negative = np.flatnonzero(correlation < 0.05)
+    return float(correlation[: negative[0] if len(negative) else len(x)].sum())

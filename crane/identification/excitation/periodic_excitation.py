@@ -1,0 +1,373 @@
+"""Periodic references that tell as much as possible about a machine's parameters."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array, as_count, as_number, as_seed
+from crane.common.text_tables import format_table
+from crane.common.threads import with_single_threaded_blas
+from crane.dynamics import Dynamics
+from crane.identification.excitation.fisher_information import (
+    CRITERIA,
+    FisherInformation,
+    InformationMeasures,
+)
+from crane.identification.excitation.fourier_trajectory import FourierTrajectory
+from crane.identification.excitation.trajectory_limits import (
+    QUANTITIES,
+    TrajectoryLimits,
+    joint_values,
+    singularity_proximity,
+    trajectory_limits,
+)
+from crane.identification.excitation.trajectory_optimizer import (
+    COARSE_SAMPLES,
+    TrajectoryOptimizer,
+)
+from crane.identification.mechanics.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    random_samples,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_term import MotionSamples
+from crane.machine import Machine
+from crane.recordings import timeseries
+from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
+from crane.recordings.timeseries import TIME, Table
+
+_NOISE_SHARE = 0.01  # of a drive's force limit, its noise if none is given
+_REPORTED_PARAMETERS = 5  # parameters in the table
+_MAX_SAMPLES = 4_000_000  # samples of the recording
+_FRICTION_SMOOTHING = 5e-4  # of velocities of the machine, over which friction turns in the search
+_MAX_MEMORY = 1e9  # that motions are optimised in [bytes]
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Excitation(OneLineRepr):
+    """A reference to identify a machine with.
+
+    Attributes:
+        trajectory: The reference, see `FourierTrajectory`.
+        machine: The machine.
+        base: What is to be identified.
+        nominal: (p,) all parameters by the machine's description.
+        prior_std: (r,) deviations of the base parameters beforehand, see `FisherInformation`.
+        initial_information: What the first random reference within the limits would tell.
+        optimized_information: What this one will tell.
+        limits: That it keeps.
+        limit_usage: (5, n) share of them that it uses, by `QUANTITIES`.
+        noise: (n,) of the forces [N], [N m].
+        criterion: It is best in.
+        seed: Of the random references.
+        step: Of the recording that is counted on [s].
+    """
+
+    trajectory: FourierTrajectory
+    machine: Machine
+    base: BaseParameters
+    nominal: Array
+    prior_std: Array
+    initial_information: InformationMeasures
+    optimized_information: InformationMeasures
+    limits: TrajectoryLimits
+    limit_usage: Array
+    noise: Array
+    criterion: str
+    seed: int
+    step: float
+
+    def _one_line(self) -> str:
+        """For what, how long, and what it gains."""
+        return (
+            f"Excitation of '{self.machine.name}', {self.trajectory.duration:.6g} s: condition "
+            f"{self.initial_information.condition:.3g} random, "
+            f"{self.optimized_information.condition:.3g} optimised"
+        )
+
+    def motion(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Times (N,), and q_A, v_A, a_A, tau_A (N, n) of the machine as described."""
+        count = int(self.trajectory.duration / self.step + 1e-9) + 1
+        time = self.step * np.arange(count, dtype=np.float64)
+        q, v, a = self.trajectory(time)
+        return time, q, v, a, Dynamics(self.machine).inverse(q, v, a, friction=True)
+
+    def least_identifiable(self, count: int = _REPORTED_PARAMETERS) -> list[int]:
+        """Base parameters that are told least, by std over what would take all force."""
+        return np.argsort(-self.optimized_information.std / self.prior_std, kind="stable")[
+            :count
+        ].tolist()
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the motion, with forces of the machine as described: a recording of no noise.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        units = {TIME: "s"}
+        for suffix in ("", "_velocity", "_acceleration", "_force"):
+            for joint in self.machine.active:
+                unit = self.machine.unit(joint)
+                units[joint + suffix] = {
+                    "": unit,
+                    "_velocity": VELOCITY_UNITS[unit],
+                    "_acceleration": f"{unit}/s2",
+                    "_force": FORCE_UNITS[unit],
+                }[suffix]
+        lead, period = self.trajectory.lead, self.trajectory.period
+        notes = {
+            "crane reference": "",
+            "machine": self.machine.load_expression,
+            "task": f"excitation, steady from {lead:g} s, period {period:g} s",
+        }
+        timeseries.write_table(path, Table(units, np.column_stack(self.motion()), notes))
+
+    def to_yaml(self, path: str | Path) -> None:
+        """Write the coefficients, see `FourierTrajectory`.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        K = self.trajectory.harmonics
+        numbers = self.trajectory.coefficients.T.tolist()
+        text = {
+            "machine": self.machine.load_expression,
+            "criterion": self.criterion,
+            "seed": self.seed,
+            "period": self.trajectory.period,
+            "periods": self.trajectory.periods,
+            "lead": self.trajectory.lead,
+            "coefficients": {
+                joint: {"c": row[0], "a": row[1 : K + 1], "b": row[K + 1 :]}
+                for joint, row in zip(self.machine.active, numbers, strict=True)
+            },
+        }
+        with replace_file(path) as part:
+            part.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
+
+    def to_text(self) -> str:
+        """Tables for reading: before and after, shares of the limits, the worst parameters."""
+        initial, optimized = self.initial_information, self.optimized_information
+        figures: list[tuple[str, ...]] = [
+            ("", "random", "optimised"),
+            ("ln det (1 + M)", f"{initial.logdet:.1f}", f"{optimized.logdet:.1f}"),
+            ("condition number", f"{initial.condition:.3g}", f"{optimized.condition:.3g}"),
+            (
+                "smallest singular value",
+                f"{initial.smallest_singular_value:.3g}",
+                f"{optimized.smallest_singular_value:.3g}",
+            ),
+        ]
+        shares: list[tuple[str, ...]] = [("share of limits used", *QUANTITIES)]
+        for joint, row, limit in zip(
+            self.machine.active, self.limit_usage.T, self.limits.as_array.T, strict=True
+        ):
+            words = (
+                f"{x:.0%}" if np.isfinite(y) else "-" for x, y in zip(row, limit, strict=True)
+            )
+            shares.append((joint, *words))
+        nominal = self.base.values(self.nominal)
+        least_identifiable: list[tuple[str, ...]] = [
+            ("least known", "value", "std, random", "std, optimised")
+        ]
+        for i in self.least_identifiable():
+            numbers = (nominal[i], initial.std[i], optimized.std[i])
+            name = self.base.names[self.base.independent[i]]
+            least_identifiable.append((name, *(f"{x:.3g}" for x in numbers)))
+        return "\n\n".join(
+            "\n".join(format_table(rows)) for rows in (figures, shares, least_identifiable)
+        )
+
+
+@with_single_threaded_blas
+def excite(
+    machine: Machine,
+    model: IdentificationModel | None = None,
+    *,
+    period: float = 10.0,
+    harmonics: int = 5,
+    periods: int = 3,
+    criterion: str = "logdet",
+    noise: Mapping[str, float] | None = None,
+    prior: ArrayLike | None = None,
+    acceleration: Mapping[str, float] | None = None,
+    margin: float = 0.05,
+    step: float = 0.01,
+    starts: int = 3,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Excitation:
+    """Find a periodic reference that determines a machine's base parameters best.
+
+    The best of random references, scaled to what the limits allow, are optimised by sequential
+    quadratic programming over the coefficients of `FourierTrajectory`, then scaled to keep all
+    limits at 64 instants per period of the highest harmonic, the ways from and to rest included,
+    with 1 / cos(pi / 64) for what a series may do in between (Ehlich and Zeller, 1964).
+
+    Args:
+        machine: The machine.
+        model: What is to be identified; `IdentificationModel(machine)` if not given.
+        period: [s].
+        harmonics: K.
+        periods: How many.
+        criterion: "logdet", the volume of the confidence ellipsoid, or "condition".
+        noise: Standard deviations of the measured forces by active joint [N], [N m]; 1 % of the
+            force limit if not given, 1 where there is none.
+        prior: (p,) standard deviations of the model's parameters before, see `FisherInformation`.
+        acceleration: See `limits`.
+        margin: See `limits`.
+        step: Of the recording [s].
+        starts: How many random references are optimised.
+        seed: Of the random references: the same seed gives the same bits.
+        progress: Called with the finished share, 0 to 1.
+
+    Raises:
+        InputError: Arguments out of range, or no reference within the limits.
+    """
+    progress = progress_reporter(progress)
+    if criterion not in CRITERIA:
+        raise InputError(
+            f"criterion '{criterion}' is unknown, {suggest_names(CRITERIA, criterion)}"
+        )
+    for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):
+        as_count(value, f"the number of {what}")
+    period = as_number(period, "the period", "s", greater_than=0)
+    step = as_number(step, "the step", "s", greater_than=0)
+    seed = as_seed(seed)
+    if machine.free:
+        held = " ".join(f"--lock {joint}=VALUE" for joint in machine.free)
+        raise InputError(
+            f"nothing drives {', '.join(map(repr, machine.free))}, and a planned motion needs all "
+            f"joints where it wants them: hold what is free ({held})"
+        )
+    # friction that jumps has no gradient to search along
+    smooth_model = model or IdentificationModel(_with_smooth_friction(machine))
+    model = model or IdentificationModel(machine)
+    _check_size(model, period, harmonics, periods, step)
+    bounds = trajectory_limits(machine, acceleration, margin)
+    force = machine.model.effortLimit[machine.closure.active]
+    default = np.where(np.isfinite(force), _NOISE_SHARE * force, 1.0)
+    deviation = joint_values(machine, noise, "noise", default)
+    for joint, force_limit, value in zip(machine.active, force, deviation, strict=True):
+        if value > force_limit:
+            raise InputError(
+                f"noise of '{joint}' is {value:g}, above the {force_limit:g} of its drive: give "
+                f"less"
+            )
+    force = np.where(np.isfinite(force), force, deviation / _NOISE_SHARE)
+    base = base_parameters(model)
+    if not base.rank:
+        raise InputError(f"nothing of '{machine.name}' has an effect on its drives")
+    time = np.arange(0.0, period, step)
+    if len(time) * len(machine.active) < base.rank:
+        raise InputError(
+            f"{len(time)} samples in a period of {period:g} s tell no {base.rank} base "
+            "parameters, give a smaller step or a longer period"
+        )
+    random_motions = _random_motions(model, bounds, 2 * np.pi / period * harmonics)
+    information = FisherInformation(model, base, deviation, force, random_motions, prior)
+    count = periods * period / step
+    smooth_information = FisherInformation(
+        smooth_model, base, deviation, force, random_motions, prior
+    )
+    search = TrajectoryOptimizer(
+        smooth_information, bounds, period, harmonics, count, CRITERIA[criterion]
+    )
+    draws = search.random_references(np.random.default_rng(seed))
+    costs = search.evaluate(draws)[0]
+    order = np.argsort(costs, kind="stable")[:starts]
+    best, lowest_cost = draws[order[0]], float(costs[order[0]])
+    for start_index, start in enumerate(draws[order]):
+
+        def report(share: float, tried: int = start_index) -> None:
+            if progress is not None:
+                progress((tried + share) / len(order))
+
+        found = search.optimize(start, report)
+        if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:
+            best, lowest_cost = found, cost
+    initial_trajectory, trajectory = (
+        FourierTrajectory(search.coefficients(x), period, periods) for x in (draws[0], best)
+    )
+    first, last = (
+        information.measures(model.samples(*one(one.lead + time), float(time[1] - time[0])), count)
+        for one in (initial_trajectory, trajectory)
+    )
+    return Excitation(
+        trajectory=trajectory,
+        machine=machine,
+        base=base,
+        nominal=model.nominal,
+        prior_std=np.linalg.norm(information.scale, axis=1),
+        initial_information=first,
+        optimized_information=last,
+        limits=bounds,
+        limit_usage=search.limit_usage(trajectory),
+        noise=deviation,
+        criterion=criterion,
+        seed=seed,
+        step=step,
+    )
+
+
+def _with_smooth_friction(machine: Machine) -> Machine:
+    """The machine with friction that is smooth where it sticks."""
+    rates = machine.closure.units / machine.closure.characteristic_time
+    laws = {
+        joint: replace(law, smoothing=_FRICTION_SMOOTHING * float(rates[machine.column(joint)]))
+        for joint, law in machine.friction.items()
+        if law.has_stick_slip
+    }
+    return machine.replace(friction={**machine.friction, **laws})
+
+
+def _check_size(
+    model: IdentificationModel, period: float, harmonics: int, periods: int, step: float
+) -> None:
+    """See that the search and the recording have room.
+
+    Raises:
+        InputError: They have none; the message has what would be possible.
+    """
+    n = len(model.machine.active)
+    max_samples = _MAX_MEMORY / (24 * n * len(model.names))  # samples of three regressors at once
+    min_step = max(period / max_samples, (periods + 1) * period / _MAX_SAMPLES)
+    if step < min_step:
+        raise InputError(
+            f"{periods} periods of {period:g} s and the ways from and to rest are "
+            f"{(periods + 1) * period / step:.3g} samples of {step:g} s, for which there is no "
+            f"room: give a step of at least {min_step:.2g} s, or fewer or shorter periods"
+        )
+    max_harmonics = max(
+        1, int((max_samples / (2 * n * COARSE_SAMPLES)) ** 0.5)
+    )  # a stack of motions per derivative
+    if harmonics > max_harmonics:
+        raise InputError(
+            f"the number of harmonics is {harmonics}, more than there is room for with {n} active "
+            f"joints: give at most {max_harmonics}"
+        )
+
+
+def _random_motions(
+    model: IdentificationModel, bounds: TrajectoryLimits, max_frequency: float
+) -> MotionSamples:
+    """Random motions within the limits, of harmonics up to a circular frequency [rad/s]."""
+    machine, rng = model.machine, np.random.default_rng(0)
+    at = random_samples(model, 300)
+    is_regular = singularity_proximity(machine, at) <= 1
+    q_a = at.q_a[is_regular]
+    v_max = np.minimum(bounds.velocity, max_frequency * bounds.half_stroke)
+    a_max = np.minimum(bounds.acceleration, max_frequency * v_max)
+    v_a, a_a = (limit * rng.uniform(-1, 1, q_a.shape) for limit in (v_max, a_max))
+    return model.samples(q_a, v_a, a_a, at.step)

@@ -1,0 +1,201 @@
+"""Signals of valves that move cylinders as planned and turn them before their strokes end."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from crane.codegen import Scalar
+from crane.common.samples import Array
+from crane.control.control_law import ControllerInputs
+from crane.control.valve_commands import ValveCommand, require_circuit
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.supply_and_engine import Supply
+from crane.machine import Machine
+
+
+class PulseSignals(ValveCommand):
+    """Pulses of the valves' signals, one per valve and slot of time, that keep within strokes.
+
+    A plan has the largest opening y of each pulse, -1 to 1, and for how much of its slot the
+    pulse lasts. The spool's position u = (U - neutral) / (full - neutral) goes from 0 to
+    sign(y) (d + (1 - d) |y|), d the dead band, and back to 0 at the rate r, so that over a pulse
+    of duration T
+
+        integral of |y| dt = |y| (T - (|u| + d) / r),
+
+    and the stroke moves by that times its steady velocity at full opening (`full_opening_speed`).
+    At the begin of a slot the plan meets the machine as it is there: where a pulse would pass the
+    end of its range it goes the other way, or less far, and where all together would ask for more
+    than the pump's flow, all open less.
+
+    Args:
+        machine: The machine.
+        plan: (slots, m, 2) openings, and shares of the slot from 0 to 1; the slot before and what
+            follows after them is rest.
+        slot: Duration of a slot [s].
+        rate: The fastest change of u [1/s].
+        low: (m,) least coordinates [m], [rad].
+        high: (m,) largest.
+        flow: The most that the valves ask the pump for [m3/s]; infinite where it has no limit.
+    """
+
+    is_open_loop = True
+
+    def __init__(
+        self,
+        machine: Machine,
+        plan: Array,
+        slot: float,
+        rate: float,
+        low: Array,
+        high: Array,
+        flow: float,
+    ):
+        circuit = self._circuit = require_circuit(machine)
+        self._plan, self.period, self._rate, self._max_flow = plan, slot, rate, flow
+        self._low, self._high = low, high
+        self._joint_columns = [machine.column(joint) for joint in circuit.joints]
+        valves = list(circuit.valves.values())
+        self._neutral = np.array([valve.neutral for valve in valves])
+        self._signal_ranges = np.array([valve.full - valve.neutral for valve in valves])
+        self._dead_bands = np.array([valve.dead_band for valve in valves])
+        self._valve_indices = [
+            circuit.joints.index(spool.joint) for spool in circuit.spools.values()
+        ]
+        # slots from when on, how far they open, and for how long
+        self._slot_starts = [0.0]
+        self._peak_positions, self._duration_history = (
+            [np.zeros(len(valves))],
+            [np.zeros(len(valves))],
+        )
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """See `ValveCommand`."""
+        slot = round(time / self.period) - 1
+        peak_positions = self._pulse_durations = np.zeros(len(self._signal_ranges))
+        if 0 <= slot < len(self._plan):
+            peak_positions = self._pulse_positions(slot, q, pressures)
+        slot_index = max(0, slot + 1)
+        (
+            self._slot_starts[slot_index:],
+            self._peak_positions[slot_index:],
+            self._duration_history[slot_index:],
+        ) = [time], [peak_positions], [self._pulse_durations]
+
+    def _pulse_positions(self, slot: int, q: Array, pressures: Array) -> Array:
+        """(m,) how far valves open in a slot."""
+        opening, share = self._plan[slot].T
+        x = q[self._joint_columns]
+        speeds = self._full_opening_speeds(pressures)
+        self._pulse_durations = share * self.period
+        openings = np.array(
+            [
+                self._opening_within_stroke(i, float(y), float(x[i]), speeds[i])
+                for i, y in enumerate(opening)
+            ]
+        )
+        openings *= min(1.0, self._max_flow / max(self._pump_flow(openings, speeds), 1e-30))
+        u = self._dead_bands + (1.0 - self._dead_bands) * np.abs(openings)
+        return np.where(openings, np.copysign(u, openings), 0.0)
+
+    def references(self, times: Array) -> Array:
+        """See `ValveCommand`."""
+        at = np.maximum(np.searchsorted(self._slot_starts, times, "right") - 1, 0)
+        top, last = np.array(self._peak_positions)[at], np.array(self._duration_history)[at]
+        since = np.asarray(times)[:, None] - np.array(self._slot_starts)[at, None]
+        ramps = self._rate * np.clip(np.minimum(since, last - since), 0.0, None)
+        u = np.copysign(np.minimum(np.abs(top), ramps), top)
+        # a second spool gets the signal of the first one, as `ValveSignals` have it
+        return np.asarray(self._neutral + self._signal_ranges * u)[:, self._valve_indices]
+
+    def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """See `ValveCommand`."""
+        return inputs.reference
+
+    def _full_opening_speeds(self, pressures: Array) -> Array:
+        """(m, 2) steady velocities at full opening, forwards and backwards [m/s], [rad/s]."""
+        found = []
+        for joint, (a, b) in zip(self._circuit.joints, pressures, strict=True):
+            cylinder, valve = self._circuit.cylinders[joint], self._circuit.valves[joint]
+            force = cylinder.area_a * a - cylinder.area_b * b
+            found.append([
+                full_opening_speed(cylinder, valve, self._circuit.supply, force, side)
+                for side in (False, True)
+            ])  # fmt: skip
+        return np.array(found)
+
+    def _opening_within_stroke(self, i: int, opening: float, x: float, speeds: Array) -> float:
+        """The opening of a pulse that keeps cylinder i within its range."""
+        clearances = max(self._high[i] - x, 0.0), max(x - self._low[i], 0.0)
+        side, size = int(opening < 0), self._reachable_opening(i, abs(opening))
+        if size and self._opening_integral(i, size) * speeds[side] > clearances[side]:
+            side = int(clearances[1] > clearances[0])
+            if self._opening_integral(i, size) * speeds[side] > clearances[side]:
+                size = self._opening_for_integral(i, clearances[side] / speeds[side])
+        return -size if side else size
+
+    def _reachable_opening(self, i: int, opening: float) -> float:
+        """As much of an opening as the rate allows within the pulse."""
+        dead = self._dead_bands[i]
+        most = (self._rate * self._pulse_durations[i] / 2 - dead) / (1.0 - dead)
+        return min(opening, max(most, 0.0))
+
+    def _opening_integral(self, i: int, opening: float) -> float:
+        """Integral of the opening over the pulse [s]."""
+        dead = self._dead_bands[i]
+        u = dead + (1.0 - dead) * opening
+        return float(opening * (self._pulse_durations[i] - (u + dead) / self._rate))
+
+    def _opening_for_integral(self, i: int, integral: float) -> float:
+        """The opening of which the integral over the pulse is `integral` [s], the smaller root."""
+        dead, rate = self._dead_bands[i], self._rate
+        linear_coefficient = self._pulse_durations[i] - 2 * dead / rate
+        root = linear_coefficient**2 - 4 * (1.0 - dead) / rate * integral
+        return (
+            float(2 * integral / (linear_coefficient + np.sqrt(max(root, 0.0))))
+            if linear_coefficient > 0
+            else 0.0
+        )
+
+    def _pump_flow(self, openings: Array, speeds: Array) -> float:
+        """What the pump is asked for [m3/s]."""
+        total = 0.0
+        for y, speed, cylinder in zip(
+            openings, speeds, self._circuit.cylinders.values(), strict=True
+        ):
+            area = cylinder.area_b if y < 0 else cylinder.area_a
+            total += abs(y) * speed[int(y < 0)] * area
+        return total
+
+
+def full_opening_speed(
+    cylinder: Cylinder, valve: Valve, supply: Supply, force: float, backwards: bool
+) -> float:
+    """Steady velocity of a cylinder at full opening [m/s], [rad/s], its size.
+
+    The pressure drops of both edges, (A_in w / c_in)^2 and (A_out w / c_out)^2, and the force F
+    against the motion balance the supply,
+
+        w^2 (A_in^3 / c_in^2 + A_out^3 / c_out^2) = A_in p_S - A_out p_R - F,
+
+    and a compensator lets no more in than c_in sqrt(margin), unless a load that pulls presses out
+    more, c_out sqrt(-F / A_out - p_R); 0 where the load is too heavy.
+
+    Args:
+        cylinder: The cylinder.
+        valve: Its valve.
+        supply: Of the circuit.
+        force: Of the cylinder, A_A p_A - A_B p_B [N], [N m].
+        backwards: Whether oil flows into chamber B.
+    """
+    inward, outward = cylinder.area_a, cylinder.area_b
+    inlet, outlet = valve.c1, valve.c2
+    if backwards:
+        inward, outward, inlet, outlet = outward, inward, valve.c4, valve.c3
+        force = -force
+    driving_force = inward * supply.pressure - outward * supply.tank - force
+    speed = np.sqrt(max(driving_force, 0.0) / (inward**3 / inlet**2 + outward**3 / outlet**2))
+    if valve.margin:
+        load_driven_speed = outlet * np.sqrt(max(-force / outward - supply.tank, 0.0)) / outward
+        speed = min(speed, max(inlet * np.sqrt(valve.margin) / inward, load_driven_speed))
+    return float(speed)

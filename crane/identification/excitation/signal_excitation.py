@@ -1,0 +1,271 @@
+"""Signals of valves that tell as much as possible about numbers that a calibration fits."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.errors import InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array, as_count, as_number, as_seed
+from crane.common.text_tables import format_table
+from crane.common.threads import with_single_threaded_blas
+from crane.common.units import format_quantity
+from crane.control.valve_commands import require_circuit
+from crane.description.sensors import VALVE_SIGNAL_PREFIX
+from crane.identification.calibration.unknowns import Unknown
+from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm
+from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
+from crane.identification.excitation.signal_information import SignalInformation
+from crane.identification.excitation.signal_limits import SignalLimits
+from crane.machine import Machine
+from crane.recordings import timeseries
+from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE, Recording
+from crane.recordings.timeseries import Table
+
+_MAX_STD_SHARE = 0.5  # standard deviation, of a number's size, that says nothing
+_MIN_DURATION, _MIN_STEP = 2.0, 1e-3  # duration and step [s]
+_MAX_STEP = 0.05  # step [s], of which a pulse still has enough
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SignalExcitation(OneLineRepr):
+    """Signals of valves to calibrate a machine with.
+
+    Attributes:
+        machine: The machine.
+        unknowns: The numbers that are wanted.
+        run: The machine as described, driven by the signals.
+        expected_readings: Signals, and what sensors without noise say of it.
+        noise: Standard deviations of the sensors by column.
+        initial_information: What one lever after the other, out and back, would tell in the same
+            time.
+        optimized_information: What these signals will tell; `std` in the numbers' own units.
+        stroke_margins: (m,) what the strokes keep to their ends, as a share of the stroke.
+        worst_case_stroke_margins: (m,) the same of the worst machine whose wanted numbers are off,
+            one at a time.
+        pump_flow_share: The largest share of the pump's flow; 0 where it has no limit.
+        peak_pressures: (m,) largest pressure in a cylinder [Pa].
+        signal_rates: (m,) fastest change of the signals [V/s].
+        criterion: They are best in.
+        seed: Of the random signals.
+    """
+
+    machine: Machine
+    unknowns: tuple[Unknown, ...]
+    run: Recording
+    expected_readings: Table
+    noise: Mapping[str, float]
+    initial_information: InformationMeasures
+    optimized_information: InformationMeasures
+    stroke_margins: Array
+    worst_case_stroke_margins: Array
+    pump_flow_share: float
+    peak_pressures: Array
+    signal_rates: Array
+    criterion: str
+    seed: int
+
+    def _one_line(self) -> str:
+        """For what, how long, and what it tells."""
+        return (
+            f"SignalExcitation of '{self.machine.name}', {self.run.time[-1]:.6g} s: "
+            f"{len(self.unknowns) - len(self.unidentifiable)} of "
+            f"{format_count(len(self.unknowns), 'number')} told"
+        )
+
+    @property
+    def signals(self) -> dict[str, Array]:
+        """(N,) by joint at `run.time` [V], as `crane.ValveSignals` takes them."""
+        joints = require_circuit(self.machine).joints
+        return {joint: self.run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Expected standard deviations by name, infinite for what is not told."""
+        return {
+            one.name: float(x)
+            for one, x in zip(self.unknowns, self.optimized_information.std, strict=True)
+        }
+
+    @property
+    def unidentifiable(self) -> list[str]:
+        """Names of numbers that these sensors do not tell, whatever the signals here."""
+        return [
+            one.name
+            for one in self.unknowns
+            if not self.std[one.name] <= _MAX_STD_SHARE * one.scale
+        ]
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write signals and expected readings: a recording of no noise.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        notes = {"machine": self.machine.load_expression, "task": "excitation through the valves"}
+        notes[SENSORS_NOTE] = IDEAL_SENSORS
+        timeseries.write_table(
+            path, Table(self.expected_readings.units, self.expected_readings.values, notes)
+        )
+
+    def to_text(self) -> str:
+        """Tables for reading: numbers before and after, strokes, and what is not told."""
+        numbers: list[tuple[str, ...]] = [("number", "value", "std, plain", "std, designed")]
+        for one, initial_std, optimized_std in zip(
+            self.unknowns,
+            self.initial_information.std,
+            self.optimized_information.std,
+            strict=True,
+        ):
+            words = (f"{one.start:.5g}", f"{initial_std:.3g}", f"{optimized_std:.3g}")
+            numbers.append((one.name, *words))
+        gain = (
+            f"{self.initial_information.logdet:.1f}",
+            f"{self.optimized_information.logdet:.1f}",
+        )
+        numbers.append(("ln det (1 + M)", "", *gain))
+        strokes: list[tuple[str, ...]] = [
+            ("stroke", "least left", "numbers off", "largest pressure", "fastest signal")
+        ]
+        for i, joint in enumerate(require_circuit(self.machine).joints):
+            strokes.append((
+                joint, f"{self.stroke_margins[i]:.0%}", f"{self.worst_case_stroke_margins[i]:.0%}",
+                format_quantity(self.peak_pressures[i], "Pa"), f"{self.signal_rates[i]:.3g} V/s",
+            ))  # fmt: skip
+        parts = ["\n".join(format_table(rows)) for rows in (numbers, strokes)]
+        if self.pump_flow_share:
+            parts.append(f"largest share of the pump's flow: {self.pump_flow_share:.0%}")
+        if self.unidentifiable:
+            names = ", ".join(self.unidentifiable)
+            parts.append(
+                f"not told by these sensors in this time: {names}\n"
+                "leave them out, name further --sensors, or give a longer --duration"
+            )
+        return "\n\n".join(parts)
+
+
+@with_single_threaded_blas
+def excite_valves(
+    machine: Machine,
+    fit: Mapping[str, object] | Sequence[str],
+    *,
+    duration: float = 20.0,
+    sensors: Sequence[str] | None = None,
+    noise: Mapping[str, float] | None = None,
+    criterion: str = "logdet",
+    rate: float = 2.0,
+    margin: float = 0.1,
+    step: float = 0.01,
+    trials: int = 60,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> SignalExcitation:
+    """Find signals of a machine's valves that determine numbers best, fitted by `calibrate`.
+
+    Pulses of all valves (see `PulseSignals`) from rest at home to rest, the best of some at random
+    and of what the exchange of single slots makes of them (Meyer and Nachtsheim, 1995), judged by
+    the information of the simulated readings (see `SignalInformation`). Signals that leave the
+    limits of `crane.identification.excitation.signal_limits.SignalLimits` are not taken.
+
+    Args:
+        machine: A machine with valves.
+        fit: Numbers by name, as `crane.calibrate` takes them; with (start, low, high) the
+            strokes hold from low to high, else for numbers that are off by 30 %.
+        duration: [s].
+        sensors: Columns that will be measured; strokes and pressures of all cylinders if not
+            given.
+        noise: Their standard deviations by column, SI; where not given 0.5 mm, 1 mrad, 2 mm/s,
+            5 mrad/s, 0.3 bar.
+        criterion: "logdet", the volume of the confidence ellipsoid of the numbers, each against
+            its size; or "condition".
+        rate: The fastest change of a signal, in strokes of the spool per second; 2 is an
+            operator's hand that moves a lever to its end in half a second.
+        margin: Share of every stroke that is left unused at both ends, and of the pump's flow.
+        step: Between samples of the signals [s].
+        trials: How many signals are judged.
+        seed: Of the random signals: the same seed gives the same bits.
+        progress: Called with the finished share, 0 to 1.
+
+    Raises:
+        InputError: Arguments out of range, no valves, or no signals within the limits.
+
+    Source: Goodwin, Payne 1977, Dynamic System Identification, chapter 6; Meyer, Nachtsheim
+    1995, Technometrics 37(1).
+    """
+    progress = progress_reporter(progress)
+    require_circuit(machine)
+    if criterion not in CRITERIA:
+        raise InputError(
+            f"criterion '{criterion}' is unknown, {suggest_names(CRITERIA, criterion)}"
+        )
+    step = as_number(step, "the step", "s", greater_than=0, max_magnitude=_MAX_STEP)
+    duration = as_number(duration, "the duration", "s", greater_than=0)
+    if step < _MIN_STEP or duration < _MIN_DURATION:
+        raise InputError(
+            f"{duration:g} s in steps of {step:g} s: give a duration of at least "
+            f"{_MIN_DURATION:g} s "
+            f"and a step from {_MIN_STEP:g} to {_MAX_STEP:g} s"
+        )
+    rate = as_number(rate, "the rate", "1/s", greater_than=0)
+    if not 0 <= as_number(margin, "the margin", "") < 0.5:
+        raise InputError(f"the margin is {margin:g}, give a share from 0 to below 0.5")
+    trials = as_count(trials, "the number of trials")
+    information = SignalInformation(machine, fit, sensors, noise, as_seed(seed))
+    limits = SignalLimits(information, margin)
+    search = ExchangeAlgorithm(information, limits, CRITERIA[criterion], duration, step, rate)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reference_run, best = search.run(trials, np.random.default_rng(seed), progress)
+        initial_information, optimized_information = (
+            information.measures(reference_run),
+            information.measures(best),
+        )
+        worst_case_margins = limits.worst_case_stroke_margins(best)
+    return _excitation_result(
+        information,
+        limits,
+        best,
+        initial_information,
+        optimized_information,
+        worst_case_margins,
+        criterion,
+        seed,
+    )
+
+
+def _excitation_result(
+    information: SignalInformation,
+    limits: SignalLimits,
+    run: Recording,
+    initial_information: InformationMeasures,
+    optimized_information: InformationMeasures,
+    worst_case_margins: Array,
+    criterion: str,
+    seed: int,
+) -> SignalExcitation:
+    table, joints = information.expected_readings(run), require_circuit(information.machine).joints
+    largest_changes = np.abs(
+        np.diff([run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints])
+    ).max(axis=1)
+    return SignalExcitation(
+        machine=information.machine,
+        unknowns=tuple(information.unknowns),
+        run=run,
+        expected_readings=table,
+        noise=dict(zip(information.units, information.noise.tolist(), strict=True)),
+        initial_information=initial_information,
+        optimized_information=optimized_information,
+        stroke_margins=limits.stroke_margins(run),
+        worst_case_stroke_margins=worst_case_margins,
+        pump_flow_share=limits.pump_flow_share(run),
+        peak_pressures=limits.peak_pressures(run),
+        signal_rates=largest_changes / (run.time[1] - run.time[0]),
+        criterion=criterion,
+        seed=seed,
+    )

@@ -1,0 +1,199 @@
+"""What a recording of valve signals tells of numbers that are fitted through the simulation."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from crane.common.errors import InputError, suggest_names
+from crane.common.samples import Array, as_number
+from crane.control.valve_commands import require_circuit
+from crane.description.sensors import INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, VELOCITY_SUFFIX
+from crane.dynamics.joint_forces import find_stick_slip_columns
+from crane.formats.machine_loading import MachineVariants
+from crane.identification.calibration.calibration_problem import (
+    CalibrationProblem,
+    RecordingCase,
+    recording_case,
+)
+from crane.identification.calibration.unknowns import build_unknowns
+from crane.identification.excitation.fisher_information import (
+    InformationMeasures,
+    information_measures,
+)
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+from crane.recordings.timeseries import TIME, Table
+from crane.simulation.simulated_readings import read_simulation, simulated_columns, simulated_units
+
+# Standard deviations of usual sensors, by unit.
+_DEFAULT_NOISE = {"rad": 1e-3, "m": 5e-4, "rad/s": 5e-3, "m/s": 2e-3, "Pa": 3e4}
+_MIN_SENSITIVITY = (
+    1e-6  # noises that a number of its own size changes all readings by, taken together
+)
+
+
+class SignalInformation:
+    """The information of recordings about numbers p that are fitted, `crane.calibrate`'s.
+
+    Readings y of white noise sigma depend on p, each in its scale, and on the recording's start s,
+    known beforehand to its deviations, each 1 in these:
+
+        M = J_p^T (1 - J_s (J_s^T J_s + 1)^-1 J_s^T) J_p,    J = sigma^-1 dy/d(p, s),
+
+    whose inverse is the covariance that the best fit has. With [J_s J_p; 1 0] = Q R the rows of
+    R that belong to p alone are a root of it.
+
+    Args:
+        machine: The machine.
+        fit: Numbers by name, see `crane.calibrate`.
+        sensors: Columns of what is measured; active joints on valves and their pressures if not
+            given.
+        noise: Standard deviations by column; those of usual sensors if not given.
+        seed: Of the noise on the virtual recordings, which only says how well starts are known.
+
+    Attributes:
+        machine: With the numbers from which a fit starts.
+        sensor_units: Of the sensors by column.
+        noise: (k,) standard deviations.
+        unknowns: See `crane.identification.calibration.unknowns.Unknown`.
+
+    Raises:
+        InputError: Names that cannot be, or noise that nothing tells.
+        RecordingError: An inclination of no link.
+
+    Source: Ljung 1999, System Identification, section 7.4.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        fit: Mapping[str, object] | Sequence[str],
+        sensors: Sequence[str] | None,
+        noise: Mapping[str, float] | None,
+        seed: int,
+    ):
+        self.machine, self._seed = machine, seed
+        joints = require_circuit(machine).joints
+        default_sensors = [
+            *joints,
+            *(f"pressure_{joint}_{side}" for joint in joints for side in "ab"),
+        ]
+        available_units = simulated_units(machine)
+        self.units = {
+            name: _sensor_unit(available_units, name)
+            for name in dict.fromkeys(default_sensors if sensors is None else sensors)
+        }
+        if not self.units:
+            raise InputError(f"no sensor is named, choose among {', '.join(available_units)}")
+        given = {x: y.noise for x, y in machine.sensors.items() if y.noise and x in self.units}
+        given |= noise or {}
+        for name in given:
+            if name not in self.units:
+                raise InputError(
+                    f"noise of '{name}', which is not measured, {suggest_names(self.units, name)}"
+                )
+        self.noise = np.array([_noise_std(name, given, unit) for name, unit in self.units.items()])
+        signals = {VALVE_SIGNAL_PREFIX + joint: "V" for joint in joints}
+        simulated_columns(machine, Table(self.units, np.zeros((0, len(self.units))), {}))
+        variants = MachineVariants(machine)
+        self.unknowns = build_unknowns(fit, variants.spec, variants.values, self.units | signals)
+        initial_values = {x: y for one in self.unknowns for x, y in one.changes(one.start).items()}
+        if any(variants.values[name] != value for name, value in initial_values.items()):
+            self.machine = variants.machine(initial_values)
+        # where and when something sticks depends on everything before
+        self._has_stiction = bool(find_stick_slip_columns(machine))
+        self._problem = self._smoothed_problem([])
+
+    def perturbed_machine(self, values: Mapping[str, float]) -> Machine:
+        """The machine with some of the wanted numbers changed, of friction that is smooth."""
+        z = [(values.get(one.name, one.start) - one.start) / one.scale for one in self.unknowns]
+        return self._problem.simulated_machine(np.array(z), self._problem.smooth)
+
+    def expected_readings(self, run: Recording, noisy: bool = False) -> Table:
+        """What a run's recording would hold: signals and readings, with noise or without."""
+        names = list(self.units)
+        values = read_simulation(self.machine, run, names)
+        if noisy:
+            random = np.random.default_rng(self._seed)
+            values = values + self.noise * random.normal(size=values.shape)
+            pressures = [unit == "Pa" for unit in self.units.values()]
+            values[:, pressures] = np.maximum(values[:, pressures], 0.0)
+        joints = require_circuit(self.machine).joints
+        sensor_units = (
+            {TIME: "s"} | {VALVE_SIGNAL_PREFIX + joint: "V" for joint in joints} | self.units
+        )
+        columns = [run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints]
+        return Table(sensor_units, np.column_stack([run.time, *columns, values]), {})
+
+    def information_root(self, run: Recording, estimate_start: bool = True) -> Array:
+        """A root of M, (p, p) upper triangle.
+
+        Args:
+            run: A simulation of the machine with the signals.
+            estimate_start: Whether the start has to be found, too; quicker without.
+
+        Raises:
+            CraneError: A machine of slightly other numbers cannot be simulated.
+        """
+        names, table = list(self.units), self.expected_readings(run, noisy=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            case = recording_case(self.machine, "the design", table, {}, names, (0.0, np.inf))
+        if not self._problem.cases:
+            self._problem = self._smoothed_problem([case])
+        problem, case = self._problem, replace(case, first_start_index=len(self.unknowns))
+        if not estimate_start:
+            case = replace(case, start_std=np.zeros_like(case.start_std))
+        _, derivatives = problem.linearize(case, np.zeros(problem.unknown_count))
+        J = (derivatives / self.noise[:, None]).reshape(-1, problem.unknown_count)
+        count = len(self.unknowns)
+        start_count = problem.unknown_count - count
+        prior = np.hstack([np.eye(start_count), np.zeros((start_count, count))])
+        stacked = np.vstack([np.roll(J, start_count, axis=1), prior])
+        return _triangular_factor(stacked)[start_count:, start_count:]
+
+    def measures(self, run: Recording) -> InformationMeasures:
+        """What a recording of a run will tell; deviations in the units of the numbers."""
+        rows = self.information_root(run)
+        result = information_measures(rows, np.eye(len(self.unknowns)), 0.0)
+        scale = np.array([unknown.scale for unknown in self.unknowns])
+        return replace(result, std=self.standard_deviations(rows) * scale)
+
+    def standard_deviations(self, information_root: Array) -> Array:
+        """(p,) standard deviations of the numbers in their scales, infinite if not told."""
+        is_identifiable = np.linalg.norm(information_root, axis=0) > _MIN_SENSITIVITY
+        out = np.full(len(information_root), np.inf)
+        if is_identifiable.any():
+            identifiable_root = _triangular_factor(information_root[:, is_identifiable])
+            out[is_identifiable] = information_measures(
+                identifiable_root, np.eye(len(identifiable_root)), 0.0
+            ).std
+        return out
+
+    def _smoothed_problem(self, cases: list[RecordingCase]) -> CalibrationProblem:
+        problem = CalibrationProblem(self.machine, self.unknowns, cases)
+        problem.smooth = self._has_stiction
+        return problem
+
+
+def _triangular_factor(matrix: Array) -> Array:
+    """R of Q R."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
+
+
+def _sensor_unit(available_units: Mapping[str, str], name: str) -> str:
+    if name.startswith(INCLINATION_PREFIX):
+        return "rad/s" if name.endswith(VELOCITY_SUFFIX) else "rad"
+    if name not in available_units:
+        raise InputError(f"'{name}' cannot be compared, {suggest_names(available_units, name)}")
+    return available_units[name]
+
+
+def _noise_std(name: str, given: Mapping[str, float], unit: str) -> float:
+    if name in given:
+        return as_number(given[name], f"noise of '{name}'", unit, greater_than=0)
+    if unit not in _DEFAULT_NOISE:
+        raise InputError(f"noise of '{name}' is not known, give its deviation in {unit or '1'}")
+    return _DEFAULT_NOISE[unit]

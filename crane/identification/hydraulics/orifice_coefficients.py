@@ -1,0 +1,348 @@
+"""Bulk modulus and orifice coefficients of a cylinder and its valve by equations (29) to (32).
+
+Equations are those of the electro-hydraulic forwarder paper (IROS 2012); see
+`crane.identification.hydraulics.orifice_equations` for them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.errors import InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array
+from crane.common.threads import with_single_threaded_blas
+from crane.identification.estimation import estimators
+from crane.identification.hydraulics.cylinder_signals import (
+    CylinderSignals,
+    cylinder_and_valve,
+    cylinder_signals,
+    noise_std,
+    signal_noise,
+)
+from crane.identification.hydraulics.orifice_equations import (
+    EquationSides,
+    OrificeEquations,
+    chamber_terms,
+)
+from crane.identification.signals.signal_processing import differentiate
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+
+PARAMETER_NAMES = ("1/beta", "c1", "c2", "c3", "c4")
+PARAMETER_UNITS = ("1/Pa",) + 4 * ("m3/(s Pa^0.5)",)
+METHODS = ("weak", "chambers", "ls")
+
+_WINDOW_LENGTH = 0.1  # [s]
+_MIN_CORRELATION, _MIN_SIGNIFICANCE = 0.5, 10.0  # of a column's halves: see `_check_told`
+_MAX_SAMPLES = 20000  # samples of method "ls"
+_UNIDENTIFIABLE_REASONS = {
+    0: (
+        "1/beta",
+        "its pressures change less than their noise, record faster motion or changing load",
+    ),
+    1: (
+        "c1 and c2",
+        "its valve hardly opens to extend for a whole window, record extending motion",
+    ),
+    3: (
+        "c3 and c4",
+        "its valve hardly opens to retract for a whole window, record retracting motion",
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OrificeCoefficients(OneLineRepr):
+    """X of one cylinder.
+
+    Attributes:
+        machine: Whose areas and volumes counted as known.
+        joint: The cylinder's.
+        method: Of `identify_orifices`.
+        values: (5,) 1/beta [1/Pa], c1 to c4 [m3/(s Pa^0.5)].
+        covariance: (5, 5).
+        degrees_of_freedom: Degrees of freedom of each standard error (5,).
+        condition: Condition number of A with columns of length one.
+        misfit: Mean square of the residuals over what the sensors' noise explains, nan for "ls",
+            which does not follow the noise through its derivatives; far above 1
+            the model is wrong or the noise stronger or not white.
+        window: Length of the test functions [s].
+        training_sides: Sides of (29), one entry per recording.
+    """
+
+    machine: Machine
+    joint: str
+    method: str
+    values: Array
+    covariance: Array
+    degrees_of_freedom: Array
+    condition: float
+    misfit: float
+    window: float
+    training_sides: tuple[EquationSides, ...] = ()
+
+    @property
+    def std(self) -> Array:
+        """(5,) standard errors."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def bulk_modulus(self) -> float:
+        """Beta [Pa]; infinite if 1/beta came out negative, which its interval allows."""
+        return 1 / float(self.values[0]) if self.values[0] > 0 else np.inf
+
+    def interval(self, level: float = 0.95) -> Array:
+        """(5, 2) ends of what covers the truth with this probability."""
+        from scipy.stats import t
+
+        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
+        return np.column_stack([self.values - half, self.values + half])
+
+    def predict(self, recording: Recording, period: float | None = None) -> EquationSides:
+        """Both sides of (29) on another recording, as means over windows.
+
+        Args:
+            recording: As for `identify_orifices`.
+            period: Likewise.
+        """
+        signals = cylinder_signals(self.machine, recording, self.joint, period)
+        return OrificeEquations(self.machine, self.joint, signals, self.window, False).sides(
+            self.values
+        )
+
+    def to_text(self) -> str:
+        """A table of the parameters."""
+        lines = [
+            f"cylinder of {self.joint}, method {self.method}: condition number "
+            f"{self.condition:.3g} with columns scaled"
+            + ("" if np.isnan(self.misfit) else f", misfit {self.misfit:.3g}"),
+            f"{'parameter':<10}{'value':>12}{'std':>10}{'rel. std':>10}   95 % interval",
+        ]
+        for name, unit, value, std, (low, high) in zip(
+            PARAMETER_NAMES, PARAMETER_UNITS, self.values, self.std, self.interval(), strict=True
+        ):
+            share = f"{100 * std / abs(value):.2g} %"
+            lines.append(
+                f"{name:<10}{value:>12.5g}{std:>10.2g}{share:>10}   {low:.5g} to {high:.5g} {unit}"
+            )
+        for i, both in enumerate(self.training_sides):
+            error = f"{100 * both.relative_error:.3g} %"
+            lines.append(f"recording {i + 1}: relative error of (29) {error}")
+        return "\n".join(lines) + "\n"
+
+
+@with_single_threaded_blas
+def identify_orifices(
+    machine: Machine,
+    recordings: Recording | Sequence[Recording],
+    joint: str,
+    method: str = "weak",
+    window: float = _WINDOW_LENGTH,
+    period: float | None = None,
+    noise: Mapping[str, float] | None = None,
+) -> OrificeCoefficients:
+    """X = [1/beta, c1, c2, c3, c4] of one cylinder, its areas and hose volumes known.
+
+    "weak": (29) times test functions phi, integrated by parts,
+
+        -int phi' F dt / beta + sum_j c_j int phi z_j dt = int phi' (A_A ln V_A - A_B ln V_B) dt,
+
+    as Y = -(A_A ln V_A - A_B ln V_B)': nothing measured is differentiated. Windows in which the
+    opening crosses zero or its end are left out, as the integrands have kinks there. Rows are
+    taken from every other sample, with the samples between them as instruments: noise that is
+    white does not bias X. Standard errors propagate the sensors' white noise to X; what residuals
+    the noise does not explain adds the covariance of `estimators.instrumental_variables`, with its
+    correlation in time.
+
+    "chambers": the same with the two equations of (23) instead of their difference (29). In (29)
+    c1 and c2 (and c3, c4) differ only by how V_A / V_B changes along the stroke; here each has
+    an equation of its own.
+
+    "ls": the paper's (36) on F' and x' by the Kalman smoother, at every sample. It filters force
+    and stroke by the noise of each, not alike: oscillations that are below the stroke's noise stay
+    on one side only, which biases 1/beta towards zero, and its interval does not tell.
+
+    Not in these equations, and in X where it matters: leakage, entrapped gas, relief and check
+    valves, cushioning, the compliance of boom and mountings.
+
+    Args:
+        machine: With hydraulics; of its valve only the opening's numbers and the margin are used.
+        recordings: One or several, see `cylinder_signals.cylinder_signals`.
+        joint: The cylinder's.
+        method: "weak", "chambers" or "ls".
+        window: Length of the test functions [s], at least 64 steps are taken. About a period of
+            the oil's oscillation, where it is excited, else it hardly matters.
+        period: Of a periodic motion [s], whose periods are averaged first.
+        noise: Standard deviations of some of x, opening, p_a, p_b, p_s, p_r (after averaging),
+            which are estimated otherwise.
+
+    Raises:
+        InputError: Unknown method, joint or sensor; parameters that the motion does not tell.
+        RecordingError: Columns missing, or samples that cannot serve.
+    """
+    if method not in METHODS:
+        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    cylinder, _ = cylinder_and_valve(machine, joint)
+    if cylinder.counterbalance_a or cylinder.counterbalance_b:
+        raise InputError(
+            f"the cylinder of '{joint}' has a counterbalance valve, for which (21), (22) do not "
+            "hold: choose another cylinder"
+        )
+    if isinstance(recordings, Recording):
+        recordings = [recordings]
+    if not recordings:
+        raise InputError("no recordings, give at least one")
+    runs = [cylinder_signals(machine, one, joint, period) for one in recordings]
+    sets = [OrificeEquations(machine, joint, run, window, method == "chambers") for run in runs]
+    _check_identifiable(sets, joint)
+    if method == "ls":
+        values, covariance, freedom, condition, misfit = _pointwise_estimate(machine, joint, runs)
+    else:
+        levels = [
+            _opening_noise(machine, one, joint, len(run.time)) | dict(noise or {})
+            for one, run in zip(recordings, runs, strict=True)
+        ]
+        values, covariance, freedom, condition, misfit = _weak_form_estimate(sets, levels, joint)
+    _check_values(values, covariance, joint, method, runs)
+    training = tuple(rows.sides(values) for rows in sets)
+    return OrificeCoefficients(
+        machine, joint, method, values, covariance, freedom, condition, misfit, window, training
+    )
+
+
+def _opening_noise(
+    machine: Machine, recording: Recording, joint: str, count: int
+) -> dict[str, float]:
+    """Noise of an opening that came through the spool's equation, over `count` samples.
+
+    What passes of the signal's white noise is as strong at low frequencies, to which windows
+    answer, as before, and hardly to be seen from sample to sample.
+    """
+    _, valve = cylinder_and_valve(machine, joint)
+    if f"spool_{joint}" in recording.channels or not valve.bandwidth:
+        return {}
+    level = noise_std(recording.channels[f"voltage_{joint}"])
+    level /= abs(valve.full - valve.neutral) * (1 - valve.dead_band)
+    return {"opening": level / np.sqrt(max(len(recording.time) // count, 1))}
+
+
+def _weak_form_estimate(
+    sets: list[OrificeEquations], noise: list[dict[str, float]], joint: str
+) -> tuple[Array, Array, Array, float, float]:
+    """X, covariance, freedom, condition number, misfit."""
+    count = len(sets[0].combination)
+    start, W, Z, y, groups, samples = 0, [], [], [], [], []
+    for rows in sets:
+        at = np.flatnonzero(rows.is_smooth)
+        for e in range(count):
+            for half in range(2):
+                W.append(rows.W[e, half, at])
+                Z.append(rows.W[e, 1 - half, at])
+                y.append(rows.y[e, half, at])
+                groups.append(np.full(len(at), 2 * e + half))
+                samples.append(start + at)
+        start += len(rows.is_smooth) + 100
+    order = np.argsort(np.concatenate(groups), kind="stable")
+    group = np.concatenate(groups)[order]
+    W_all, Z_all, y_all = (np.concatenate(part)[order] for part in (W, Z, y))
+    try:
+        estimate = estimators.instrumental_variables(
+            W_all, y_all, Z_all, group, np.concatenate(samples)[order]
+        )
+    except InputError as error:
+        raise InputError(f"the cylinder of '{joint}': {error}") from None
+    X, scale = estimate.values, estimate.noise**2
+    A = sum(Z_all[group == g].T @ W_all[group == g] / scale[g] for g in range(len(scale)))
+    middle, explained = np.zeros((5, 5)), 0.0
+    for rows, given in zip(sets, noise, strict=True):
+        w, N = rows.windows, len(rows.signals.time)
+        Z_rows = rows.W[:, ::-1] * rows.is_smooth[:, None]
+        for sensor, level in signal_noise(rows.signals, given).items():
+            df, dg = rows.noise_sensitivity(X, sensor, level)
+            total = np.zeros((N, 5))
+            for e in range(count):
+                share = scale[2 * e : 2 * e + 2]
+                weighted = Z_rows[e] / share[:, None, None]
+                total += df[e][:, None] * w.apply_transpose(w.phi_derivative, weighted, N)
+                total += dg[e][:, None] * w.apply_transpose(w.phi, weighted, N)
+                variance = (
+                    w.integrate(w.phi_derivative**2, df[e] ** 2)
+                    + w.integrate(w.phi**2, dg[e] ** 2)
+                    + 2 * w.integrate(w.phi_derivative * w.phi, df[e] * dg[e])
+                )
+                explained += float((variance[:, rows.is_smooth] / share[:, None]).sum())
+            middle += total.T @ total
+    inverse = np.linalg.inv(A)
+    propagated = inverse @ middle @ inverse.T
+    found = float(np.sum(estimate.residuals**2 / scale[group]))
+    misfit = found / max(explained, 1e-300)
+    other = max(0.0, 1 - 1 / misfit) * estimate.covariance
+    both = np.diag(propagated + other)
+    # Welch and Satterthwaite: the propagated part is known as well as the sensors' noise
+    freedom = estimate.degrees_of_freedom * (both / np.maximum(np.diag(other), 1e-9 * both)) ** 2
+    return X, propagated + other, freedom, estimate.scaled_condition, misfit
+
+
+def _pointwise_estimate(
+    machine: Machine, joint: str, runs: list[CylinderSignals]
+) -> tuple[Array, Array, Array, float, float]:
+    """The same by (36), sample by sample."""
+    cylinder, _ = cylinder_and_valve(machine, joint)
+    areas = np.array([cylinder.area_a, -cylinder.area_b])
+    start, W, y, samples = 0, [], [], []
+    for run in runs:
+        force = cylinder.area_a * run.p_a - cylinder.area_b * run.p_b
+        found = differentiate(run.time, np.column_stack([force, run.x]))
+        columns = np.tensordot(areas, chamber_terms(machine, joint, run)[1], 1)
+        volumes = (
+            cylinder.hose_a + cylinder.area_a * run.x,
+            cylinder.hose_b + cylinder.area_b * (run.stroke - run.x),
+        )
+        stiff = cylinder.area_a**2 / volumes[0] + cylinder.area_b**2 / volumes[1]
+        every = -(-len(run.time) // _MAX_SAMPLES)
+        W.append(np.column_stack([found.v[:, 0], columns.T])[::every])
+        y.append((-found.v[:, 1] * stiff)[::every])
+        samples.append(start + np.arange(len(y[-1])))
+        start += len(y[-1]) + 100
+    estimate = estimators.least_squares(
+        np.concatenate(W), np.concatenate(y), samples=np.concatenate(samples)
+    )
+    freedom = np.full(5, estimate.degrees_of_freedom)
+    return estimate.values, estimate.covariance, freedom, estimate.scaled_condition, np.nan
+
+
+def _check_identifiable(sets: list[OrificeEquations], joint: str) -> None:
+    """Refuse what a motion cannot tell, by name.
+
+    A column serves if its halves correlate, or if the sum of their products is many times the
+    standard deviation that it would have if they were noise.
+    """
+    for j, (name, reason) in _UNIDENTIFIABLE_REASONS.items():
+        total = energy = spread = 0.0
+        for rows in sets:
+            halves = rows.W[:, :, rows.is_smooth, j]
+            products = halves[:, 0] * halves[:, 1]
+            total += float(products.sum())
+            energy += 0.5 * float((halves**2).sum())
+            spread += float((products**2).sum())
+        if not (total > _MIN_CORRELATION * energy or total > _MIN_SIGNIFICANCE * np.sqrt(spread)):
+            raise InputError(f"{name} of '{joint}' cannot be told: {reason}")
+
+
+def _check_values(
+    values: Array, covariance: Array, joint: str, method: str, runs: list[CylinderSignals]
+) -> None:
+    std = np.sqrt(np.diag(covariance))
+    for j in range(1, 5):
+        if not 0.5 * values[j] > std[j]:
+            pair = "c1 and c2" if j < 3 else "c3 and c4"
+            low, high = (min(r.x.min() for r in runs), max(r.x.max() for r in runs))
+            other = "" if method == "chambers" else ", or take method 'chambers'"
+            raise InputError(
+                f"{pair} of '{joint}' cannot be told apart along {low:.3g} to {high:.3g} of its "
+                f"stroke ({PARAMETER_NAMES[j]} = {values[j]:.3g} +- {std[j]:.2g}): record "
+                f"longer strokes"
+                f"{other}"
+            )

@@ -1,0 +1,260 @@
+"""Neutral signal, dead band and flow gain of a compensated valve from steady speeds.
+
+Pressure compensation makes the flow a function of the signal U [V] alone. With e = U - neutral
+towards extending (turned where `full` is below `neutral`), steady speed v and half a dead band w,
+
+    v = s_up max(e - w, 0) - s_down max(-e - w, 0),
+
+and with the nominal signal range S = |full - neutral| that is v A = gain (|u| - u0) / (1 - u0),
+u = e / S, u0 = w / S, gain = s A (S - w): A is the inlet's area, chamber A to extend and B to
+retract.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.errors import RecordingError
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array
+from crane.common.threads import with_single_threaded_blas
+from crane.identification.estimation import estimators
+from crane.identification.hydraulics.cylinder_signals import (
+    channel_values,
+    cylinder_and_valve,
+    joint_velocity,
+)
+from crane.identification.signals.steady_samples import steady_means
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+
+PARAMETER_NAMES = ("edge up", "edge down", "slope up", "slope down")
+_PARAMETER_UNITS = ("V", "V", "{0}/s/V", "{0}/s/V")
+_STANDSTILL_SHARE = 0.01  # of the fastest speed, at which a signal moves nothing
+_MIN_SIGNAL_SPREAD = 0.05  # of the signal's range, by which levels of one direction must differ
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ValveCurve(OneLineRepr):
+    """Steady speed over signal.
+
+    Attributes:
+        joint: The cylinder's.
+        values: (4,) signals where extending and retracting begin [V], and how the speed in that
+            direction grows with the signal [m/s/V] or [rad/s/V], both positive.
+        covariance: (4, 4).
+        degrees_of_freedom: Degrees of freedom behind it.
+        signal_range: Nominal |full - neutral| [V] with its sign: negative where a lower signal
+            extends.
+        inlet_areas: Of the inlets (2,), extending and retracting [m2].
+        signal: Steady samples used (M,) [V].
+        speed: Their speeds (M,).
+        noise: Standard deviation of the speeds about the curve.
+        ringing: Lowest and highest frequency [Hz] and largest amplitude of speeds that ring while
+            the signal is held, of which means over periods are taken; None where none does.
+    """
+
+    joint: str
+    values: Array
+    covariance: Array
+    degrees_of_freedom: float
+    signal_range: float
+    inlet_areas: tuple[float, float]
+    signal: Array
+    speed: Array
+    noise: float
+    ringing: tuple[float, float, float] | None = None
+
+    def valve_parameters(self) -> tuple[tuple[str, ...], Array, Array]:
+        """What a machine file takes: names, values (5,) and Jacobian (5, 4) of them.
+
+        neutral [V], dead_band as share u0 and, as half width, in volts, flow of u = 1 extending
+        and retracting [m3/s].
+        """
+        up, down, s_up, s_down = self.values
+        turn, size = np.sign(self.signal_range), abs(self.signal_range)
+        half = 0.5 * turn * (up - down)
+        d_half = 0.5 * turn * np.array([1.0, -1, 0, 0])
+        rows = [np.array([0.5, 0.5, 0, 0]), d_half / size, d_half]
+        for area, slope, at in ((self.inlet_areas[0], s_up, 2), (self.inlet_areas[1], s_down, 3)):
+            row = -area * slope * d_half
+            row[at] += area * (size - half)
+            rows.append(row)
+        flows = [
+            a * s * (size - half) for a, s in zip(self.inlet_areas, (s_up, s_down), strict=True)
+        ]
+        values = np.array([0.5 * (up + down), half / size, half, *flows])
+        return (
+            ("neutral", "dead_band", "half width", "flow up", "flow down"),
+            values,
+            np.array(rows),
+        )
+
+    @property
+    def neutral(self) -> float:
+        """Signal in the middle of the dead band [V]."""
+        return float(self.valve_parameters()[1][0])
+
+    @property
+    def dead_band(self) -> float:
+        """Share u0 of the nominal stroke."""
+        return float(self.valve_parameters()[1][1])
+
+    @property
+    def full_flows(self) -> tuple[float, float]:
+        """Flow of u = 1, extending and retracting [m3/s]."""
+        return float(self.valve_parameters()[1][3]), float(self.valve_parameters()[1][4])
+
+    def parameter_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float, float]]:
+        """By name value, and both ends of what covers the truth with this probability."""
+        from scipy.stats import t
+
+        factor = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom)
+        names, values, J = self.valve_parameters()
+        std = np.sqrt(np.diag(self.covariance)), np.sqrt(np.diag(J @ self.covariance @ J.T))
+        rows = zip(
+            (*PARAMETER_NAMES, *names),
+            np.concatenate([self.values, values]),
+            factor * np.concatenate(std),
+            strict=True,
+        )
+        return {name: (float(v), float(v - h), float(v + h)) for name, v, h in rows}
+
+    def predict(self, signal: Array) -> Array:
+        """Steady speeds of signals (N,) [V]."""
+        return _steady_speed(self.values, signal, np.sign(self.signal_range))
+
+    def to_text(self, unit: str = "m") -> str:
+        """A table of all of them."""
+        units = [text.format(unit) for text in _PARAMETER_UNITS] + ["V", "", "V", "m3/s", "m3/s"]
+        lines = [
+            f"valve of {self.joint}: {len(self.signal)} steady samples",
+            f"{'':<12}{'value':>12}   95 % interval",
+        ]
+        for (name, (value, low, high)), text in zip(
+            self.parameter_intervals().items(), units, strict=True
+        ):
+            lines.append(f"{name:<12}{value:>12.5g}   {low:.5g} to {high:.5g} {text}".rstrip())
+        if self.ringing is not None:
+            low, high, size = self.ringing
+            at = f"{low:.3g}" if high < 1.02 * low else f"{low:.3g} to {high:.3g}"
+            told = (
+                f"the speed rings at {at} Hz by up to {size:.3g} {unit}/s while the signal is held"
+            )
+            lines.append(f"{told}: means over its periods are taken")
+        return "\n".join(lines) + "\n"
+
+
+@with_single_threaded_blas
+def identify_valve(
+    machine: Machine, recording: Recording, joint: str, settle: float = 0.5
+) -> ValveCurve:
+    """Dead band and gains of one valve from slow ramps or a staircase of its signal.
+
+    Samples count whose signal and speed hardly changed over the last `settle` seconds, or, where
+    the speed rings while the signal is held, whose means over its period did. With
+    pressures recorded, those that move are left out where the compensator has no margin (supply
+    less inlet below the valve's margin), or where the inlet is sucked empty (below half of the
+    tank's pressure) since the load runs ahead. The spool's lag moves the edges by lag times rate
+    of a ramp; up and down together cancel that.
+
+    Args:
+        machine: With hydraulics; of its valve `neutral`, `full` and `margin` are used, the first
+            two for direction and range only.
+        recording: With the joint and `voltage_<joint>`; pressures as in `cylinder_signals`.
+            A noisy velocity is replaced by a smoother's of the coordinate.
+        joint: The cylinder's.
+        settle: [s], several times the spool's and the load's answer.
+
+    Raises:
+        InputError: The joint has no cylinder.
+        RecordingError: A column is missing, nothing is steady, or one direction is not recorded
+            at two signals.
+    """
+    cylinder, valve = cylinder_and_valve(machine, joint)
+    signal = channel_values(recording, f"voltage_{joint}", "V")
+    v = joint_velocity(recording, joint)
+    means = steady_means(recording.time, settle, signal, v)
+    is_steady, signal, v = means.kept.copy(), means.signal, means.answer
+    fastest = float(np.abs(v).max())
+    names = (f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply")
+    if valve.margin and all(name in recording.channels for name in names):
+        p_a, p_b, supply = (channel_values(recording, name, "Pa") for name in names)
+        inlet = np.where(v > 0, p_a, p_b)
+        tank = machine.hydraulics.supply.tank if machine.hydraulics else 0.0
+        has_margin = (supply - inlet >= valve.margin) & (inlet > 0.5 * tank)
+        is_steady &= has_margin | (np.abs(v) < _STANDSTILL_SHARE * fastest)
+    span = valve.full - valve.neutral
+    sign = float(np.sign(span))
+    for sense, word in ((1, "extending"), (-1, "retracting")):
+        moving = is_steady & (sense * v > _STANDSTILL_SHARE * fastest)
+        if np.count_nonzero(moving) < 2 or np.ptp(signal[moving]) < _MIN_SIGNAL_SPREAD * np.ptp(
+            signal
+        ):
+            raise RecordingError(
+                f"'{joint}' has no steady {word} at two signals with margin at its valve, record "
+                f"a slow ramp or steps of more than {settle:g} s of 'voltage_{joint}' that way"
+            )
+    at = np.flatnonzero(is_steady)
+    # so many samples as tell anything anew
+    at = at[:: max(1, len(at) // 4000)]
+    U, speeds = signal[at], v[at]
+    values = _fit_curve(U, speeds, sign, fastest)
+    J = _steady_speed_jacobian(values, U, sign)
+    estimate = estimators.least_squares(
+        J, speeds - _steady_speed(values, U, sign) + J @ values, samples=at
+    )
+    return ValveCurve(
+        joint=joint,
+        values=values,
+        covariance=estimate.covariance,
+        degrees_of_freedom=estimate.degrees_of_freedom,
+        signal_range=span,
+        inlet_areas=(cylinder.area_a, cylinder.area_b),
+        signal=U,
+        speed=speeds,
+        noise=float(estimate.noise[0]),
+        ringing=None if means.frequency is None else (*means.frequency, means.amplitude),
+    )
+
+
+def _steady_speed(values: Array, U: Array, sign: float) -> Array:
+    up, down, s_up, s_down = values
+    rising, falling = np.maximum(sign * (U - up), 0), np.maximum(sign * (down - U), 0)
+    return np.asarray(s_up * rising - s_down * falling)
+
+
+def _steady_speed_jacobian(values: Array, U: Array, sign: float) -> Array:
+    """Of `_steady_speed` (M, 4)."""
+    up, down, s_up, s_down = values
+    rising, falling = np.maximum(sign * (U - up), 0), np.maximum(sign * (down - U), 0)
+    return np.column_stack(
+        [-sign * s_up * (rising > 0), -sign * s_down * (falling > 0), rising, -falling]
+    )
+
+
+def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
+    """Least squares in edges and slopes, from straight lines through each direction."""
+    from scipy.optimize import least_squares
+
+    start = np.empty(4)
+    for i, sense in enumerate((1, -1)):
+        moving = sense * v > 0.1 * fastest
+        if np.ptp(U[moving]) == 0:
+            moving = sense * v > _STANDSTILL_SHARE * fastest
+        slope, offset = np.polyfit(U[moving], v[moving], 1)
+        start[i], start[2 + i] = -offset / slope, abs(slope)
+    volts, rate = float(np.ptp(U)), float(np.abs(start[2:]).max())
+
+    def residuals(x: Array) -> Array:
+        return _steady_speed(x, U, sign) - v
+
+    def jacobian(x: Array) -> Array:
+        return _steady_speed_jacobian(x, U, sign)
+
+    scale = [volts, volts, rate, rate]
+    fine = 1e-14
+    found = least_squares(
+        residuals, start, jac=jacobian, x_scale=scale, xtol=fine, ftol=fine, gtol=fine
+    )
+    return np.asarray(found.x)

@@ -1,0 +1,228 @@
+"""Base parameters: what of a machine's parameters can be told from its drives' forces."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from crane.closure.constraint_structure import Indices
+from crane.common.errors import ClosureError, InputError
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_term import MotionSamples
+from crane.machine import Machine
+
+_RANK_TOLERANCE = 1e-8  # of a column's norm, what of it must be new
+_ZERO_TOLERANCE = 1e-10  # of the largest norm, below which a column is zero
+_DEFAULT_SPAN = 1.0  # [rad], [machine's size] of joints without limits
+# Preferred as base parameters, first: what is told from one axis before what needs many.
+_PREFERENCE_ORDER = {
+    "Izz": 0,
+    "mx": 1,
+    "my": 1,
+    "mz": 2,
+    "Ixx": 3,
+    "Ixy": 3,
+    "Ixz": 3,
+    "Iyz": 3,
+    "Iyy": 4,
+    "m": 5,
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BaseParameters(OneLineRepr):
+    """The smallest set of parameters with the same effect: W beta = W[:, independent] K beta.
+
+    Attributes:
+        names: (p,) of all parameters.
+        independent: (r,) columns of W that carry the base parameters.
+        grouping: K (r, p): base parameters are K beta; identity in the independent columns.
+        unobservable: Names of parameters without any effect.
+        units: (p,) to compare parameters with: of a body of 1 kg in a machine of size l 1, l and
+            l^2; of friction and the like what makes as much force at most.
+    """
+
+    names: tuple[str, ...]
+    independent: Indices
+    grouping: Array
+    unobservable: tuple[str, ...]
+    units: Array
+
+    @property
+    def rank(self) -> int:
+        """Number of base parameters."""
+        return len(self.independent)
+
+    def identifiable_part(self, rows: Array) -> "BaseParameters":
+        """What of the base parameters a motion tells, rows (m, r) of their columns.
+
+        Of the columns those are taken first of which much is new: taken in another order, many
+        of which a little is new may together hold nothing new.
+        """
+        names, units = [self.names[i] for i in self.independent], self.units[self.independent]
+        order = _pivot_order(rows)
+        identifiable = group_parameters(names, rows, units, order.index)
+        if identifiable.rank == self.rank:
+            return self
+        independent = self.independent[identifiable.independent]
+        grouping = identifiable.grouping @ self.grouping
+        return BaseParameters(self.names, independent, grouping, self.unobservable, self.units)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Each base parameter in words, such as "link7.mx + 0.22 payload.m"."""
+        out = []
+        for row, first in zip(self.grouping, self.independent, strict=True):
+            others = []
+            for i, (share, name) in enumerate(zip(row, self.names, strict=True)):
+                if share != 0 and i != first:
+                    factor = "" if abs(abs(share) - 1) < 1e-9 else f"{abs(share):.6g} "
+                    others.append(f"{'-' if share < 0 else '+'} {factor}{name}")
+            out.append(" ".join([self.names[first], *others]))
+        return tuple(out)
+
+    def values(self, parameters: Array) -> Array:
+        """Base parameters (r,) of parameters (p,)."""
+        return self.grouping @ parameters
+
+
+def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> MotionSamples:
+    """Closed postures all over the strokes, with random velocities and accelerations.
+
+    Raises:
+        InputError: The loops close nowhere within the limits.
+    """
+    machine, rng = model.machine, np.random.default_rng(seed)
+    lower, upper = stroke_limits(machine)
+    q_a: list[Array] = []
+    for _ in range(20 * count):
+        trial = rng.uniform(lower, upper)
+        try:
+            machine.closure.solve(trial)
+        except ClosureError:
+            continue
+        q_a.append(trial)
+        if len(q_a) == count:
+            break
+    if len(q_a) < count:
+        raise InputError(
+            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random postures "
+            "within its limits, narrow the limits"
+        )
+    # joints that move little per coordinate are moved faster, so that all columns are alike
+    span, characteristic_time = upper - lower, machine.closure.characteristic_time
+    v_a, a_a = (
+        size * span * rng.normal(size=(count, len(lower)))
+        for size in (1.0 / characteristic_time, 3.0 / characteristic_time**2)
+    )
+    return model.samples(np.array(q_a), v_a, a_a, characteristic_time)
+
+
+def stroke_limits(machine: Machine) -> tuple[Array, Array]:
+    """Limits of the active joints; those without are taken around home."""
+    home = machine.home[machine.closure.active]
+    span = machine.upper - machine.lower
+    is_unlimited, margin = (
+        ~np.isfinite(span),
+        _DEFAULT_SPAN * machine.closure.units[machine.closure.active],
+    )
+    return (
+        np.where(is_unlimited, home - margin, machine.lower),
+        np.where(is_unlimited, home + margin, machine.upper),
+    )
+
+
+def base_parameters(
+    model: IdentificationModel, samples: MotionSamples | None = None, seed: int = 0
+) -> BaseParameters:
+    """Base parameters of a model, numerically (Gautier, 1991).
+
+    The columns of W over random closed postures are taken one by one, those of Izz, mx, my and
+    of the last bodies first; one that is a combination of those before it joins their groups.
+
+    Args:
+        model: The model.
+        samples: A motion, if what it can tell is asked for; all of the strokes if not given.
+        seed: Of the random postures.
+
+    Raises:
+        InputError: The loops close nowhere within the limits.
+    """
+    p, n = len(model.names), len(model.machine.active)
+    if samples is None:
+        samples = random_samples(model, max(60, 4 * p // n), seed)
+    closure, bodies = model.machine.closure, 10 * len(model.bodies)
+    # forces as virtual work per 1 rad and the machine's size, so that drives compare
+    rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)
+    units = np.ones(p)
+    body = [1.0, *[closure.characteristic_length] * 3, *[closure.characteristic_length**2] * 6]
+    units[:bodies] = np.tile(body, len(model.bodies))
+    norms = np.linalg.norm(rows, axis=0) * units
+    if norms[bodies:].any():  # friction and the like compare among themselves
+        units[bodies:] = norms[:bodies].max(initial=0.0) / norms[bodies:].max() or 1.0
+    return group_parameters(
+        model.names, rows, units, lambda column: _column_preference(model, column)
+    )
+
+
+def group_parameters(
+    names: Sequence[str],
+    rows: Array,
+    units: Array,
+    preference: Callable[[int], Any] = lambda column: column,
+) -> BaseParameters:
+    """Base parameters of a regressor (m, p) and units (p,), columns of small preference first.
+
+    A column counts if what is new of it exceeds 1e-8 of its norm.
+    """
+    norms = np.linalg.norm(rows, axis=0)
+    zero = norms * units <= _ZERO_TOLERANCE * (norms * units).max(initial=0.0)
+    scaled = rows / np.where(zero, 1.0, norms)
+    chosen: list[int] = []
+    directions = np.empty((len(rows), 0))
+    for i in sorted(np.flatnonzero(~zero).tolist(), key=preference):
+        rest = scaled[:, i]
+        for _ in range(2):  # twice is enough (Kahan, Parlett)
+            rest = rest - directions @ (directions.T @ rest)
+        length = np.linalg.norm(rest)
+        if length > _RANK_TOLERANCE:
+            chosen.append(i)
+            directions = np.column_stack([directions, rest / length])
+    independent = np.array(sorted(chosen), dtype=np.intp)
+    q, r = np.linalg.qr(scaled[:, independent])
+    share = np.linalg.solve(r, q.T @ scaled)
+    share[np.abs(share) < 1e-9] = 0.0
+    grouping = share * np.where(zero, 0.0, norms) / norms[independent][:, None]
+    grouping[:, independent] = np.eye(len(independent))
+    unobservable = tuple(name for name, nothing in zip(names, zero, strict=True) if nothing)
+    return BaseParameters(tuple(names), independent, grouping, unobservable, units)
+
+
+def _pivot_order(columns: Array) -> list[int]:
+    """Columns in the order of what is new of them, as of columns of length one.
+
+    As with pivoting (Businger, Golub, 1965), but the first of those of which at least half as
+    much is new as of any, so that rounding does not choose among those of which as much is.
+    """
+    norms = np.linalg.norm(columns, axis=0)
+    rest, order = columns / np.where(norms, norms, 1.0), list[int]()
+    for _ in norms:
+        remaining = np.linalg.norm(rest, axis=0)
+        remaining[order] = -1.0
+        order.append(int(np.argmax(remaining >= 0.5 * remaining.max())))
+        if length := remaining[order[-1]]:
+            direction = rest[:, order[-1]] / length
+            rest -= np.outer(direction, direction @ rest)
+    return order
+
+
+def _column_preference(model: IdentificationModel, column: int) -> tuple[int, int, int]:
+    """Bodies before other parameters of the same effect, distal ones first."""
+    bodies = 10 * len(model.bodies)
+    if column >= bodies:
+        return (1, 0, column)
+    kind = model.names[column].rpartition(".")[2]
+    return (0, _PREFERENCE_ORDER[kind], -column)

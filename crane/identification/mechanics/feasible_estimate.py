@@ -1,0 +1,155 @@
+"""Parameters of bodies that can exist."""
+
+import numpy as np
+
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.identification.estimation.estimators import Estimate, Prior, estimate_from_minimum
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.feasible_parameters import (
+    body_parameters,
+    body_size,
+    divergence_hessian_root,
+    pseudo_inertia,
+    solve_feasible,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.regression_equations import RegressionEquations
+
+_MIN_NOISE_SHARE = 1e-4  # of the forces, noise that a feasible estimate counts with at least
+_DEFAULT_RELATIVE_STD = (
+    0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
+)
+_UNINFORMATIVE_STD = 1e3  # that of a body of which a prior says nothing
+_ROUNDING = 1e-9
+_MIN_THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
+
+
+def feasible_estimate(
+    model: IdentificationModel,
+    base: BaseParameters,
+    equations: RegressionEquations,
+    selection: Array,
+    unconstrained: Estimate,
+    prior: Prior | None,
+) -> Estimate:
+    """All parameters, with bodies that can exist and friction that is not negative.
+
+    The covariance is that of the minimum of `feasible`'s own objective,
+
+        H^-1 (W^T D C D W + P) H^-1,    H = W^T D W + P,    D = 1 / noise^2,
+
+    with C the covariance of the residuals, P half of the second derivative of divergence and
+    spread at the estimate, as if what they draw towards were as uncertain as they say. A bound at
+    which friction ends is not counted as knowledge: there the interval is too wide rather than
+    too narrow.
+
+    Args:
+        model: The model, with bodies.
+        base: What of its base parameters the recording tells.
+        equations: The recording.
+        selection: Which columns of the rows they are (., r).
+        unconstrained: Estimate of the base parameters that knows no bounds, for its noise.
+        prior: Of all parameters; the described bodies if not given.
+
+    Returns:
+        All parameters (p,).
+
+    Raises:
+        InputError: A body has no mass.
+    """
+    count = 10 * len(model.bodies)
+    described_values = model.nominal if prior is None else prior[0]
+    for link, mass in zip(model.bodies, described_values[:count:10].tolist(), strict=True):
+        if not mass > 0:
+            raise InputError(
+                f"'{link}' is described without mass, give it a rough one, or leave feasible out"
+            )
+    mean, body_weights = (
+        model.nominal.copy(),
+        np.full(len(model.bodies), _DEFAULT_RELATIVE_STD**-2),
+    )
+    parameter_std, parameter_weights = np.full(len(mean) - count, np.inf), np.zeros(count)
+    if prior is not None:
+        mean = prior[0].copy()
+        parameter_std = prior[1][count:]
+        body_weights, parameter_weights = _body_prior_weights(mean[:count], prior[1][:count])
+    for i in range(0, count, 10):
+        mean[i : i + 10] = thicken_body(mean[i : i + 10])
+    nonnegative = [i for i, sign in enumerate(model.nonnegative) if sign and i >= count]
+    # the triangular factors of the joints' rows instead of the rows: their columns have the same
+    # lengths and angles
+    K = selection @ base.grouping
+    W, y = (
+        np.vstack(list(equations.triangular_factors[:, :, :-1] @ K)),
+        equations.triangular_factors[:, :, -1].ravel(),
+    )
+    size = np.linalg.norm(y) / np.sqrt(len(equations.y))
+    noise = np.maximum(unconstrained.noise, _MIN_NOISE_SHARE * size)
+    # none of the others makes more than all of the force; without that, two that do the same in
+    # this motion may grow without end
+    single_forces = np.linalg.norm(W[:, count:], axis=0) / np.sqrt(len(equations.y))
+    parameter_std = np.minimum(
+        parameter_std, size / np.where(single_forces > 0, single_forces, size)
+    )
+    weights = np.repeat(1 / noise, equations.triangular_factors.shape[1])
+    # what is known of one parameter of a body beyond what is of the whole body
+    prior_rows = np.diag(np.sqrt(parameter_weights))[parameter_weights > 0]
+    W = np.vstack(
+        [W, np.column_stack([prior_rows, np.zeros((len(prior_rows), len(parameter_std)))])]
+    )
+    y = np.append(y, prior_rows @ (mean if prior is None else prior[0])[:count])
+    weights = np.append(weights, np.ones(len(prior_rows)))
+    solution = solve_feasible(
+        W, y, weights, model.bodies, mean, body_weights, parameter_std, nonnegative
+    )
+    prior_root = np.zeros((16 * len(model.bodies) + len(mean), len(mean)))
+    for i, each in enumerate(body_weights):
+        body = slice(10 * i, 10 * i + 10)
+        prior_root[16 * i : 16 * i + 16, body] = np.sqrt(each) * divergence_hessian_root(
+            solution.values[body]
+        )
+    prior_root[-len(mean) :] = np.diag(np.append(np.sqrt(parameter_weights), 1 / parameter_std))
+    return estimate_from_minimum(
+        equations.projected_regressor(K),
+        equations.y,
+        equations.groups,
+        equations.samples,
+        solution.values,
+        noise,
+        prior_root,
+    )
+
+
+def _body_prior_weights(mean: Array, std: Array) -> tuple[Array, Array]:
+    """What a prior of bodies (10 nb,) is in the divergence, and beyond it.
+
+    Returns:
+        Per body (nb,) one over the square of the share of mass and size to which all of it is
+        known at least; and per parameter (10 nb,) what is known beyond that, one over a variance.
+    """
+    units = np.array([_body_units(mean[i : i + 10]) for i in range(0, len(mean), 10)])
+    share = np.minimum((std.reshape(-1, 10) / units).max(axis=1), _UNINFORMATIVE_STD)
+    excess = std**-2.0 - (share[:, None] * units).ravel() ** -2.0
+    return share**-2.0, np.where(excess * std**2 > _ROUNDING, excess, 0.0)
+
+
+def _body_units(body: Array) -> Array:
+    """m, m l, m l^2 (10,) of a body."""
+    mass, length = body_size(body)
+    return mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
+
+
+def thicken_body(body: Array) -> Array:
+    """A body at least a share of its size thick in every direction.
+
+    Rods and plates without thickness lie on the edge of what can exist.
+    """
+    P = pseudo_inertia(body)
+    mass, length = body_size(body)
+    com = P[:3, 3] / mass
+    second = P[:3, :3] - mass * np.outer(com, com)
+    values, axes = np.linalg.eigh(second)
+    least = mass * (_MIN_THICKNESS * length) ** 2
+    P[:3, :3] = axes @ np.diag(np.maximum(values, least)) @ axes.T + mass * np.outer(com, com)
+    return body_parameters(P)

@@ -1,0 +1,284 @@
+"""The physically feasible parameters that explain forces best: a convex problem.
+
+A mass, first moment h and inertia I about the origin of a body's frame belong to a body that
+can exist, with mass everywhere positive, if and only if its pseudo-inertia
+
+    P = [[tr(I)/2 1 - I, h], [h^T, m]]   (4, 4)
+
+is positive definite (Wensing, Kim, Slotine 2018, IEEE Robotics and Automation Letters 3(1)).
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from crane.common.errors import CraneError, InputError
+from crane.common.optional_libraries import import_optional_library
+from crane.common.samples import Array
+from crane.description.inertia_feasibility import inertia_problem
+
+_MIN_EIGENVALUE = 1e-4  # smallest eigenvalue of X
+_SOLVER_TOLERANCES = {
+    "tol_gap_abs": 1e-10,
+    "tol_gap_rel": 1e-10,
+    "tol_feas": 1e-9,
+}  # met or nearly
+_CAUTIOUS_OPTIONS = {"max_step_fraction": 0.9, "static_regularization_constant": 1e-7}
+_SCS_OPTIONS = {"eps": 1e-7, "max_iters": 20000}
+_SINGULARITY_TOLERANCE = (
+    1e-10  # smallest over largest eigenvalue of a prior, its lengths scaled to one
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FeasibleSolution:
+    """A physically feasible estimate.
+
+    Attributes:
+        values: Parameters (p,): m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of each body, then
+            the others.
+        misfit: |weights (W values - y)|^2.
+        divergence: Of each body from its prior (nb,), without unit.
+        smallest_eigenvalues: Smallest eigenvalue of each body's pseudo-inertia (nb,), its length
+            unit chosen so that the prior's second moments have the trace of its mass [kg].
+    """
+
+    values: Array
+    misfit: float
+    divergence: Array
+    smallest_eigenvalues: Array
+
+
+def pseudo_inertia(parameters: Array) -> Array:
+    """P (..., 4, 4) from the ten parameters (..., 10) of a body in Pinocchio's order."""
+    m, hx, hy, hz, xx, xy, yy, xz, yz, zz = np.moveaxis(np.asarray(parameters), -1, 0)
+    half = 0.5 * (xx + yy + zz)
+    rows = [
+        [half - xx, -xy, -xz, hx],
+        [-xy, half - yy, -yz, hy],
+        [-xz, -yz, half - zz, hz],
+        [hx, hy, hz, m],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def body_size(body: Array) -> tuple[float, float]:
+    """Mass [kg], and root of the mean square distance of the mass from the origin [m]."""
+    P = pseudo_inertia(body)
+    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
+
+
+def body_parameters(P: Array) -> Array:
+    """The ten parameters (..., 10) from P (..., 4, 4): the inverse of `pseudo_inertia`."""
+    P = np.asarray(P)
+    xx, yy, zz = (P[..., i, i] for i in range(3))
+    columns = [P[..., 3, 3], P[..., 0, 3], P[..., 1, 3], P[..., 2, 3]]
+    columns += [yy + zz, -P[..., 0, 1], xx + zz, -P[..., 0, 2], -P[..., 1, 2], xx + yy]
+    return np.stack(columns, axis=-1)
+
+
+def load_convex_solver() -> Any:
+    """The library that solves it.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    return import_optional_library("cvxpy", "a feasible estimate")
+
+
+def solve_feasible(
+    W: Array,
+    y: Array,
+    weights: Array,
+    bodies: Sequence[str],
+    prior: Array,
+    prior_weight: float | Array,
+    parameter_std: Array | None = None,
+    nonnegative: Sequence[int] = (),
+) -> FeasibleSolution:
+    """Minimise misfit and distance to a prior over all bodies that can exist.
+
+        |weights (W theta - y)|^2 + sum_b prior_weight_b 2 d(P_b, P0_b)
+            + sum_i ((theta_i - prior_i) / spread_i)^2
+
+        d(P, P0) = tr(P0^-1 P) - log det(P0^-1 P) - 4,   L^-1 P_b L^-T >= 1e-4,  P0_b = L L^T.
+
+    d is the divergence between normal distributions of mass: it depends neither on frames nor
+    on units, grows without end towards what cannot exist, and is |L^-1 P L^-T - 1|^2 / 2 near
+    the prior, so that prior_weight is 1 / (relative standard deviation of a body)^2 where the
+    weights are 1 / (standard deviation of the forces). X = L^-1 P L^-T is also what is solved
+    for: it is near 1 for bodies of any size. W may have dependent columns.
+
+    Args:
+        W: Regressor (m, p), ten columns per body, then others.
+        y: Forces (m,).
+        weights: One over the noise of each row (m,).
+        bodies: Names (nb,).
+        prior: Parameters (p,), those of bodies that can exist.
+        prior_weight: > 0, of each body (nb,) or of all.
+        parameter_std: Standard deviations (p - 10 nb,) of the others about the prior; infinite, as
+            all are if left out, where it says nothing.
+        nonnegative: Columns among the others that are not negative, such as friction.
+
+    Raises:
+        InputError: Shapes, a body of the prior that cannot exist, or no CVXPY.
+        CraneError: The solver gave up.
+
+    Source: Lee, Wensing, Park 2020, IEEE Transactions on Robotics 36(1).
+    """
+    cp = load_convex_solver()
+    size, split = np.shape(W)[1], 10 * len(bodies)
+    parameter_std = (
+        np.full(size - split, np.inf) if parameter_std is None else np.asarray(parameter_std)
+    )
+    prior_weight = np.broadcast_to(np.asarray(prior_weight, np.float64), len(bodies))
+    _check_arguments(W, y, weights, prior, prior_weight, parameter_std, nonnegative, split)
+    factors = [
+        _prior_factor(body, p)
+        for body, p in zip(bodies, prior[:split].reshape(-1, 10), strict=True)
+    ]
+
+    # [W y] weighted, compressed to its triangular factor; then columns for X and of length one.
+    weighted_factor = np.linalg.qr(np.column_stack([W, y]) * np.asarray(weights)[:, None]).R
+    R, d = weighted_factor[:size, :size], weighted_factor[:size, size]
+    maps = [_scaled_parameter_map(L) for L in factors]
+    # What is solved for is near zero: X - 1, and the others from where the prior's bodies
+    # leave them, in units of what the forces or their prior tell.
+    d = d - R[:, :split] @ prior[:split]
+    is_known = np.isfinite(parameter_std)
+    length = np.linalg.norm(R[:, split:], axis=0)
+    unit = np.minimum(1 / np.where(length > 0, length, 1.0), parameter_std)
+    prior_root = np.diag(1 / parameter_std)[is_known]
+    system = np.vstack([R[:, split:], prior_root]) * unit
+    start = unit * np.linalg.lstsq(system, np.append(d, prior_root @ prior[split:]))[0]
+    bounded = np.asarray(nonnegative, dtype=int) - split
+    start[bounded] = np.maximum(start[bounded], 0)
+    d, prior_offset = d - R[:, split:] @ start, prior[split:] - start
+
+    scale = 1 / np.sqrt(max(1.0, 2 * prior_weight.max()))
+    X = [cp.Variable((4, 4), symmetric=True) for _ in bodies]
+    z = cp.Variable(size - split)
+    model = (R[:, split:] * unit) @ z - d
+    cost = cp.sum_squares(scale * (prior_root * unit @ z - prior_root @ prior_offset))
+    constraints = [z[bounded] >= -start[bounded] / unit[bounded]]
+    for b, x in enumerate(X):
+        block = R[:, 10 * b : 10 * b + 10] @ maps[b]
+        model = model + block @ cp.vec(x - np.eye(4), order="F")
+        cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
+        constraints.append(x >> _MIN_EIGENVALUE * np.eye(4))
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
+    # its own tolerances where ours are out of reach, and a solver that needs no factors where
+    # columns do the same
+    solvers = (
+        *((cp.CLARABEL, x) for x in (_SOLVER_TOLERANCES, {}, _CAUTIOUS_OPTIONS)),
+        (cp.SCS, _SCS_OPTIONS),
+    )
+    for solver, options in solvers:
+        with suppress(cp.SolverError):  # told below
+            problem.solve(solver=solver, **options)
+            break
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        raise CraneError(
+            f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"
+        )
+
+    solved = [0.5 * (x.value + x.value.T) for x in X]
+    others = start + unit * z.value
+    others[bounded] = np.maximum(others[bounded], 0)  # to rounding
+    inertias = [L @ x @ L.T for L, x in zip(factors, solved, strict=True)]
+    values = np.concatenate([*(body_parameters(P) for P in inertias), others])
+    return FeasibleSolution(
+        values,
+        float(np.sum((weights * (W @ values - y)) ** 2)),
+        np.array([np.trace(x) - np.linalg.slogdet(x)[1] - 4 for x in solved]),
+        np.array(
+            [
+                np.linalg.eigvalsh(_normalized_inertia(P, L @ L.T))[0]
+                for P, L in zip(inertias, factors, strict=True)
+            ]
+        ),
+    )
+
+
+def divergence_hessian_root(body: Array) -> Array:
+    """L (16, 10) with L^T L the second derivative of d(P, P0) by the parameters of a body.
+
+    d = tr(P0^-1 P) - log det(P0^-1 P) - 4, so d'' = |P^-1/2 dP P^-1/2|^2, whatever P0 is.
+
+    Args:
+        body: Parameters (10,), of P.
+    """
+    cholesky_factor = np.linalg.cholesky(pseudo_inertia(body))
+    first = np.linalg.solve(cholesky_factor, pseudo_inertia(np.eye(10)))
+    transformed = np.linalg.solve(cholesky_factor, np.swapaxes(first, 1, 2))
+    return transformed.reshape(10, 16).T
+
+
+def _check_arguments(
+    W: Array,
+    y: Array,
+    weights: Array,
+    prior: Array,
+    prior_weight: Array,
+    parameter_std: Array,
+    nonnegative: Sequence[int],
+    split: int,
+) -> None:
+    count, size = np.shape(W)
+    shapes = {"y": (y, (count,)), "weights": (weights, (count,)), "prior": (prior, (size,))}
+    shapes["spread"] = (parameter_std, (size - split,))
+    for name, (array, shape) in shapes.items():
+        if size < split or np.shape(array) != shape:
+            raise InputError(
+                f"{name} has the shape {np.shape(array)}, give {shape} for the regressor "
+                f"{(count, size)} with {split} columns of bodies"
+            )
+    for name, array in (("regressor", W), ("y", y), ("weights", weights), ("prior", prior)):
+        if not np.isfinite(array).all():
+            raise InputError(f"{name} is not finite, leave such rows out")
+    if not (prior_weight > 0).all() or not (parameter_std > 0).all():
+        raise InputError("weight and spread of the prior are not above 0, give larger ones")
+    if not all(split <= i < size for i in nonnegative):
+        raise InputError(
+            f"nonnegative columns {list(nonnegative)}, choose of {split} to {size - 1}"
+        )
+
+
+def _prior_factor(body: str, parameters: Array) -> Array:
+    """L (4, 4) of P0 = L L^T of a body's prior.
+
+    Raises:
+        InputError: The body cannot exist, or is flat.
+    """
+    P = pseudo_inertia(parameters)
+    mass, first = parameters[0], parameters[1:4]
+    if mass <= 0:
+        raise InputError(f"prior of '{body}' has the mass {mass:.4g} kg, give it a positive one")
+    second = P[:3, :3] - np.outer(first, first) / mass
+    problem = inertia_problem(mass, np.trace(second) * np.eye(3) - second)
+    if problem:
+        raise InputError(f"prior of '{body}' has {problem}")
+    values = np.linalg.eigvalsh(second)
+    if values[0] <= _SINGULARITY_TOLERANCE * values[-1]:
+        raise InputError(
+            f"prior of '{body}' is flat: second moments of mass {values[0]:.3g}, {values[1]:.3g}, "
+            f"{values[2]:.3g} kg m2 about its centre, give it some thickness"
+        )
+    return np.asarray(np.linalg.cholesky(P), dtype=np.float64)
+
+
+def _scaled_parameter_map(L: Array) -> Array:
+    """Matrix (10, 16) from vec(X) to the ten parameters of P = L X L^T."""
+    basis = np.eye(16).reshape(16, 4, 4)
+    symmetric = 0.5 * (basis + np.swapaxes(basis, 1, 2))
+    return body_parameters(L @ symmetric @ L.T).T
+
+
+def _normalized_inertia(P: Array, prior: Array) -> Array:
+    """P in a length unit in which the prior's second moments have the trace of its mass."""
+    length = np.sqrt(np.trace(prior[:3, :3]) / prior[3, 3])
+    unit = np.array([1 / length] * 3 + [1.0])
+    return P * np.outer(unit, unit)

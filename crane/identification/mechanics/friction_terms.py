@@ -1,0 +1,216 @@
+"""Friction along a direction: functions of its velocity, and of what it did before."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from crane.common.errors import InputError, suggest_names
+from crane.common.samples import Array
+from crane.description import Friction
+from crane.identification.mechanics.model_term import (
+    ForceDirection,
+    MotionSamples,
+    resolve_direction,
+)
+from crane.machine import Machine
+
+ForceShape = Callable[[Array], Array]
+
+
+class VelocityFriction:
+    """Forces along one direction whose shapes over its velocity are known: friction.
+
+    Args:
+        machine: The machine.
+        direction: A joint's name, or a combination.
+        shapes: Velocity (N,) -> (N,) by name of the parameter.
+        nominal: Their values; zero if not given.
+        nonnegative: Names of parameters that cannot be negative.
+
+    Attributes:
+        direction: See above.
+        stribeck_velocities: Velocities over which stiction fades [m/s], [rad/s].
+    """
+
+    stribeck_velocities: tuple[float, ...] = ()
+
+    def __init__(
+        self,
+        machine: Machine,
+        direction: str | ForceDirection,
+        shapes: Mapping[str, ForceShape],
+        nominal: Mapping[str, float] | None = None,
+        nonnegative: Sequence[str] = (),
+    ):
+        direction = resolve_direction(machine, direction)
+        self._machine, self.direction, self._shapes = machine, direction, shapes
+        self.names = tuple(f"{direction.name}.{name}" for name in shapes)
+        self.nominal = np.array([(nominal or {}).get(name, 0.0) for name in shapes])
+        self.nonnegative = tuple(name in nonnegative for name in shapes)
+
+    def columns(self, samples: MotionSamples) -> Array:
+        """See `ModelTerm`."""
+        rows = self.direction.jacobian(self._machine, samples)
+        speed = np.einsum("ij,ij->i", rows, samples.v_a)
+        return rows[:, :, None] * self.steady_forces(speed)[:, None, :]
+
+    def steady_forces(self, v: Array) -> Array:
+        """(N, k) forces per parameter at steady speeds (N,)."""
+        return np.stack([shape(v) for shape in self._shapes.values()], axis=1)
+
+
+def smoothed_sign(smoothing: float) -> ForceShape:
+    """sign(v), smoothed to tanh(v / smoothing) as in the simulation."""
+    if smoothing == 0:
+        return np.sign
+    return lambda v: np.tanh(v / smoothing)
+
+
+def friction_term(
+    machine: Machine,
+    direction: str | ForceDirection,
+    kinds: Sequence[str] = ("coulomb", "coulomb_offset", "viscous", "viscous_offset"),
+    smoothing: float | None = None,
+    stribeck: Sequence[float] = (),
+) -> VelocityFriction:
+    """Friction of equation (5) of the reduced-scale forwarder paper, and Stribeck's.
+
+        coulomb s + coulomb_offset + viscous v + viscous_offset |v|
+        + sum_i stiction_i s e^-(v / v_i)^2,    s = sign(v).
+
+    Args:
+        machine: The machine, whose own friction is nominal.
+        direction: A joint's name, or a combination.
+        kinds: Which of the four.
+        smoothing: Of the sign [m/s], [rad/s]; the machine's if not given, 0 for a jump.
+        stribeck: Velocities v_i [m/s], [rad/s]; the parameters of several: stiction_1, ...
+    """
+    name = direction if isinstance(direction, str) else direction.name
+    law = machine.friction.get(name, Friction(smoothing=0.0))
+    sign = smoothed_sign(law.smoothing if smoothing is None else smoothing)
+    shapes_by_kind: dict[str, ForceShape] = {
+        "coulomb": sign,
+        "coulomb_offset": np.ones_like,
+        "viscous": lambda v: v,
+        "viscous_offset": lambda v: v * sign(v),
+    }
+    for kind in kinds:
+        if kind not in shapes_by_kind:
+            raise InputError(
+                f"friction '{kind}' is unknown, {suggest_names(shapes_by_kind, kind)}"
+            )
+    shapes = {kind: shapes_by_kind[kind] for kind in kinds}
+    nominal = {kind: getattr(law, kind) for kind in kinds}
+    for i, v_s in enumerate(stribeck, start=1):
+        label = "stiction" if len(stribeck) == 1 else f"stiction_{i}"
+        shapes[label] = lambda v, v_s=v_s: sign(v) * np.exp(-((v / v_s) ** 2))  # type: ignore[misc]
+        if law.stribeck == v_s:
+            nominal[label] = law.stiction
+    term = VelocityFriction(
+        machine, direction, shapes, nominal, nonnegative=("coulomb", "viscous")
+    )
+    term.stribeck_velocities = tuple(stribeck)
+    return term
+
+
+def root_friction_term(machine: Machine, direction: str | ForceDirection) -> VelocityFriction:
+    """Friction like the root of the speed, of mixed lubrication: root sign(v) sqrt |v|."""
+    shape = {"root": lambda v: np.sign(v) * np.sqrt(np.abs(v))}
+    return VelocityFriction(machine, direction, shape)
+
+
+class FrictionalMemory:
+    """Friction that remembers rest: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 first.
+
+    A joint that starts from rest sticks more than one that comes to rest, as the contact takes
+    time to change.
+
+    Args:
+        machine: The machine.
+        direction: A joint's name, or a combination.
+        lag: Over which rest is forgotten [s].
+        speed: At which it is forgotten [m/s], [rad/s].
+    """
+
+    names: tuple[str, ...]
+    nonnegative: tuple[bool, ...]
+
+    def __init__(
+        self, machine: Machine, direction: str | ForceDirection, lag: float, speed: float
+    ):
+        direction = resolve_direction(machine, direction)
+        if not (lag > 0 and speed > 0):
+            raise InputError(
+                f"the memory of '{direction.name}' has the lag {lag:g} s and the speed {speed:g}, "
+                "give two numbers above 0"
+            )
+        self._machine, self.direction, self._lag, self._speed = machine, direction, lag, speed
+        self.names, self.nominal = (f"{direction.name}.memory",), np.zeros(1)
+        self.nonnegative = (False,)
+
+    def columns(self, samples: MotionSamples) -> Array:
+        """See `ModelTerm`."""
+        from scipy.signal import lfilter
+
+        if samples.step is None:
+            raise InputError(f"'{self.names[0]}' remembers time, give the step of the samples")
+        rows = self.direction.jacobian(self._machine, samples)
+        v = np.einsum("ij,ij->i", rows, samples.v_a)
+        share = -np.expm1(-samples.step / self._lag)  # exact for a steady speed
+        w, state = np.empty_like(v), samples.term_states.get(self, np.zeros(1))
+        edges = sorted({0, *samples.starts, len(v)})
+        for start, end in pairwise(edges):
+            state = np.zeros(1) if start in samples.starts else state
+            w[start:end], state = lfilter([share], [1, share - 1], np.abs(v[start:end]), zi=state)
+        samples.term_states[self] = state
+        return (rows * (np.sign(v) * np.exp(-w / self._speed))[:, None])[:, :, None]
+
+    def steady_forces(self, v: Array) -> Array:
+        """(N, 1) force per parameter at steady speeds (N,), where w = |v|."""
+        return (np.sign(v) * np.exp(-np.abs(v) / self._speed))[:, None]
+
+
+class PreslidingFriction:
+    """Friction that has to be wound up first: Dahl's law over the travelled distance.
+
+    F = force z, dz = (1 - sign(v) z) ds / length, z = 0 where a recording begins (Dahl, 1968).
+
+    Args:
+        machine: The machine.
+        direction: A joint's name, or a combination.
+        length: Distance over which it winds up [m], [rad].
+    """
+
+    names: tuple[str, ...]
+    nonnegative: tuple[bool, ...]
+
+    def __init__(self, machine: Machine, direction: str | ForceDirection, length: float):
+        direction = resolve_direction(machine, direction)
+        if not length > 0:
+            raise InputError(f"the length of presliding of '{direction.name}' is {length:g}")
+        self._machine, self.direction, self._length = machine, direction, length
+        self.names, self.nominal = (f"{direction.name}.presliding",), np.zeros(1)
+        self.nonnegative = (True,)
+
+    def columns(self, samples: MotionSamples) -> Array:
+        """See `ModelTerm`."""
+        rows = self.direction.jacobian(self._machine, samples)
+        travel = self.direction.coordinate(self._machine, samples)
+        state, last = samples.term_states.get(self, (0.0, travel[0]))
+        steps = np.diff(travel, prepend=last) / self._length
+        steps[list(samples.starts)] = 0.0
+        z = np.empty(len(travel))
+        restarts = set(samples.starts)
+        for i, step in enumerate(steps.tolist()):
+            if i in restarts:
+                state = 0.0
+            limit = 1.0 if step > 0 else -1.0
+            state = limit + (state - limit) * np.exp(-abs(step))  # exact for a steady direction
+            z[i] = state
+        samples.term_states[self] = (state, travel[-1])
+        return rows[:, :, None] * z[:, None, None]
+
+    def steady_forces(self, v: Array) -> Array:
+        """(N, 1) force per parameter at steady speeds (N,), wound up."""
+        return np.sign(v)[:, None]

@@ -1,0 +1,245 @@
+"""What an identification found, and how well it predicts."""
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.atomic_output import replace_file
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array
+from crane.common.text_tables import format_table
+from crane.identification.estimation.estimators import Estimate
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.force_comparison import ForceComparison
+from crane.identification.mechanics.identifiability import weak_directions
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.machine import Machine
+
+_IMPOSSIBLE_FACTOR = 10.0  # times its magnitude, what a parameter cannot be
+_MAX_SHOWN = 3  # directions that a table names
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(OneLineRepr):
+    """Parameters of a machine from a recording.
+
+    Attributes:
+        model: What was identified.
+        base: Base parameters that the recording tells.
+        values: (r,) their values.
+        covariance: (r, r).
+        parameters: (p,) values of all parameters, where a prior or feasibility asked for them;
+            else None: forces determine the base parameters only.
+        estimate: Of the estimator, with noise and condition numbers; of all parameters where
+            those are known.
+        method: Name of the estimator.
+        feasible: Whether every body of `parameters` can exist.
+        training: On the recording it was identified from.
+        magnitude: (r,) how large they can be on such a machine, see `determined.magnitudes`.
+        advice: What motion would tell what this one does not.
+        speeds: By direction along which there is friction, least and largest speed of the
+            training [m/s], [rad/s].
+        bandwidth: [Hz] of the low-pass.
+        slow: (n,) velocities below which rows were left out [m/s], [rad/s].
+        validation: On another one, if there was one.
+    """
+
+    model: IdentificationModel
+    base: BaseParameters
+    values: Array
+    covariance: Array
+    parameters: Array | None
+    estimate: Estimate
+    method: str
+    feasible: bool
+    training: ForceComparison
+    magnitude: Array
+    advice: str
+    speeds: Mapping[str, tuple[float, float]]
+    bandwidth: float
+    slow: Array
+    validation: ForceComparison | None = None
+
+    def _one_line(self) -> str:
+        """What was identified, how, and how well it predicts."""
+        kind = "feasible, " if self.feasible else ""
+        fits = {"error": self.training, "validation": self.validation}
+        error_texts = (
+            f", {name} {fit.overall_relative_error:.3%}"
+            for name, fit in fits.items()
+            if fit is not None and not math.isnan(fit.overall_relative_error)
+        )
+        vague = self.marks.count("not determined")
+        return (
+            f"Identification of '{self.described_machine.name}': {len(self.values)} base "
+            f"parameters"
+            f"{f', {vague} not determined' if vague else ''}, "
+            f"{kind}{self.method}{''.join(error_texts)}"
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(r,) first parameter of each group."""
+        return tuple(self.base.names[i] for i in self.base.independent)
+
+    @property
+    def std(self) -> Array:
+        """(r,) standard deviations."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # below it by rounding
+
+    def interval(self, level: float = 0.95) -> Array:
+        """(r, 2) ends of what covers the truth with this probability."""
+        from scipy.stats import t
+
+        half = t.ppf(0.5 + 0.5 * level, self.estimate.degrees_of_freedom) * self.std
+        return np.column_stack([self.values - half, self.values + half])
+
+    @cached_property
+    def marks(self) -> tuple[str, ...]:
+        """(r,) what is wrong with each: "not determined", "impossible", or "".
+
+        Not determined is what has a standard deviation above its magnitude: the recording tells
+        less than the description of the machine does. Impossible is what is beyond ten times its
+        magnitude by more than two standard deviations.
+        """
+        beyond = np.abs(self.values) - 2 * self.std > _IMPOSSIBLE_FACTOR * self.magnitude
+        return tuple(
+            "not determined" if vague else "impossible" if far else ""
+            for vague, far in zip(self.std > self.magnitude, beyond, strict=True)
+        )
+
+    @cached_property
+    def undetermined_directions(self) -> list[tuple[float, str]]:
+        """Directions that the recording does not determine, see `determined.weak_directions`."""
+        return weak_directions(self.names, self.covariance, self.magnitude)
+
+    @property
+    def remedy(self) -> str:
+        """What would determine more; a motion last, as this one may be the best there is."""
+        if self.parameters is not None:
+            return f"leave such terms out, or {self.advice}"
+        return f"give a prior, ask for feasible bodies, or {self.advice}"
+
+    @property
+    def warning(self) -> str:
+        """One line on the parameters not determined or impossible, "" where none is."""
+        vague, wrong = (
+            [name for name, mark in zip(self.names, self.marks, strict=True) if mark == kind]
+            for kind in ("not determined", "impossible")
+        )
+        parts = []
+        if vague:  # combinations of such as are determined each the table names without a warning
+            weakest = (
+                self.undetermined_directions[0][1] if self.undetermined_directions else vague[0]
+            )
+            parts.append(
+                f"this motion does not determine {len(vague)} of {len(self.names)} base "
+                f"parameters, the least {weakest}: {self.remedy}"
+            )
+        if wrong:
+            parts.append(
+                f"{', '.join(wrong[:_MAX_SHOWN])} {'is' if len(wrong) == 1 else 'are'} beyond "
+                f"what "
+                f"such a machine can have: look at units, signs and zeros of the recording"
+            )
+        return "; ".join(parts)
+
+    @cached_property
+    def nominal(self) -> Array:
+        """(r,) what the machine's description says."""
+        return self.base.values(self.model.nominal)
+
+    def predict(
+        self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, step: float | None = None
+    ) -> Array:
+        """Forces of a motion by the identified parameters.
+
+        Args:
+            q_a: (N, n) [m], [rad].
+            v_a: (N, n).
+            a_a: (N, n).
+            step: From one sample to the next [s], for terms that remember time.
+
+        Returns:
+            (N, n) [N], [N m].
+        """
+        at = self.model.samples(q_a, v_a, a_a, step)
+        W = self.model.regressor(at)[:, :, self.base.independent]
+        return W @ self.values + self.model.known_forces(at)
+
+    @property
+    def described_machine(self) -> Machine:
+        """The machine as it was described; as identified it is what `write_identified` writes."""
+        return self.model.machine
+
+    def to_text(self) -> str:
+        """Tables of the fit and of the parameters."""
+        lines = [
+            f"{self.described_machine.name}: {self.base.rank} base parameters of "
+            f"{len(self.base.names)}, "
+            f"{self.method}{', feasible' if self.feasible else ''}; condition number "
+            f"{self.estimate.condition:.3g}, columns scaled {self.estimate.scaled_condition:.3g}",
+            "",
+        ]
+        for title, fit in (("training", self.training), ("validation", self.validation)):
+            if fit is None:
+                continue
+            rows = [["force", "RMS error", "", "relative", "PE (9)"]]
+            for i, joint in enumerate(fit.joints):
+                unit = "N" if self.described_machine.unit(joint) == "m" else "N m"
+                shares = [
+                    f"{100 * fit.relative_error[i]:.2f} %",
+                    f"{fit.percentage_error[i]:.3f} %",
+                ]
+                if joint in self.described_machine.free:
+                    shares = ["free", ""]
+                row = [joint, f"{fit.rmse[i]:.4g}", unit, *shares]
+                rows.append(row if fit.is_moving[:, i].any() else [joint, "-", "", "-", "-"])
+            if not np.isnan(fit.overall_relative_error):
+                mean = f"{100 * np.nanmean(fit.relative_error):.2f} %"
+                rows.append(["mean of the joints", "", "", mean, ""])
+                rows.append(
+                    ["all, stacked", "", "", f"{100 * fit.overall_relative_error:.2f} %", ""]
+                )
+            lines += [f"{title}, moving rows", *format_table(rows, (0, 2)), ""]
+        rows = [["parameter", "value", "std", "rel. std", "description", ""]]
+        for name, value, std, before, mark in zip(
+            self.names, self.values, self.std, self.nominal, self.marks, strict=True
+        ):
+            share = f"{100 * std / abs(value):.1f} %" if std < 10 * abs(value) else "-"
+            rows.append([name, f"{value:.6g}", f"{std:.2g}", share, f"{before:.6g}", mark])
+        lines += format_table(rows, (0, 5))
+        if self.undetermined_directions:
+            lines += ["", "not determined by this motion, in units of what can be:"]
+            lines += [
+                f"  +- {std:.2g}  {words}"
+                for std, words in self.undetermined_directions[:_MAX_SHOWN]
+            ]
+            if more := len(self.undetermined_directions[_MAX_SHOWN:]):
+                lines.append(f"  and {more} more directions")
+            lines.append(self.remedy)
+        return "\n".join(lines) + "\n"
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the base parameters: value, deviation, 95 % interval, description, mark, group.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        columns = [self.values, self.std, *self.interval().T, self.nominal]
+        with replace_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(
+                ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
+            )
+            for name, numbers, mark, words in zip(
+                self.names, np.column_stack(columns).tolist(), self.marks, self.base.groups,
+                strict=True,
+            ):  # fmt: skip
+                table.writerow([name, *map(repr, numbers), mark, words])

@@ -1,0 +1,431 @@
+"""Mass and centre of mass of a load from a recording of a machine that is known."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NoReturn
+
+import numpy as np
+
+from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array
+from crane.common.threads import with_single_threaded_blas
+from crane.dynamics import Dynamics
+from crane.identification.estimation.estimators import Estimate, Prior
+from crane.identification.estimation.regressor import triangular_factor
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.force_checks import check_forces
+from crane.identification.mechanics.force_comparison import ForceComparison
+from crane.identification.mechanics.free_joint_equations import iterate_estimate
+from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identify import METHODS, build_equations, multi_pass_progress
+from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.payload_estimate import PayloadEstimate, PayloadTerm
+from crane.identification.mechanics.recording_checks import reject_unless_trusted
+from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
+from crane.identification.mechanics.static_mass import (
+    MIN_FRICTION_SHARE,
+    breakaway_force,
+    low_passed_motion,
+    static_cutoff,
+    static_mass,
+)
+from crane.identification.signals.signal_processing import Motion
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+
+_IDENTIFIABLE_TOLERANCE = 1e-6  # what of a direction may be missing from those that forces tell
+_SEGMENT_COUNT = 10  # of a recording, that are left out one by one
+_MIN_RETURN_SHARE = 0.1  # of a drive's way, that it goes back at least
+_MAX_INTERVAL_SHARE = 0.1  # of the machine's moving mass, that half of an interval may be at most
+_GRAVITY = 9.81  # [m/s^2]
+
+
+@with_single_threaded_blas
+def identify_payload(
+    machine: Machine,
+    recording: Recording | Motion,
+    frame: str | None = None,
+    method: str = "wls",
+    inertia: bool = True,
+    trust: bool = False,
+    progress: Progress | None = None,
+) -> PayloadEstimate:
+    """What a machine carries, from the forces that are not its own.
+
+    tau_A - (M_A a_A + bias + friction) = Y_b T phi + sum_j c_j sign(v_j), with Y_b the columns of
+    the body that the frame is on, phi the load's ten parameters about the frame, T their change of
+    frame, and c_j what Coulomb friction of drive j differs from the described one: it depends on
+    load, temperature and wear, and looks like weight where a drive moves one way only. Else the
+    machine counts as known; what it is not as described shows as parts of the recording that tell
+    different loads, which widens the intervals (delete-one jackknife over ten parts).
+
+    Where that does not tell the mass, the load counts as a point at the frame's origin: one number
+    beside friction, by its weight, all low-passed at ten times the motion's frequency.
+    Friction of a drive that moved one way only is known there to what the machine describes, or a
+    hundredth of the drive's force if that is more. What the forces at rest say otherwise widens
+    the interval.
+
+    Args:
+        machine: Without the load, identified.
+        recording: With the load, moving.
+        frame: What it is fixed to; the tip if not given.
+        method: As of `identify`.
+        inertia: Whether the load's inertia about the frame is estimated too, or neglected.
+        trust: As of `identify`.
+        progress: Takes the finished share.
+
+    Raises:
+        InputError: An unknown frame or method, or one that does not move.
+        RecordingError: A recording that cannot serve, or does not tell the mass, or not even to a
+            tenth of the machine's own and to itself; or a mass that is surely negative.
+
+    Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
+    """
+    progress = progress_reporter(progress)
+    if method not in METHODS:
+        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    if frame is None and machine.tip is None:
+        raise InputError(f"'{machine.name}' has no tip, give the frame that holds the load")
+    frame = frame or str(machine.tip)
+    motion, progress = recording, multi_pass_progress(progress)
+    if not isinstance(motion, Motion):
+        motion = smoothed_motion(machine, motion, trust=trust, progress=progress)
+    drive_moves = np.ptp(motion.v, axis=0) > 0
+    names = [joint for joint, moved in zip(machine.active, drive_moves, strict=True) if moved]
+    v = low_passed_motion(motion).v.T
+    one_way_drives = [
+        joint for joint, v in zip(names, v[drive_moves], strict=True) if _moves_one_way(v)
+    ]
+    case = _PayloadCase(machine, frame, motion, method, names, one_way_drives)
+    first, reason = None, ""
+    try:
+        first = case.estimate_body(10 if inertia else 4, trust, progress)
+        if not case.is_uncertain(first):
+            low, high = first.interval()[0].tolist()
+            is_significant = not low <= 0 <= high
+            com = np.nan_to_num(first.com)
+            _check_mass(first, trust)
+            return replace(
+                first,
+                static_mass=case.estimate_static_mass(first.friction_corrections, com)
+                if is_significant
+                else None,
+            )
+    except _UnidentifiableMassError as error:
+        reason = str(error)
+    point = case.estimate_point_mass(progress)
+    if point is None or case.is_uncertain(point):
+        _raise_unidentifiable(
+            one_way_drives, first or point, reason, case.estimate_static_mass({}, np.zeros(3))
+        )
+    _check_mass(point, trust)
+    return point
+
+
+class _UnidentifiableMassError(RecordingError):
+    """A motion does not tell the mass."""
+
+
+@dataclass(frozen=True)
+class _PayloadCase:
+    """A recording of a machine with a load.
+
+    Attributes:
+        machine: Without the load.
+        frame: That carries it.
+        motion: Recorded.
+        method: Of the estimate.
+        moving_drives: Drives that moved.
+        one_way_drives: Those that hardly moved back.
+    """
+
+    machine: Machine
+    frame: str
+    motion: Motion
+    method: str
+    moving_drives: Sequence[str]
+    one_way_drives: Sequence[str]
+
+    def model(self, parameter_count: int) -> IdentificationModel:
+        """The load of so many parameters, and what Coulomb friction is beyond the described."""
+        machine, dynamics = self.machine, Dynamics(self.machine)
+
+        def machine_forces(at: MotionSamples) -> Array:
+            """Forces (N, n) of the machine without the load."""
+            return dynamics.evaluate_closed("inverse with friction", at.q, at.v_a, at.a_a)
+
+        machine_without_forces = machine.replace(
+            friction={}, forces=(), gas_springs=(), ropes=(), end_stops=()
+        )
+        extra = [
+            friction_term(machine_without_forces, joint, ("coulomb",), smoothing=0.0)
+            for joint in self.moving_drives
+        ]
+        return IdentificationModel(
+            machine_without_forces,
+            [PayloadTerm(machine, self.frame, parameter_count), *extra],
+            machine_forces,
+        )
+
+    def estimate_body(
+        self, parameter_count: int, trust: bool, progress: Progress | None
+    ) -> PayloadEstimate:
+        """A load of 10 or 4 parameters.
+
+        Raises:
+            _NotToldError: The motion does not tell its mass.
+        """
+        model = self.model(parameter_count)
+        # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth
+        motion = replace(self.motion, passband=math.inf)
+        equations, base = build_equations(model, [motion], progress=progress)
+        (thinned,) = equations.thinned_motions()
+        drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
+        q, v, a, tau = (
+            x[:, drive_indices] for x in (thinned.q, thinned.v, thinned.a, thinned.tau)
+        )
+        drive_motion = Motion(thinned.time, q, v, a, tau)
+        check_forces(
+            drive_motion, equations.offset[:, drive_indices], self.moving_drives, trust=trust
+        )
+        columns = equations.column_selection(base)
+        equations, estimate = self._estimate(equations, columns, None)
+        combinations, directions = _identifiable_moments(base)
+        if not combinations[:, 0].any():
+            raise _UnidentifiableMassError("this motion does not tell the mass, move all joints")
+        mass, *first = (combinations.T @ estimate.values).tolist()
+        com = np.where(combinations[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
+        derivatives = np.eye(4)  # derivatives of mass and com by mass and first moments
+        derivatives[1:] /= mass
+        derivatives[1:, 0] = -np.nan_to_num(com) / mass
+        derivatives = derivatives @ combinations.T
+        covariance, freedom = _widen_covariance(equations, columns, estimate, derivatives)
+        unknown = np.append(False, np.isnan(com))
+        covariance[unknown] = covariance[:, unknown] = np.nan
+        names = [base.names[i] for i in base.independent]
+        corrections = {
+            joint: float(estimate.values[names.index(f"{joint}.coulomb")])
+            for joint in self.moving_drives
+            if f"{joint}.coulomb" in names and joint not in self.one_way_drives
+        }
+        fit = self._force_comparison(equations, columns @ estimate.values)
+        return PayloadEstimate(
+            self.frame, mass, com, covariance, freedom, directions, corrections, None, fit
+        )
+
+    def estimate_point_mass(self, progress: Progress | None) -> PayloadEstimate | None:
+        """A mass at the frame's origin; None where its weight loads no drive that moved."""
+        motion, model = low_passed_motion(self.motion), self.model(1)
+        if not self._weight_loads_drive(motion):
+            return None
+        try:
+            equations, base = build_equations(
+                model, [motion], static_cutoff(motion), progress=progress
+            )
+        except RecordingError:  # no row is far enough from standstill
+            return None
+        columns = equations.column_selection(base) @ base.grouping
+        std = [math.inf]
+        for joint in self.moving_drives:
+            i = self.machine.active.index(joint)
+            least = MIN_FRICTION_SHARE * float(np.sqrt(np.mean(motion.tau[:, i] ** 2)))
+            band = max(breakaway_force(self.machine, joint), least)
+            std.append(band if joint in self.one_way_drives else math.inf)
+        prior = np.zeros(len(std)), np.array(std)
+        equations, parameters = self._estimate(equations, columns, prior)
+        derivatives = np.zeros((4, len(std)))
+        derivatives[0, 0] = 1.0
+        covariance, freedom = _widen_covariance(
+            equations, columns, parameters, derivatives, np.diag(1 / prior[1])
+        )
+        covariance[1:] = covariance[:, 1:] = np.nan
+        unknown_com = np.full(3, np.nan)
+        corrections = {
+            joint: float(value)
+            for joint, value in zip(self.moving_drives, parameters.values[1:], strict=True)
+            if joint not in self.one_way_drives
+        }
+        estimate = PayloadEstimate(
+            self.frame,
+            float(parameters.values[0]),
+            unknown_com,
+            covariance,
+            freedom,
+            np.zeros((0, 3)),
+            corrections,
+            self.estimate_static_mass(corrections, np.zeros(3)),
+            self._force_comparison(equations, columns @ parameters.values),
+        )
+        if estimate.static_mass is not None:  # two answers are as uncertain as they are apart
+            covariance[0, 0] += (estimate.static_mass[0] - estimate.mass) ** 2
+        return estimate
+
+    def _estimate(
+        self, equations: RegressionEquations, columns: Array, prior: Prior | None
+    ) -> tuple[RegressionEquations, Estimate]:
+        """What rows tell, and they as they tell it."""
+
+        def estimate_at(values: Array) -> tuple[Estimate, Array]:
+            nonlocal equations
+            equations = equations.at_values(values) if self.machine.free else equations
+            found = METHODS[self.method](
+                equations.projected_regressor(columns),
+                equations.y,
+                equations.groups,
+                equations.samples,
+                prior,
+            )
+            return found, columns @ found.values
+
+        zeros = np.zeros(len(columns))
+        found = (
+            iterate_estimate(estimate_at, zeros) if self.machine.free else estimate_at(zeros)[0]
+        )
+        return equations, found
+
+    def _weight_loads_drive(self, motion: Motion) -> bool:
+        """Whether the weight of a point loads a drive that moves."""
+        load, q = (
+            PayloadTerm(self.machine, self.frame, 1),
+            motion.q[:: max(1, len(motion.q) // 100)],
+        )
+        at = IdentificationModel(self.machine, [load]).samples(q, 0 * q, 0 * q)
+        drive_indices = [self.machine.active.index(joint) for joint in self.moving_drives]
+        weight = np.abs(load.columns(at)[:, drive_indices, 0])
+        return bool(
+            weight.max(initial=0.0)
+            > _IDENTIFIABLE_TOLERANCE * _GRAVITY * self.machine.closure.characteristic_length
+        )
+
+    def _force_comparison(self, equations: RegressionEquations, values: Array) -> ForceComparison:
+        load_forces = equations.forces - equations.offset
+        joints = self.machine.active
+        return ForceComparison(
+            equations.time,
+            load_forces,
+            equations.modelled_forces(values),
+            equations.is_moving,
+            joints,
+        )
+
+    def is_uncertain(self, estimate: PayloadEstimate) -> bool:
+        """Whether an interval is wider than the mass, and than a share of the machine's own."""
+        low, high = estimate.interval()[0].tolist()
+        machine_mass = sum(inertia.mass for inertia in list(self.machine.model.inertias)[1:])
+        return not high - low <= 2 * max(abs(estimate.mass), _MAX_INTERVAL_SHARE * machine_mass)
+
+    def estimate_static_mass(
+        self, friction_corrections: dict[str, float], com: Array
+    ) -> tuple[float, float] | None:
+        """See `static_mass`."""
+        load = PayloadTerm(self.machine, self.frame, 4)
+        return static_mass(self.machine, load, self.motion, friction_corrections, com)
+
+
+def _widen_covariance(
+    equations: RegressionEquations,
+    columns: Array,
+    estimate: Estimate,
+    derivatives: Array,
+    prior_root: Array | None = None,
+) -> tuple[Array, Array]:
+    """Covariance (4, 4) by noise, or by what leaving parts out changes, and its freedom (4,)."""
+    covariance = derivatives @ estimate.covariance @ derivatives.T
+    jackknife_variances = np.diag(
+        derivatives
+        @ _jackknife_covariance(equations, columns, estimate.noise, prior_root)
+        @ derivatives.T
+    )
+    inflation = jackknife_variances / np.maximum(np.diag(covariance), np.finfo(float).tiny)
+    scale = np.sqrt(np.maximum(inflation, 1.0))
+    freedom = np.where(inflation > 1, _SEGMENT_COUNT - 1, estimate.degrees_of_freedom)
+    return covariance * np.outer(scale, scale), freedom
+
+
+def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
+    """Doubt a mass whose whole interval is negative: something else is wrong.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    low, high = estimate.interval()[0].tolist()
+    if high < 0:
+        text = (
+            f"the mass comes out as {low:.3g} to {high:.3g} kg, and no load weighs less than "
+            "nothing: look at signs and units of forces or pressures, and identify the machine "
+            "without a load first"
+        )
+        reject_unless_trusted(text, trust)
+
+
+def _raise_unidentifiable(
+    one_way_drives: Sequence[str],
+    estimate: PayloadEstimate | None,
+    reason: str,
+    static_mass: tuple[float, float] | None,
+) -> NoReturn:
+    if estimate is None:
+        raise RecordingError(reason)
+    low, high = estimate.interval()[0].tolist()
+    text = f"this recording does not tell the mass ({low:.3g} to {high:.3g} kg): "
+    if one_way_drives:
+        names = ", ".join(f"'{joint}'" for joint in one_way_drives)
+        text += f"{names} moved one way only, where friction looks like weight, record both ways"
+    else:
+        text += "its parts tell different loads, identify the machine without a load first"
+    if static_mass is not None:
+        text += (
+            f"; with its centre at '{estimate.frame}' the forces at rest hold "
+            f"{static_mass[0]:.4g} +- "
+            f"{static_mass[1]:.2g} kg, by the described friction"
+        )
+    raise RecordingError(text)
+
+
+def _jackknife_covariance(
+    equations: RegressionEquations, columns: Array, noise: Array, prior_root: Array | None
+) -> Array:
+    """Covariance (s, s) of parameters by what leaving out each part of the recording changes.
+
+    Rows of a prior about zero (k, s) belong to all parts.
+    """
+    size = columns.shape[1]
+    prior_rows = np.zeros((0, size)) if prior_root is None else prior_root
+    prior_rows = np.column_stack([prior_rows, np.zeros(len(prior_rows))])
+    T = np.zeros((len(columns) + 1, size + 1))
+    T[:-1, :-1], T[-1, -1] = columns, 1.0
+    parts = equations.segment_factors(_SEGMENT_COUNT) @ T / noise[:, None, None]
+    found = []
+    for i in range(_SEGMENT_COUNT):
+        R = triangular_factor(
+            np.vstack([np.delete(parts, i, axis=0).reshape(-1, size + 1), prior_rows])
+        )
+        found.append(np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0])
+    spread = np.array(found) - np.mean(found, axis=0)
+    return np.asarray((_SEGMENT_COUNT - 1) / _SEGMENT_COUNT * spread.T @ spread)
+
+
+def _moves_one_way(v: Array) -> bool:
+    """Whether a drive of velocity (N,) goes hardly any way back."""
+    travel = np.maximum(v, 0).sum(), np.maximum(-v, 0).sum()
+    return bool(min(travel) < _MIN_RETURN_SHARE * max(travel))
+
+
+def _identifiable_moments(base: BaseParameters) -> tuple[Array, Array]:
+    """Mass and first moments as combinations (r, 4) of base parameters, zero where not told.
+
+    And the directions (k, 3) of first moments that are told. A combination w of parameters is
+    told if it is one of the rows of K, so at right angles to all that K does not see.
+    """
+    K = base.grouping
+    share = np.array(np.linalg.lstsq(K.T, np.eye(K.shape[1])[:, :4], rcond=None)[0])
+    missing = np.abs(K.T @ share - np.eye(K.shape[1])[:, :4]).max(axis=0)
+    share[:, missing > _IDENTIFIABLE_TOLERANCE] = 0.0
+    unseen = np.linalg.svd(K)[2][len(K) :]
+    _, sizes, axes = np.linalg.svd(unseen[:, 1:4]) if len(unseen) else (0, np.zeros(3), np.eye(3))
+    sizes = np.append(sizes, np.zeros(3 - len(sizes)))
+    return share, np.asarray(axes[sizes <= _IDENTIFIABLE_TOLERANCE])

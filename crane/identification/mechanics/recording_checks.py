@@ -1,0 +1,225 @@
+"""Recordings that would mislead an identification, and why."""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from crane.common.errors import CraneWarning, RecordingError
+from crane.common.samples import Array
+from crane.identification.signals.outliers import outlier_mask, replace_outliers
+from crane.identification.signals.signal_processing import (
+    central_differences,
+    check_gaps,
+    low_pass,
+    resample_evenly,
+    sampling_step,
+)
+from crane.identification.signals.spectral_lines import strongest_spectral_line
+
+_MIN_SAMPLES = 50  # samples
+_COMPARISON_CUTOFF = 10.0  # [Hz] up to which recorded velocities and positions are compared
+_CORRELATION_TOLERANCE = 0.01  # of a correlation
+_MAX_DELAY = 1.0  # [s] longest delay that is looked for
+_MAX_OUTLIER_SHARE = 0.05  # share of a column's samples above which it is refused
+_COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}  # units that are taken for SI
+
+
+def signal_delay(time: Array, one: Array, other: Array) -> float:
+    """By how many seconds the second signal (N,) comes after the first, at most 1 s.
+
+    Where the correlation of what overlaps has its maximum, refined by a parabola.
+    """
+    from scipy.signal import correlate
+
+    step = sampling_step(time)
+    one, other = one - one.mean(), other - other.mean()
+    shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
+    products = correlate(other, one, method="fft")[shifts + len(time) - 1]
+    first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
+    low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
+    energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
+    correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
+    # of equal ones, as of periodic signals, the shortest
+    best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
+    at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
+    if correlation[at - 1 : at + 2].argmax() != 1:  # on the slope of the shortest
+        direction = 1 if correlation[at + 1] > correlation[at] else -1
+        while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
+            at += direction
+    before, here, after = correlation[at - 1 : at + 2]
+    curvature = before - 2 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((at - reach + shift) * step)
+
+
+def reject_unless_trusted(text: str, trust: bool) -> None:
+    """Refuse a recording that is most likely wrong, or only tell why, where it is trusted.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    if not trust:
+        raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
+    warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
+
+
+def check_samples(time: Array) -> None:
+    """Refuse a recording of too few samples, or with gaps between its instants (N,).
+
+    Raises:
+        RecordingError: The message says when.
+    """
+    if len(time) < _MIN_SAMPLES:
+        raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
+    check_gaps(time)
+
+
+def remove_outliers(
+    time: Array, names: Sequence[str], columns: Array, trust: bool = False
+) -> Array:
+    """Columns (N, k) without samples that stand out: lines between their neighbours instead.
+
+    Before any filter, which would smear them. Columns of a trusted recording stay as they are.
+
+    Raises:
+        RecordingError: A column has too many of them.
+    """
+    messages = []
+    for name, column in () if trust else zip(names, columns.T, strict=True):
+        bad = outlier_mask(column)
+        if not bad.any():
+            continue
+        first = f"the first at {time[bad.argmax()]:.6g} s"
+        if bad.mean() > _MAX_OUTLIER_SHARE:
+            reject_unless_trusted(
+                f"'{name}' has {bad.sum()} outliers in {len(bad)} samples, {first}", trust
+            )
+        messages.append(f"{bad.sum()} in '{name}' ({first})")
+        column[:] = replace_outliers(column, bad)
+    if messages:
+        text = f"outliers are left out and bridged: {', '.join(messages)} of {len(time)} samples"
+        warnings.warn(text, CraneWarning, stacklevel=3)
+    return columns
+
+
+def warn_hum(time: Array, columns: Mapping[str, Array], min_frequency: float) -> None:
+    """Warn of lines in the spectra of columns (N,), above a frequency [Hz] where nothing moves."""
+    step, messages = float(np.median(np.diff(time))), []
+    for name, column in columns.items():
+        if (
+            np.ptp(column) > 0
+            and (found := strongest_spectral_line(column, step, min_frequency)) is not None
+        ):
+            share = 100 * found[1] / float(np.std(column))
+            messages.append(f"'{name}' of {found[0]:.3g} Hz ({found[1]:.3g}, {share:.2g} % of it)")
+    if messages:
+        text = f"hum in {', '.join(messages)}: keep the bandwidth well below it"
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def check_recording(
+    time: Array,
+    q: Array,
+    tau: Array,
+    joints: Sequence[str],
+    units: Mapping[str, str],
+    v: Array | None = None,
+    limits: Array | None = None,
+    longest_delay: float = 0.05,
+    free: Sequence[str] = (),
+    trust: bool = False,
+) -> None:
+    """Refuse a recording that cannot serve an identification.
+
+    Args:
+        time: Instants (N,) [s].
+        q: Coordinates (N, n).
+        tau: Generalized forces (N, n).
+        joints: Names (n,).
+        units: "rad" or "m" of each coordinate.
+        v: Recorded velocities (N, n), compared with those of q.
+        limits: Lowest and highest coordinate (n, 2).
+        longest_delay: [s] between recorded velocity and q; a filter in the sensor makes some.
+        free: Those of the joints whose force is known to be zero.
+        trust: Whether to tell only what is most likely wrong, and refuse what cannot be used.
+
+    Raises:
+        RecordingError: No motion, wrong units, or columns that do not belong together; the
+            message names the column.
+    """
+    # Of noise alone, steps between samples have twice its variance.
+    if all(np.ptp(x) == 0 or np.var(np.diff(x)) >= np.var(x) for x in q.T):
+        raise RecordingError("no joint moves, record a motion")
+    for i, joint in enumerate(joints):
+        if joint not in free and np.ptp(tau[:, i]) == 0 and np.ptp(q[:, i]) > 0:
+            reject_unless_trusted(
+                f"'{joint}_force' is constant while '{joint}' moves, check it", trust
+            )
+        if limits is not None:
+            _check_range(q[:, i], limits[i], joint, units[joint], trust)
+        if v is not None and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
+            _check_velocity(time, q[:, i], v[:, i], joint, units[joint], longest_delay, trust)
+
+
+def _check_range(x: Array, limits: Array, joint: str, unit: str, trust: bool) -> None:
+    low, high = limits
+    slack = 0.1 * (high - low)
+
+    def inside(values: Array) -> bool:
+        return low - slack <= values.min() and values.max() <= high + slack
+
+    if not inside(x):
+        other, factor = _COMMON_UNITS[unit]
+        is_other_unit = inside(x / factor) and np.ptp(x) > 0.02 * factor * (high - low)
+        hint = f"it looks like {other}" if is_other_unit else "check its zero and unit"
+        reject_unless_trusted(
+            f"'{joint}' goes from {x.min():.4g} to {x.max():.4g} {unit}, its limits are "
+            f"{low:.4g} and {high:.4g} {unit}, {hint}",
+            trust,
+        )
+
+
+def _check_velocity(
+    time: Array, x: Array, v: Array, joint: str, unit: str, longest_delay: float, trust: bool
+) -> None:
+    """Compare a velocity with the derivative of its coordinate, both up to 10 Hz."""
+    time, columns = resample_evenly(time, np.column_stack([x, v]))
+    step = sampling_step(time)
+    if 0.4 / step > _COMPARISON_CUTOFF:
+        columns = low_pass(time, columns, _COMPARISON_CUTOFF)
+    derivative, v = central_differences(time, columns[:, 0]), columns[:, 1]
+    # what is less than a micrometre in the sampled time is noise or rounding, not motion
+    if np.std(columns[:, 0]) < 1e-6:
+        return
+    ratio = math.sqrt(np.mean(v**2) / np.mean(derivative**2))
+    other, factor = _COMMON_UNITS[unit]
+    for wrong, scale in ((f"{joint}_velocity", factor), (joint, 1 / factor)):
+        if 0.8 < ratio / scale < 1.25:
+            return reject_unless_trusted(
+                f"'{joint}_velocity' is {ratio:.3g} times the derivative of '{joint}', "
+                f"'{wrong}' looks like {other}, give {unit}",
+                trust,
+            )
+    delay = signal_delay(time, derivative, v)
+    shift = round(delay / step)
+    first, second = (derivative, v) if shift >= 0 else (v, derivative)
+    overlap = len(v) - abs(shift)
+    first, second = first[:overlap], second[abs(shift) :]
+    correlation = float(np.corrcoef(first, second)[0, 1]) if np.ptp(v) > 0 else 0.0
+    if correlation < 0.7 or not 0.5 < ratio < 2:
+        return reject_unless_trusted(
+            f"'{joint}_velocity' is not the derivative of '{joint}' (correlation "
+            f"{correlation:.2f}, ratio {ratio:.3g}), check the columns",
+            trust,
+        )
+    if abs(delay) > longest_delay:
+        reject_unless_trusted(delay_message(f"{joint}_velocity", delay, f"'{joint}'"), trust)
+    return None
+
+
+def delay_message(name: str, delay: float, reference: str) -> str:
+    """What to say of a column that comes so many seconds after another."""
+    side = "behind" if delay > 0 else "ahead of"
+    return f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock"

@@ -1,0 +1,334 @@
+"""y = W beta along a motion, filtered and thinned, in blocks that fit into memory."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.force_comparison import ForceComparison
+from crane.identification.mechanics.free_joint_equations import free_joint_rows
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.signals.signal_processing import (
+    Motion,
+    filter_kernel,
+    filter_rows,
+    is_moving,
+)
+
+_MIN_PERIODS = 5.0  # periods of the filter's cutoff in a recording
+_BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor that are computed at once
+_CACHE_BYTES = (
+    3 << 27
+)  # bytes of filtered blocks that are held; others are computed again when needed
+
+Progress = Callable[[float], None]
+
+
+class _FilteredMotion:
+    """One of the motions, through the low-pass.
+
+    Attributes:
+        motion: The motion.
+        step: Of its samples [s].
+        thinning: One of so many samples is left.
+        filter_reach: Samples that the filter sees to each side, a multiple of the thinning.
+        is_moving: (M, n) which of the rows that are left count.
+    """
+
+    def __init__(self, motion: Motion, bandwidth: float, slow: Array):
+        from scipy.ndimage import maximum_filter1d
+
+        self.motion, self.step = motion, float(motion.time[1] - motion.time[0])
+        duration = float(motion.time[-1] - motion.time[0])
+        if not is_long_enough(motion, bandwidth):
+            raise InputError(
+                f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
+                f"{_MIN_PERIODS / duration:.2g} Hz"
+            )
+        self.thinning, kernel_reach = 1, 0
+        if bandwidth * self.step < 0.25:
+            self.thinning = max(1, int(0.25 / (self.step * bandwidth)))
+            kernel_reach = len(filter_kernel(self.step, bandwidth)) // 2
+        self.filter_reach = -(-kernel_reach // self.thinning) * self.thinning
+        # near standstill friction is none of its shapes, and in no row that the filter mixes it in
+        is_resting = ~is_moving(motion.v, slow)
+        is_near_rest = maximum_filter1d(
+            is_resting.view(np.uint8), 2 * kernel_reach + 1, axis=0, mode="constant"
+        )
+        self.is_moving = is_near_rest[:: self.thinning] == 0
+
+    def __len__(self) -> int:
+        """How many instants are left."""
+        return len(self.is_moving)
+
+
+@dataclasses.dataclass
+class _EquationBlock:
+    """Rows that are computed at once.
+
+    Attributes:
+        filtered_motion: Whose.
+        rows: Which of the part's.
+        instants: Which of all.
+        term_states: What terms that depend on the past keep, before the first sample that it
+            needs.
+    """
+
+    filtered_motion: _FilteredMotion
+    rows: slice
+    instants: slice
+    term_states: dict[object, object] = dataclasses.field(default_factory=dict)
+
+
+class RegressionEquations:
+    """tau_A + gamma^T f = W(q_A, v_A, a_A) beta of motions, both sides through one low-pass.
+
+    The regressor of a long recording is larger than memory. It is computed, filtered and thinned
+    block by block, each with as many samples before and after as the filter's kernel has,
+    so that the blocks are those of the whole.
+
+    Args:
+        model: The model.
+        base: Its base parameters; W has their columns.
+        motions: The motions, one after the other.
+        bandwidth: [Hz] of the low-pass.
+        slow: (n,) velocities below which rows do not count.
+        progress: Takes the finished share of each pass over the motions.
+        values: (r,) at which rows of free joints are taken, see `undriven`; as they are without.
+
+    Attributes:
+        time: (M,) instants that are left [s]; those of a motion after another follow it.
+        forces: (M, n) measured, filtered.
+        offset: (M, n) of these what no parameter changes; known when all blocks have been read.
+        is_moving: (M, n) which rows count.
+        base, bandwidth, slow: See above.
+
+    Raises:
+        InputError: The bandwidth leaves nothing, or something is not finite.
+    """
+
+    def __init__(
+        self,
+        model: IdentificationModel,
+        base: BaseParameters,
+        motions: Sequence[Motion],
+        bandwidth: float,
+        slow: Array,
+        progress: Progress | None = None,
+        values: Array | None = None,
+    ):
+        self.base, self.bandwidth, self.slow = base, bandwidth, slow
+        self._model, self._progress, self._values = model, progress, values
+        self._motions = motions
+        self._filtered_motions = [_FilteredMotion(motion, bandwidth, slow) for motion in motions]
+        self.is_moving = np.concatenate([part.is_moving for part in self._filtered_motions])
+        self.time = _concatenate_times(
+            [part.motion.time[:: part.thinning] for part in self._filtered_motions]
+        )
+        self.forces, self.offset = np.empty((2, *self.is_moving.shape))
+        wanted = _BLOCK_BYTES // (8 * len(model.names) * len(model.machine.active))
+        self._blocks, first = list[_EquationBlock](), 0
+        for part in self._filtered_motions:
+            length = max(wanted, 2 * part.filter_reach) // part.thinning + 1
+            for i in range(0, len(part), length):
+                rows = slice(i, min(i + length, len(part)))
+                span = slice(first + rows.start, first + rows.stop)
+                self._blocks.append(_EquationBlock(part, rows, span))
+            first += len(part)
+        self._block_cache: dict[int, Array] = {}
+
+    def at_values(self, values: Array) -> "RegressionEquations":
+        """The same with rows of free joints taken at values (r,), see `undriven`."""
+        same = self._model, self.base, self._motions, self.bandwidth, self.slow, self._progress
+        return RegressionEquations(*same, values)
+
+    def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
+        """Which of the instants, and W there (L, n, r)."""
+        numbers = range(len(self._blocks))
+        for done, number in enumerate(reversed(numbers) if backwards else numbers):
+            W = self._block_cache.get(number)
+            if W is None:
+                W = self._compute_block(number)
+                if (
+                    sum(one.nbytes for one in self._block_cache.values()) + W.nbytes
+                    <= _CACHE_BYTES
+                ):
+                    self._block_cache[number] = W
+            if self._progress is not None:
+                self._progress((done + 1) / len(self._blocks))
+            yield self._blocks[number].instants, W
+
+    def _compute_block(self, number: int) -> Array:
+        """W (L, n, r) of a block, filtered; its forces and offset are written down on the way."""
+        block = self._blocks[number]
+        part, rows, thinning = block.filtered_motion, block.rows, block.filtered_motion.thinning
+        start = max(0, rows.start * thinning - part.filter_reach)
+        stop = min(len(part.motion.q), rows.stop * thinning + part.filter_reach)
+        both = self._unfiltered_block(number, start, stop)
+        tau = part.motion.tau[start:stop]
+        if part.filter_reach:
+            both, tau = filter_rows(both, tau, part.step, self.bandwidth, thinning)
+        here = slice(rows.start - start // thinning, rows.stop - start // thinning)
+        self.forces[block.instants], self.offset[block.instants] = tau[here], both[here, :, -1]
+        return np.ascontiguousarray(both[here, :, :-1])
+
+    def _unfiltered_block(self, number: int, start: int, stop: int) -> Array:
+        """[W, offset] (stop - start, n, r + 1), little by little."""
+        part, next_blocks = (
+            self._blocks[number].filtered_motion,
+            self._blocks[number + 1 : number + 2],
+        )
+        motion = part.motion
+        first = None  # sample at which the next block's filter begins
+        if next_blocks and next_blocks[0].filtered_motion is part:
+            first = max(0, next_blocks[0].rows.start * part.thinning - part.filter_reach)
+        size = _BLOCK_BYTES // (8 * len(self._model.names) * motion.q.shape[1])
+        cuts = {*range(start, stop, max(size, 1)), stop, *([first] if first else [])}
+        term_states = dict(self._blocks[number].term_states)
+        both = np.empty((stop - start, motion.q.shape[1], self.base.rank + 1))
+        for low, high in pairwise(sorted(cuts)):
+            q, v, a = (x[low:high] for x in (motion.q, motion.v, motion.a))
+            at = self._model.samples(q, v, a, part.step, (0,) if low == 0 else ())
+            at = dataclasses.replace(at, term_states=term_states)
+            here = both[low - start : high - start]
+            here[:, :, :-1], here[:, :, -1] = self._regressor_and_forces(at)
+            if high == first:
+                next_blocks[0].term_states = dict(term_states)
+        return both
+
+    def _regressor_and_forces(self, samples: MotionSamples) -> tuple[Array, Array]:
+        """W (N, n, r) and known forces (N, n)."""
+        model = self._model
+
+        def sides(at: MotionSamples) -> tuple[Array, Array]:
+            return model.regressor(at)[:, :, self.base.independent], model.known_forces(at)
+
+        if self._values is None:
+            return sides(samples)
+        return free_joint_rows(
+            sides, samples, np.flatnonzero(~model.machine.is_driven), self._values
+        )
+
+    def thinned_motions(self) -> list[Motion]:
+        """The motions at the instants that are left, with the filtered forces."""
+        forces = np.split(
+            self.forces, np.cumsum([len(part) for part in self._filtered_motions[:-1]])
+        )
+        out = []
+        for part, tau in zip(self._filtered_motions, forces, strict=True):
+            x, kept = part.motion, slice(None, None, part.thinning)
+            out.append(Motion(x.time[kept], x.q[kept], x.v[kept], x.a[kept], tau))
+        return out
+
+    def modelled_forces(self, values: Array) -> Array:
+        """W values (M, n) for columns of parameters (r,), or (r, k) at once: (M, n, k)."""
+        out = np.empty((*self.is_moving.shape, *values.shape[1:]))
+        for span, W in self.blocks():
+            out[span] = W @ values
+        return out
+
+    def compare(self, values: Array) -> ForceComparison:
+        """Measured and modelled forces, for values (r,)."""
+        modelled = self.modelled_forces(values) + self.offset
+        joints = self._model.machine.active
+        return ForceComparison(self.time, self.forces, modelled, self.is_moving, joints)
+
+    @cached_property
+    def _row_indices(self) -> tuple[np.ndarray, np.ndarray]:
+        """Instant and joint of the rows that count, by time."""
+        instant, joint = np.nonzero(self.is_moving)
+        return instant.astype(np.int32), joint.astype(np.int8)
+
+    @property
+    def samples(self) -> np.ndarray:
+        """(m,) instant of each row that counts."""
+        return self._row_indices[0]
+
+    @cached_property
+    def groups(self) -> np.ndarray:
+        """(m,) joint of each row that counts, 0, 1, ... without those that have none."""
+        there = self.is_moving.any(axis=0)
+        return (np.cumsum(there) - 1).astype(np.int8)[self._row_indices[1]]
+
+    @cached_property
+    def y(self) -> Array:
+        """(m,) forces of the rows that count, less what no parameter changes."""
+        _ = self.triangular_factors
+        return (self.forces - self.offset)[self.is_moving]
+
+    @cached_property
+    def triangular_factors(self) -> Array:
+        """(g, r + 1, r + 1) triangular factors of [W y] of each joint's rows that count."""
+        return self.segment_factors(1)[0]
+
+    def segment_factors(self, count: int) -> Array:
+        """The same of so many equal parts of the time, one after the other (count, g, k, k)."""
+        joints = np.flatnonzero(self.is_moving.any(axis=0))
+        out = np.zeros((count, len(joints), self.base.rank + 1, self.base.rank + 1))
+        part = np.arange(len(self.time)) * count // len(self.time)
+        for span, W in self.blocks():
+            y = self.forces[span] - self.offset[span]
+            for i in np.unique(part[span]).tolist():
+                for R, joint in zip(out[i], joints.tolist(), strict=True):
+                    mask = self.is_moving[span, joint] & (part[span] == i)
+                    update_triangular_factor(R, np.column_stack([W[mask, joint], y[mask, joint]]))
+        return out
+
+    def column_selection(self, base: BaseParameters) -> Array:
+        """(r, s) that picks the columns of a narrower base."""
+        return np.eye(self.base.rank)[:, np.searchsorted(self.base.independent, base.independent)]
+
+    def projected_regressor(self, T: Array) -> "ProjectedRegressor":
+        """W T, the rows that count, for T (r, p)."""
+        return ProjectedRegressor(self, T)
+
+
+def is_long_enough(motion: Motion, bandwidth: float) -> bool:
+    """Whether a low-pass [Hz] leaves anything of a motion."""
+    return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
+
+
+def _concatenate_times(times: Sequence[Array]) -> Array:
+    """Instants of motions, each after the one before."""
+    out = [times[0]]
+    for time in times[1:]:
+        out.append(out[-1][-1] + (time - time[0]) + (time[1] - time[0]))
+    return np.concatenate(out)
+
+
+class ProjectedRegressor:
+    """Rows of equations that count, their columns combined: a `regressor.Regressor`.
+
+    Args:
+        equations: Whose W (., r).
+        T: (r, p).
+
+    Attributes:
+        shape: (m, p).
+    """
+
+    def __init__(self, equations: RegressionEquations, T: Array):
+        self._equations, self._T = equations, T
+        self.shape = len(equations.samples), T.shape[1]
+
+    def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
+        """See `regressor.Regressor`."""
+        samples = self._equations.samples
+        for span, W in self._equations.blocks(backwards):
+            start, stop = np.searchsorted(samples, [span.start, span.stop]).tolist()
+            if stop > start:
+                yield slice(start, stop), W[self._equations.is_moving[span]] @ self._T
+
+    def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
+        """See `regressor.triangular_factors`."""
+        size = self.shape[1]
+        T = np.zeros((len(self._T) + 1, size + 1))
+        T[:-1, :-1], T[-1, -1] = self._T, 1.0
+        return np.array([triangular_factor(R @ T) for R in self._equations.triangular_factors])

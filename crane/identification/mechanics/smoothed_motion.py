@@ -1,0 +1,183 @@
+"""From a recording to a motion: what is wrong with it is told, derivatives are found."""
+
+import math
+import warnings
+
+import numpy as np
+
+from crane.common.errors import CraneWarning, RecordingError, suggest_names
+from crane.common.samples import Array
+from crane.identification.mechanics.force_delays import motion_frequency
+from crane.identification.mechanics.recorded_loads import recorded_load_forces
+from crane.identification.mechanics.recording_checks import (
+    check_recording,
+    check_samples,
+    reject_unless_trusted,
+    remove_outliers,
+    warn_hum,
+)
+from crane.identification.mechanics.regression_equations import Progress
+from crane.identification.signals.outliers import outlier_mask, replace_outliers
+from crane.identification.signals.signal_processing import (
+    Derivatives,
+    Motion,
+    differentiate,
+    resample_evenly,
+)
+from crane.machine import Machine
+from crane.recordings.measured_recordings import locked_joint_conflicts
+from crane.recordings.recording import (
+    FORCE_SUFFIX,
+    VELOCITY_SUFFIX,
+    VELOCITY_UNITS,
+    Recording,
+    time_derivative,
+)
+
+_MOTION_FACTOR = 3.0  # standard deviations of a joint's velocity, above which it moves
+_MAX_SPEED_FACTOR = 30.0  # times its limit, at which no joint moves
+_HUM_FACTOR = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
+
+
+def smoothed_motion(
+    machine: Machine,
+    recording: Recording,
+    derivatives: str = "kalman",
+    cutoff: float | None = None,
+    trust: bool = False,
+    progress: Progress | None = None,
+) -> Motion:
+    """Velocities and accelerations of a recording, which is checked first.
+
+    Outliers are bridged by lines between their neighbours, before anything is filtered. Forces
+    are those of the joints and of recorded loads together.
+
+    Args:
+        machine: What was recorded.
+        recording: With all active joints of the machine.
+        derivatives: "kalman" or "lowpass", see `signals.differentiate`.
+        cutoff: [Hz] of "lowpass".
+        trust: Whether what is most likely wrong with the recording is only told, and outliers
+            are left in.
+        progress: Takes the finished share.
+
+    Raises:
+        RecordingError: What is recorded cannot serve; the message names column and time.
+    """
+    original, recording = recording, _select_active_joints(machine, recording)
+    locked_columns = {
+        x: column for x, column in original.columns().items() if x in machine.locked_joints
+    }
+    for text in locked_joint_conflicts(
+        machine, locked_columns, original.units | original.channel_units
+    ):
+        reject_unless_trusted(f"{text}, do not lock it, or lock it where it is", trust)
+    time, n = recording.time, len(machine.active)
+    check_samples(time)
+    names = [x + suffix for suffix in ("", FORCE_SUFFIX) for x in machine.active]
+    columns = remove_outliers(time, names, np.hstack([recording.q, recording.tau]), trust)
+    _check_columns(machine, time, columns, recording.v, trust)
+    columns[:, n:] += recorded_load_forces(machine, original, columns[:, :n], trust)
+    time, columns = resample_evenly(time, columns)
+    step = float(np.median(np.diff(time)))
+    lowest = _HUM_FACTOR * motion_frequency(columns[:, :n], step)
+    warn_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
+    found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
+    v, a = np.where(_is_moving(found), (found.v, found.a), 0.0)
+    _check_speeds(machine, v, trust)
+    _warn_standstill(machine, found, v)
+    return Motion(time, found.q, v, a, columns[:, n:], _lowest_passband(found))
+
+
+def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
+    """Of a recording what belongs to the machine's active joints, in their order.
+
+    Free joints may be among the channels: their force is known to be zero.
+
+    Raises:
+        RecordingError: One is missing, or in another unit, or a free one has a force.
+    """
+    recorded_columns, units = recording.columns(), recording.units | recording.channel_units
+    available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
+    missing = [joint for joint in machine.active if joint not in available]
+    if missing:
+        listed = ", ".join(f"'{joint}'" for joint in missing)
+        held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
+        raise RecordingError(
+            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}; "
+            f"lock what was "
+            f"held ({held})"
+        )
+    for joint in machine.active:
+        if units[joint] != machine.unit(joint):
+            raise RecordingError(
+                f"'{joint}' is recorded in {units[joint]}, give {machine.unit(joint)}"
+            )
+    zeros = np.zeros_like(recording.time)
+    q = np.column_stack([recorded_columns[joint] for joint in machine.active])
+    tau = np.column_stack(
+        [recorded_columns.get(joint + FORCE_SUFFIX, zeros) for joint in machine.active]
+    )
+    rates = [
+        recorded_columns.get(
+            x + VELOCITY_SUFFIX, time_derivative(recorded_columns[x], recording.time)
+        )
+        for x in machine.active
+    ]
+    v = np.column_stack(rates)
+    joint_units = {joint: machine.unit(joint) for joint in machine.active}
+    return Recording(recording.time, machine.active, q, v, tau, joint_units, free=machine.free)
+
+
+def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
+    """Refuse coordinates and forces (N, 2 n), and velocities (N, n) as recorded, by `check`."""
+    q, tau = np.split(columns, 2, axis=1)
+    recorded = None
+    if np.any(v):  # only compared; where none were recorded, derivatives of outliers
+        recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in v.T])
+    limits = np.column_stack([machine.lower, machine.upper])
+    bounded = limits if np.isfinite(limits).all() else None
+    units = {joint: machine.unit(joint) for joint in machine.active}
+    free = machine.free
+    check_recording(time, q, tau, machine.active, units, recorded, bounded, free=free, trust=trust)
+
+
+def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
+    """Doubt velocities (N, n) that the machine's joints are far from having."""
+    limits = machine.model.velocityLimit[machine.closure.active]
+    for joint, speed, limit in zip(
+        machine.active, np.sqrt(np.mean(v**2, axis=0)), limits, strict=True
+    ):
+        if 0 < limit < speed / _MAX_SPEED_FACTOR:
+            unit = VELOCITY_UNITS[machine.unit(joint)]
+            reject_unless_trusted(
+                f"'{joint}' moves at {speed:.3g} {unit} on the whole, its limit is {limit:.3g} "
+                f"{unit}: look at the unit of the time",
+                trust,
+            )
+
+
+def _lowest_passband(found: Derivatives) -> float:
+    """Least of the frequencies [Hz] of which half is left, of the joints that move."""
+    if found.passband is None:
+        return math.inf
+    return float(found.passband[_is_moving(found)].min(initial=math.inf))
+
+
+def _is_moving(found: Derivatives) -> np.ndarray:
+    """Which joints (n,) move by more than what is uncertain of their velocities."""
+    if found.std_v is None:
+        return np.ones(found.v.shape[1], dtype=bool)
+    uncertain = np.sqrt(np.mean(found.std_v**2, axis=0))
+    return np.asarray(found.v.std(axis=0) > _MOTION_FACTOR * uncertain)
+
+
+def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
+    """Warn of joints that tremble, but do not move: friction at rest makes any force."""
+    for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
+        joint, place = machine.active[i], float(found.q[:, i].mean())
+        text = (
+            f"'{joint}' stands still but for noise: its forces tell nothing, move it, or lock it "
+            f"({joint}={place:.4g})"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)

@@ -1,0 +1,360 @@
+"""An identified machine as files: its URDFs and its machine file with other numbers."""
+
+import dataclasses
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.common.atomic_output import replace_folder
+from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
+from crane.common.samples import Array
+from crane.description import Chain, Friction, MachineSpec, lock_joints
+from crane.description.inertia_feasibility import inertia_problem
+from crane.dynamics import Dynamics
+from crane.formats import load, read_machine_spec
+from crane.formats.machine_file.machine_reader import read_plain_data
+from crane.formats.machine_file.machine_writer import friction_data
+from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.parallel_robots import is_parallel_robot
+from crane.identification.mechanics.base_parameters import random_samples
+from crane.identification.mechanics.coupled_motors import joint_combinations, motor_chain
+from crane.identification.mechanics.friction_laws import (
+    FrictionLawFit,
+    FrictionTerm,
+    friction_laws,
+)
+from crane.identification.mechanics.identification_result import Identification
+from crane.identification.mechanics.inertial_terms import BODY_PARAMETERS
+from crane.identification.mechanics.locked_body_division import divide_locked_bodies
+from crane.identification.mechanics.urdf_inertials import replace_inertials
+from crane.machine import Machine
+
+_FORCE_TOLERANCE = 1e-9  # of the largest force, by which the written machine may differ
+_FRICTION_PARAMETERS = tuple(item.name for item in dataclasses.fields(Friction))
+
+
+def write_identified(identification: Identification, folder: str | Path) -> Path:
+    """Write the identified machine: a machine file with a URDF per sub-chain beside it.
+
+    `crane.load` gives it from there, with what was locked as all else:
+    `crane.load(crane.write_identified(identification, "identified"),
+    lock=identification.described.locks)`.
+
+    Each body's parameters stand in the link that its joint moves, and the inertials of links
+    fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified
+    ones, other passive forces the machine's. Friction that a machine file has no law for is
+    written as the nearest law at steady speeds, with a warning that says how near. A motor
+    that turns with several joints becomes a rotor that a coupling turns. What locked joints
+    made one body is divided among its links as they are described. Everything else is as in
+    the files that the machine was read from; what they draw is found where it is. The written
+    files are loaded, and compared where the machine was locked, before they are put in place.
+
+    Args:
+        identification: With all parameters, so of a prior or of a feasible estimate.
+        folder: Created where there is none; files of the same names are replaced.
+
+    Returns:
+        The machine file.
+
+    Raises:
+        InputError: The identified machine cannot be, forces alone determined no more than base
+            parameters, the machine comes from another format or is not as its files describe
+            it, or a machine file cannot hold the model's terms.
+        OutputError: The folder cannot be written, or holds what the machine was read from.
+    """
+    machine, parameters = identification.described_machine, identification.parameters
+    check_rewritable(machine)
+    if parameters is None or not identification.model.bodies:
+        raise InputError("forces determine base parameters only: give prior or feasible=True")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
+        spec = read_machine_spec(machine.path)
+        unlocked_machine = load(machine.path) if machine.locked_joints else machine
+    bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
+    names = _file_names(spec)
+    file = f"{machine.path.stem}.yaml"
+    originals = {machine.path, *(chain.urdf for chain in _written_chains(spec))}
+    for name in (file, *names.values()):
+        if (target := (Path(folder) / name).resolve()) in originals:
+            raise OutputError(
+                f"{target}: is what '{machine.name}' was read from, choose another folder"
+            )
+    origin_text = (
+        f"identified by {identification.method}{', feasible' if identification.feasible else ''}"
+    )
+    if undetermined_count := identification.marks.count("not determined"):
+        origin_text += (
+            f", {undetermined_count} of {len(identification.marks)} base parameters not determined"
+        )
+    law_fits = friction_laws(identification.model, parameters, identification.speeds)
+    content, motor_urdfs = _machine_file_content(
+        identification, spec, names, origin_text, law_fits
+    )
+    with replace_folder(folder) as part:
+        for chain in spec.chains:
+            tree = replace_inertials(chain.urdf, bodies, _fixed_links(spec), origin_text)
+            text = etree.tostring(tree, encoding="utf-8", xml_declaration=True)
+            (part / names[chain.name]).write_bytes(text.rstrip() + b"\n")
+        if spec.payload is not None:
+            payload_chain = spec.payload.chain
+            shutil.copyfile(payload_chain.urdf, part / names[payload_chain.name])
+        for name, text in motor_urdfs.items():
+            (part / name).write_text(text, encoding="utf-8")
+        (part / file).write_text(content, encoding="utf-8")
+        _check_written_machine(
+            identification,
+            bodies,
+            part / file,
+            exact=not any(each.max_deviation for each in law_fits.values()),
+        )
+    _warn_inexact_friction(machine, law_fits)
+    return Path(folder) / file
+
+
+def check_rewritable(machine: Machine) -> None:
+    """See that the files of a machine can be written again with other numbers in them.
+
+    Raises:
+        InputError: They cannot.
+    """
+    urdf = machine.path.suffix.lower() == ".urdf"
+    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
+        not urdf and is_parallel_robot(machine.path)
+    ):
+        raise InputError(
+            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
+            f"one: crane convert {machine.command_line_arguments} FOLDER"
+        )
+    if machine.parameter_changes:
+        raise InputError(
+            f"'{machine.name}' was loaded with changed numbers, identify it as its files "
+            "describe it"
+        )
+
+
+def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
+    """The first of the bodies that cannot exist, and why."""
+    for link, body in bodies.items():
+        if body[0] < 0:
+            return f"link '{link}' has the negative mass {body[0]:.4g} kg"
+        inertia = pin.Inertia.FromDynamicParameters(body)
+        if problem := inertia_problem(float(inertia.mass), inertia.inertia):
+            return f"link '{link}' has {problem.problem}"
+    return None
+
+
+def _file_names(spec: MachineSpec) -> dict[str, str]:
+    """File of each chain: the name it has, with a number where two are alike."""
+    taken: dict[str, str] = {}
+    for number, chain in enumerate(_written_chains(spec)):
+        name = chain.urdf.name
+        taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
+    return taken
+
+
+def _written_chains(spec: MachineSpec) -> tuple[Chain, ...]:
+    """The chains, and the payload that the machine file names."""
+    return spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
+
+
+def _fixed_links(spec: MachineSpec) -> set[str]:
+    """Links that are fixed to one that a joint moves."""
+    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
+    found = set()
+    for link in parent_joints:
+        at = link
+        while at in parent_joints and not parent_joints[at].is_movable:
+            at = parent_joints[at].parent
+        if at != link and at in parent_joints:
+            found.add(link)
+    return found
+
+
+def _machine_file_content(
+    result: Identification,
+    spec: MachineSpec,
+    names: Mapping[str, str],
+    origin_text: str,
+    law_fits: Mapping[str, FrictionLawFit],
+) -> tuple[str, dict[str, str]]:
+    """The machine file, and the URDFs of motors that turn with several joints, by name."""
+    machine = result.described_machine
+    data: dict[str, Any]
+    if machine.path.suffix.lower() == ".urdf":
+        data = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
+        loops = [dataclasses.asdict(loop) for loop in spec.loops]
+        data |= {
+            "loops": [{k: v for k, v in loop.items() if k != "source_location"} for loop in loops]
+        }
+        for loop in data["loops"]:
+            loop["axis"] = list(loop["axis"])
+        data |= {"active": list(spec.active if spec.active is not None else machine.active)}
+        if machine.tip is not None:
+            data["tip"] = machine.tip
+    else:
+        data = read_plain_data(machine.path)
+    data["source"] = f"{origin_text}; else {machine.source or machine.path.name}"
+    for chain in data["chains"]:
+        chain["urdf"] = names[chain["name"]]
+    if spec.payload is not None:
+        data["payload"] = {"urdf": names[spec.payload.chain.name]}
+    motor_urdfs = {}
+    for direction in joint_combinations(result.model):
+        chain, coupling, text = motor_chain(direction, spec.tree.root_link)
+        data["chains"].append(chain)
+        data["couplings"] = [*(data.get("couplings") or ()), coupling]
+        motor_urdfs[chain["urdf"]] = text
+    data["friction"] = _friction_data(result, spec, law_fits)
+    data["rotor_inertia"] = _rotor_inertias(result, spec)
+    scales = _parameters_of_kind(result, "gas_scale")
+    moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
+
+    def elements_of(kind: str) -> list[Any]:
+        """The machine's elements of a kind, and those that its locks took."""
+        kept = getattr(moving, kind)
+        return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
+
+    data["forces"] = [_non_default_fields(item) for item in elements_of("forces")]
+    data["gas_springs"] = {
+        item.joint: _non_default_fields(
+            item, joint=None, pressure=item.pressure * scales.get(item.joint, 1.0)
+        )
+        for item in elements_of("gas_springs")
+    }
+    data["ropes"] = [_non_default_fields(item) for item in elements_of("ropes")]
+    data["end_stops"] = {
+        item.joint: _non_default_fields(item, joint=None) for item in elements_of("end_stops")
+    }
+    for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
+        if not data.get(key):
+            data.pop(key, None)
+    return format_yaml(data, _uncertainty_notes(result, data)), motor_urdfs
+
+
+def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:
+    """How well friction and rotor inertias are known that the recording tells by themselves."""
+    found: dict[KeyPath, str] = {}
+    half = 0.5 * np.diff(result.interval(), axis=1)[:, 0]
+    for i, (name, group) in enumerate(zip(result.names, result.base.groups, strict=True)):
+        owner, _, kind = name.rpartition(".")
+        key_path = (kind, owner) if kind == "rotor_inertia" else ("friction", owner, kind)
+        place: Any = data
+        for key in key_path[:-1]:
+            place = place.get(key, {})
+        if group == name and np.isclose(
+            place.get(key_path[-1], np.nan), result.values[i], rtol=1e-9
+        ):
+            mark = result.marks[i] and f", {result.marks[i]}"
+            found[key_path] = f"identified ±{half[i]:.2g}, 95 %{mark}"
+    return found
+
+
+def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
+    """Identified parameters of a kind by what they are of."""
+    assert result.parameters is not None
+    named = zip(result.model.names, result.parameters.tolist(), strict=True)
+    return {
+        name.removesuffix(f".{kind}"): value for name, value in named if name.endswith(f".{kind}")
+    }
+
+
+def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, float]:
+    """Rotor inertia by joint, the described one where none was identified."""
+    described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
+    found = described | _parameters_of_kind(result, "rotor_inertia")
+    for joint, value in found.items():
+        if value < 0:
+            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
+    return {joint: value for joint, value in found.items() if value}
+
+
+def _friction_data(
+    result: Identification, spec: MachineSpec, law_fits: Mapping[str, FrictionLawFit]
+) -> dict[str, dict[str, Any]]:
+    """Friction by joint; one that the model gives none has none, whatever its files say."""
+    machine = result.described_machine
+    friction = {
+        joint: friction_data(law)
+        for joint, law in spec.friction.items()
+        if joint in machine.locked_joints
+    }
+    for joint in (*machine.joints, *(x.name for x in joint_combinations(result.model))):
+        if joint in law_fits:
+            friction[joint] = friction_data(law_fits[joint].law)
+        elif joint in spec.friction:
+            friction[joint] = {"viscous": 0.0}
+    return friction
+
+
+def _warn_inexact_friction(machine: Machine, law_fits: Mapping[str, FrictionLawFit]) -> None:
+    """Warn of friction that is not written as it was identified."""
+    deviations = {
+        name: each.max_deviation for name, each in law_fits.items() if each.max_deviation
+    }
+    if deviations:
+        worst = max(deviations, key=lambda name: deviations[name])
+        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
+        text = (
+            f"a machine file has no place for all of the friction of {', '.join(deviations)}: the "
+            f"nearest law at steady speeds is written, off by at most {deviations[worst]:.3g} "
+            f"{unit} "
+            f"({worst})"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=4)
+
+
+def _non_default_fields(element: Any, **changed: Any) -> dict[str, Any]:
+    """What of a dataclass is not as by default."""
+    values = {
+        field.name: changed.get(field.name, getattr(element, field.name))
+        for field in dataclasses.fields(element)
+        if field.name not in changed or changed[field.name] is not None
+    }
+    defaults = {field.name: field.default for field in dataclasses.fields(element)}
+    return {key: value for key, value in values.items() if value != defaults[key]}
+
+
+def _check_written_machine(
+    result: Identification, bodies: Mapping[str, Array], file: Path, exact: bool
+) -> None:
+    """Load what was written and compare its forces with those of the parameters.
+
+    Args:
+        result: See above.
+        bodies: Parameters (10,) by link.
+        file: The machine file.
+        exact: Whether friction is the identified one; where it is not, all else is compared.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CraneWarning)
+            written = load(file, lock=dict(result.described_machine.locked_joints))
+    except CraneError as error:
+        # a body is no slip in a file, which is not there yet: not to be corrected by hand
+        body = None if result.feasible else _infeasible_body(bodies)
+        why = f"{body}, give feasible=True" if body else error
+        raise InputError(f"the identified machine cannot be: {why}") from None
+    model, parameters = result.model, result.parameters
+    assert parameters is not None
+    at = random_samples(model, 20)
+    parameter_values, first = parameters.copy(), 0
+    for term in model.terms:
+        if isinstance(term, FrictionTerm) and not exact:
+            parameter_values[first : first + len(term.names)] = 0.0
+        first += len(term.names)
+    expected_forces = model.regressor(at) @ parameter_values + model.known_forces(at)
+    dynamics = Dynamics(written, backend="pinocchio")
+    written_forces = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=exact)
+    force_differences = np.abs(written_forces - expected_forces).max(axis=0)
+    if force_differences.max() <= _FORCE_TOLERANCE * np.abs(expected_forces).max():
+        return
+    kinds = {*_FRICTION_PARAMETERS, "gas_scale", "rotor_inertia", *BODY_PARAMETERS}
+    others = [name for name in model.names if name.rpartition(".")[2] not in kinds]
+    what = f"'{others[0]}'" if others else "friction over other velocities than the machine's"
+    raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")

@@ -1,0 +1,159 @@
+"""Who drives what: active joints that a file leaves open, free ones, and drives in surplus."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.active_joint_selection import (
+    DEAD_CENTRE_TOLERANCE,
+    ActiveJointSelection,
+    format_selections,
+    motion_scales,
+    null_space_basis,
+    propose_active_joints,
+    select_columns,
+)
+from crane.closure.coordinates import Coordinates
+from crane.closure.loop_equations import LoopEquations
+from crane.common.errors import CraneWarning
+from crane.common.samples import Array
+from crane.description import Drive, MachineSpec
+from crane.description.floating_bases import floating_series
+
+_SECTIONS_OF_ACTIVE_JOINTS = {
+    "tasks",
+    "control",
+    "hydraulics",
+}  # sections that only active joints can have
+
+
+def specified_driven_joints(spec: MachineSpec) -> tuple[str, ...]:
+    """Joints that the file says are driven, each once, in its order."""
+    named = [joint for drive in spec.drives for joint in drive.factors] or list(spec.active or ())
+    return tuple(dict.fromkeys(named))
+
+
+def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
+    """The independent coordinates as far as the file names them: driven ones, then free ones.
+
+    An open chain that names none has all of them, but those that follow others by a coupling.
+    """
+    if spec.active is not None:
+        return tuple(dict.fromkeys((*spec.active, *specified_free_joints(spec))))
+    followers = {next(iter(coupling.factors)) for coupling in spec.couplings}
+    return tuple(name for name in Coordinates(model).names if name not in followers)
+
+
+def specified_free_joints(spec: MachineSpec) -> tuple[str, ...]:
+    """Coordinates that the file calls free, and those of bodies that float."""
+    floating = (joint for series in floating_series(spec).values() for joint in series)
+    return tuple(dict.fromkeys((*spec.free, *floating)))
+
+
+def select_free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:
+    """Those of the independent coordinates that nothing drives."""
+    driven = specified_driven_joints(spec)
+    free = specified_free_joints(spec)
+    if not driven:
+        return tuple(name for name in active if name in free)
+    return tuple(name for name in active if name in free or name not in driven)
+
+
+def select_motors(spec: MachineSpec, active: Sequence[str]) -> tuple[Drive, ...]:
+    """What the file says that motors act on; every joint that it calls active if not all are."""
+    named = spec.active or ()
+    if spec.drives or all(name in active for name in named):
+        return spec.drives
+    return tuple(Drive(name, {name: 1.0}) for name in named if name not in spec.free)
+
+
+def complete_active_joints(
+    spec: MachineSpec, model: pin.Model, equations: LoopEquations, jacobian: Array
+) -> tuple[tuple[str, ...], str] | None:
+    """Independent coordinates where the file names too few, too many or none.
+
+    Joints that are named stay as far as they are independent, in their order. What they leave
+    open is completed by the joints of the best condition (see
+    `crane.closure.active_joint_selection`), which are
+    free: nothing drives them. Where no joint is named, those are proposed that look driven.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        equations: Its loops.
+        jacobian: (m, nv) of all loop equations at a closed posture.
+
+    Returns:
+        Names, and what to say of them; None where there is no such choice.
+    """
+    basis = null_space_basis(jacobian, motion_scales(model), DEAD_CENTRE_TOLERANCE)
+    names = equations.coordinates.names
+    coupled = [int(i) for i in np.flatnonzero((equations.coupling_factors != 0).any(axis=0))]
+    driven = spec.active or specified_driven_joints(spec)
+    undriven = specified_free_joints(spec)
+    specified = tuple(dict.fromkeys((*driven, *undriven)))
+    mobility = basis.shape[1]
+    is_undecided = not driven and _SECTIONS_OF_ACTIVE_JOINTS & spec.source_locations.keys()
+    is_dependent = (
+        spec.active and len(specified) == mobility
+    )  # as many as there are, and not independent
+    if not mobility or is_undecided or (is_dependent and not spec.drives):
+        return None
+    if not driven:
+        free = [names.index(name) for name in undriven]
+        found = propose_active_joints(model, jacobian, coupled, required=free)
+        if not found:
+            return None
+        driven_selections = [
+            ActiveJointSelection(
+                tuple(x for x in one.joints if x not in undriven), one.condition_number
+            )
+            for one in found
+        ]
+        text = f"no active joints named, taken as driven: {format_selections(driven_selections)}"
+        return found[0].joints, f"{_format_mobility(mobility)} and {text}"
+    independent = _independent_columns(basis, [names.index(name) for name in specified])
+    redundant = [name for name in specified if names.index(name) not in independent]
+    others = [i for i in range(len(names)) if i not in coupled]
+    chosen = select_columns(basis, others, independent)
+    if chosen is None:
+        chosen = select_columns(basis, range(len(names)), independent)
+    if chosen is None:
+        return None
+    added = [names[int(i)] for i in chosen if int(i) not in independent]
+    remarks = []
+    if redundant:
+        remarks.append(
+            f"{', '.join(redundant)} share{'s' * (len(redundant) == 1)} the load with the others"
+        )
+    if added:
+        remarks.append(
+            f"nothing drives {', '.join(added)}, free but for friction, springs and stops"
+        )
+    count = f"{len(driven)} active joint{'s' * (len(driven) != 1)}"
+    if undriven:
+        count += f" and {len(undriven)} free"
+    head = f"{count} for {_format_mobility(mobility)}"
+    return (*(names[i] for i in independent), *added), f"{head}: {'; '.join(remarks)}"
+
+
+def _independent_columns(basis: Array, columns: Sequence[int]) -> list[int]:
+    """The columns that are independent of those before them, at most as many as freedoms."""
+    independent: list[int] = []
+    for column in columns:
+        values = np.linalg.svd(basis[[*independent, column]], compute_uv=False)
+        if len(independent) < basis.shape[1] and values.min() > DEAD_CENTRE_TOLERANCE:
+            independent.append(column)
+    return independent
+
+
+def _format_mobility(count: int) -> str:
+    return f"{count} degree{'s' * (count != 1)} of freedom"
+
+
+def warn_about_completion(spec: MachineSpec, text: str) -> None:
+    """Say which coordinates were chosen."""
+    where = spec.source_locations.get("active", spec.path.name)
+    warnings.warn(f"{where}: {text}; name them as active and free", CraneWarning, stacklevel=4)

@@ -1,0 +1,311 @@
+"""The spanning tree and its closure, from a description."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure import Closure, frame_id
+from crane.closure.constraint_structure import ActiveJointError, OpenLoopError
+from crane.closure.coordinates import Coordinates
+from crane.closure.loop_equations import LoopEquations
+from crane.common.errors import DescriptionError, MechanismError, prefix_location
+from crane.common.samples import Array
+from crane.description import LoopSpec, MachineSpec, inertia_problem
+from crane.description.findings import error_recovery, is_strict, report_error
+from crane.description.floating_bases import floating_bases
+from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.pinocchio_conversion import inertia_from_inertial, se3_from_xyz_rpy
+from crane.machine.axis_diagnosis import find_wrong_axis
+from crane.machine.drive_selection import (
+    complete_active_joints,
+    select_free_joints,
+    specified_active_joints,
+    warn_about_completion,
+)
+
+_MAX_MOVING_JOINTS = 1000  # joints that move; closing takes the cube of it
+_DIRECTION_TOLERANCE = 1e-12  # difference of two directions that is none, as Pinocchio has it
+_AXIS_ALIGNED_JOINTS = (
+    (pin.JointModelRX, pin.JointModelPX),
+    (pin.JointModelRY, pin.JointModelPY),
+    (pin.JointModelRZ, pin.JointModelPZ),
+)
+
+
+def home_initial_guess(spec: MachineSpec, model: pin.Model) -> Array:
+    """(nq,) coordinates under `home`, of other joints zero or the limit nearest to it.
+
+    Raises:
+        DescriptionError: An active joint is at home outside of its limits.
+    """
+    active = specified_active_joints(spec, model)
+    coordinates = Coordinates(model)
+    lower, upper = coordinates.lower, coordinates.upper
+    initial_guess = np.clip(np.zeros(model.nv), lower, upper)
+    for joint, value in spec.home.items():
+        column = coordinates.column(joint)
+        if joint in active and not lower[column] <= value <= upper[column]:
+            problem = (
+                f"home of '{joint}' is {value:g}, outside of its limits "
+                f"{spec.tree.joints[joint].limits}, choose one within them"
+            )
+            report_error(DescriptionError(f"{spec.source_locations[f'home {joint}']}: {problem}"))
+        initial_guess[column] = value
+    return initial_guess
+
+
+def build_closure(
+    spec: MachineSpec,
+    model: pin.Model,
+    initial_guess: Array,
+    loops: Sequence[LoopSpec] | None = None,
+) -> Closure:
+    """The closure of a tree.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        initial_guess: (nq,) home posture to start from.
+        loops: Loops to close, if not all.
+
+    Raises:
+        OpenLoopError: A loop does not close; with file and line.
+        MechanismError: The parts do not make a machine that can be driven; likewise.
+    """
+    loops = spec.loops if loops is None else loops
+    # while findings are collected, joints that close rings are no part of the tree
+    known_names = set(Coordinates(model).names)
+    present_couplings = tuple(x for x in spec.couplings if known_names >= x.factors.keys())
+    spec = dataclasses.replace(spec, couplings=present_couplings)
+    names = specified_active_joints(spec, model)
+    try:
+        return _create_closure(spec, model, names, initial_guess, loops)
+    except MechanismError as refused:
+        error = refused
+
+    def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
+        tree = model if changed.tree is spec.tree else assemble_tree(changed)
+        return Closure(tree, some, names, initial_guess, present_couplings)
+
+    if names and (error.subject == "active" or error.subject.startswith("loop ")):
+        axis_error = find_wrong_axis(spec, model, loops, close)
+        if axis_error is not None:
+            raise axis_error
+    if isinstance(error, ActiveJointError) and error.configuration is not None:
+        closure = _closure_with_completed_joints(spec, model, initial_guess, loops, error)
+        if closure is not None:
+            return closure
+    text = prefix_location(spec.source_locations.get(error.subject, spec.path.name), error)
+    if isinstance(error, OpenLoopError):
+        raise OpenLoopError(text, error.subject, error.reason)
+    raise MechanismError(text, error.subject)
+
+
+def _create_closure(
+    spec: MachineSpec,
+    model: pin.Model,
+    names: Sequence[str],
+    initial_guess: Array,
+    loops: Sequence[LoopSpec],
+) -> Closure:
+    """The closure, its home sought where the file does not say it."""
+    movable = set(select_free_joints(spec, names)) - spec.home.keys()
+    return Closure(model, loops, names, initial_guess, spec.couplings, spec.home, movable)
+
+
+def _closure_with_completed_joints(
+    spec: MachineSpec,
+    model: pin.Model,
+    initial_guess: Array,
+    loops: Sequence[LoopSpec],
+    active_joint_error: ActiveJointError,
+) -> Closure | None:
+    """The closure with active joints chosen as the file leaves it, None where that is none."""
+    equations = LoopEquations(model, loops, spec.couplings)
+    choice = complete_active_joints(spec, model, equations, active_joint_error.jacobian)
+    if choice is None:
+        return None
+    names, text = choice
+    try:
+        closure = _create_closure(spec, model, names, initial_guess, loops)
+    except MechanismError:
+        try:
+            closure = Closure(
+                model, loops, names, active_joint_error.configuration, spec.couplings
+            )
+        except MechanismError:
+            return None
+    if closure.home_search is not None:  # far from where they were chosen
+        jacobian = equations.evaluate(closure.home)[1][closure.structure.independent_rows]
+        improved = complete_active_joints(spec, model, equations, jacobian)
+        if improved is not None and improved[0] != names:
+            text = improved[1]
+            closure = _closure_by_other_joints(closure, improved[0])
+    warn_about_completion(spec, text)
+    return closure
+
+
+def _closure_by_other_joints(closure: Closure, names: Sequence[str]) -> Closure:
+    """The same closure by other independent coordinates."""
+    equations = closure.equations
+    try:
+        other = Closure(closure.model, equations.loops, names, closure.home, equations.couplings)
+    except MechanismError:
+        return closure
+    other.home_search, other.initial_guess, other.specified_columns = (
+        closure.home_search,
+        closure.initial_guess,
+        closure.specified_columns,
+    )
+    return other
+
+
+def assemble_tree(spec: MachineSpec) -> pin.Model:
+    """Pinocchio's model of the tree.
+
+    Joints are added depth-first, because joints appended chain by chain make Pinocchio's crba
+    wrong without a word; those on one link in the order of their names, as Pinocchio's reader of
+    URDF adds them.
+
+    Raises:
+        DescriptionError: The tree is too large, or a body has an impossible inertia.
+    """
+    tree, joints_by_parent = spec.tree, spec.tree.joints_by_parent()
+    if (moving := len(tree.moving_joints)) > _MAX_MOVING_JOINTS:
+        raise DescriptionError(
+            f"{spec.path.name}: {moving} joints move, lock or leave out all but "
+            f"{_MAX_MOVING_JOINTS}"
+        )
+    model = pin.Model()
+    model.name = spec.name
+    root = tree.root_link
+    frame = pin.Frame(
+        root,
+        0,
+        0,
+        pin.SE3.Identity(),
+        pin.FrameType.BODY,
+        inertia_from_inertial(tree.links[root].inertial),
+    )
+    frames = {root: model.addFrame(frame)}
+    floating_series = {series[0]: (name, series) for name, series in floating_bases(spec).items()}
+    pending = _joints_in_reverse_order(joints_by_parent, root)
+    while pending:
+        joint = pending.pop()
+        if joint.name in floating_series:
+            last = _add_floating_base(model, frames, *floating_series[joint.name], tree)
+            pending += _joints_in_reverse_order(joints_by_parent, last)
+            continue
+        mass = inertia_from_inertial(tree.links[joint.child].inertial)
+        try:
+            frames[joint.child] = _add_joint(model, frames[joint.parent], joint, mass)
+        except (ValueError, RuntimeError) as error:  # it has its own words for names
+            reason = str(error).strip().splitlines()[0]
+            raise DescriptionError(
+                f"{joint.source_location}: cannot be assembled ({reason})"
+            ) from None
+        pending += _joints_in_reverse_order(joints_by_parent, joint.child)
+    model.armature = np.array(
+        [tree.joints[name].rotor_inertia for name in Coordinates(model).names]
+    )
+    _check_body_inertias(spec, model)
+    return model
+
+
+def _joints_in_reverse_order(
+    joints_by_parent: Mapping[str, list[Joint]], link: str
+) -> list[Joint]:
+    return sorted(joints_by_parent.get(link, ()), key=lambda joint: joint.name, reverse=True)
+
+
+def _add_joint(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -> int:
+    """Add a joint and the link that it moves; the frame of the link.
+
+    Args:
+        model: Where to.
+        parent: Frame of the link that the joint stands on.
+        joint: The joint.
+        mass: Inertia of the link that it moves.
+    """
+    parent_frame = model.frames[parent]
+    parent_joint, placement = (
+        parent_frame.parentJoint,
+        parent_frame.placement * se3_from_xyz_rpy(joint.xyz, joint.rpy),
+    )
+    if not joint.is_movable:
+        fixed = pin.FrameType.FIXED_JOINT
+        frame = model.addFrame(pin.Frame(joint.name, parent_joint, parent, placement, fixed, mass))
+        return int(model.addBodyFrame(joint.child, parent_joint, placement, frame))
+    limits = (
+        np.array([getattr(joint.limits, key)]) for key in ("effort", "velocity", "lower", "upper")
+    )
+    index = model.addJoint(
+        parent_joint, _pinocchio_joint_model(joint), placement, joint.name, *limits
+    )
+    frame = model.addJointFrame(index, parent)
+    model.appendBodyToJoint(index, mass, pin.SE3.Identity())
+    return int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), frame))
+
+
+def _add_floating_base(
+    model: pin.Model, frames: dict[str, int], name: str, series: Sequence[str], tree: Tree
+) -> str:
+    """Add a free-flyer in place of a series of six joints; the link that it moves."""
+    joints = [tree.joints[part] for part in series]
+    parent_frame = model.frames[frames[joints[0].parent]]
+    placement = parent_frame.placement * se3_from_xyz_rpy(joints[0].xyz, joints[0].rpy)
+    index = model.addJoint(parent_frame.parentJoint, pin.JointModelFreeFlyer(), placement, name)
+    model.addJointFrame(index, frames[joints[0].parent])
+    last = joints[-1].child
+    mass = inertia_from_inertial(tree.links[last].inertial)
+    model.appendBodyToJoint(index, mass, pin.SE3.Identity())
+    for joint in joints:
+        frames[joint.child] = int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), -1))
+    return last
+
+
+def _pinocchio_joint_model(joint: Joint) -> pin.JointModel:
+    """Pinocchio's joint, one for each direction of the frame's axes: they are faster."""
+    is_revolute, axis = joint.kind == "revolute", np.array(joint.axis)
+    for direction, kinds in zip(np.eye(3), _AXIS_ALIGNED_JOINTS, strict=True):
+        if np.linalg.norm(axis - direction) < _DIRECTION_TOLERANCE:
+            return kinds[0]() if is_revolute else kinds[1]()
+    kind = pin.JointModelRevoluteUnaligned if is_revolute else pin.JointModelPrismaticUnaligned
+    return kind(axis)
+
+
+def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
+    links = spec.tree.links
+
+    def parent_joints(some: Iterable[Link]) -> set[int]:
+        return {model.frames[frame_id(model, link.name)].parentJoint for link in some}
+
+    refused_joints = parent_joints(link for link in links.values() if link.has_refused_inertial)
+    joints_with_findings = parent_joints(
+        link for link in links.values() if _has_inertia_finding(link)
+    )
+    floating = floating_bases(spec)
+    for index in range(1, model.njoints):
+        name = model.names[index]
+        joint = spec.tree.joints[floating[name][-1] if name in floating else name]
+        link = links[joint.child]
+        if link.composite_joint is not None or index in refused_joints:
+            continue
+        with error_recovery(harmless=True):
+            _check_body_inertia(link, model.inertias[index], index in joints_with_findings)
+
+
+def _has_inertia_finding(link: Link) -> bool:
+    return link.inertial is not None and bool(link.inertial.finding_location)
+
+
+def _check_body_inertia(link: Link, inertia: pin.Inertia, has_finding: bool) -> None:
+    """Refuse a body that cannot be; of doubtful parts only where their form is no excuse."""
+    problem = inertia_problem(inertia.mass, inertia.inertia)
+    is_accepted = has_finding and (_has_inertia_finding(link) or not is_strict())
+    if problem is not None and not (is_accepted and problem.is_formal):
+        raise DescriptionError(
+            f"{link.source_location}: link '{link.name}' with what is fixed to it has {problem}"
+        )

@@ -1,0 +1,228 @@
+"""Where a reference leaves the limits of joints, told before it is tried."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from crane.common.errors import ClosureError
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.motion.trajectory import Trajectory
+
+_LIMIT_TOLERANCE = 1e-6  # [rad], [machine's size]
+_VELOCITY_LIMIT_TOLERANCE = 1e-6  # of a velocity limit
+_TIME_TOLERANCE = 1e-6  # [s]
+_MIN_SAMPLES, _SAMPLES_PER_SECOND, _MAX_SAMPLES = 100, 100, 20000  # samples
+
+ColumnFunction = Callable[[Array], Array]
+
+
+def limit_tolerances(machine: Machine) -> Array:
+    """By how much the coordinates of all joints may pass a limit [m], [rad], which is rounding."""
+    return _LIMIT_TOLERANCE * machine.closure.units
+
+
+def limit_violation_message(
+    machine: Machine, reference: Trajectory, end_time: float = np.inf
+) -> str:
+    """What to say of a reference that leaves the limits of an active joint, else nothing.
+
+    Args:
+        machine: The machine.
+        reference: Reference of its active joints.
+        end_time: End of what is looked at [s].
+    """
+    lower_bounds, upper_bounds = reference.bounds()
+    if lower_bounds.shape != machine.lower.shape:
+        return ""  # of another machine, which is told elsewhere
+    tolerances = limit_tolerances(machine)[machine.closure.active]
+    if (
+        np.maximum(machine.lower - lower_bounds, upper_bounds - machine.upper) <= tolerances
+    ).all():
+        return ""  # without a look where it turns
+    times = np.unique(
+        np.minimum(
+            np.append(reference.extremum_times(), _sample_times(reference, end_time)), end_time
+        )
+    )
+    violation = _LimitViolation.find(
+        times, reference.position, machine.lower, machine.upper, tolerances
+    )
+    if violation is None:
+        return ""
+    joint, others_text = machine.active[violation.joint_index], _others_text(violation.other_count)
+    return (
+        f"the reference of {_violation_text(machine, joint, violation)}{others_text}: keep it "
+        f"within, or widen the "
+        "limits"
+    )
+
+
+def passive_limit_violation_message(
+    machine: Machine, reference: Trajectory, end_time: float = np.inf
+) -> str:
+    """What to say of a reference that takes other joints beyond their limits, else nothing.
+
+    Those are the passive ones, closed loop by loop, and the velocities of all.
+
+    Args:
+        machine: The machine.
+        reference: Reference of its active joints.
+        end_time: End of what is looked at [s].
+    """
+    closure, times = machine.closure, _sample_times(reference, end_time)
+    if reference.position(times).shape[1] != len(machine.active):
+        return ""
+    passive = np.delete(np.arange(len(machine.joints)), closure.active)
+    lower, upper = machine.coordinates.lower, machine.coordinates.upper
+
+    def passive_coordinates(times: Array) -> Array:
+        return closure.solve(reference.position(times))[:, passive]
+
+    def joint_velocities(times: Array) -> Array:
+        gamma = closure.gamma(closure.solve(reference.position(times)))
+        return np.asarray(np.einsum("nij,nj->ni", gamma, reference.velocity(times)))
+
+    try:
+        violation = _LimitViolation.find(
+            times,
+            passive_coordinates,
+            lower[passive],
+            upper[passive],
+            limit_tolerances(machine)[passive],
+        )
+    except ClosureError:
+        return ""  # a dead centre, or beyond the reach: the run tells which
+    if violation is not None:
+        joint = machine.joints[passive[violation.joint_index]]
+        return (
+            f"the reference takes "
+            f"{_violation_text(machine, joint, violation, 'to')}"
+            f"{_others_text(violation.other_count)}: keep "
+            "it within, or widen the limits"
+        )
+    velocity_limits = np.array(
+        [
+            machine.tree.joints[joint].limits.velocity if joint in machine.tree.joints else np.inf
+            for joint in machine.joints
+        ]
+    )
+    velocity_limits[velocity_limits <= 0] = np.inf
+    violation = _LimitViolation.find(
+        times,
+        joint_velocities,
+        -velocity_limits,
+        velocity_limits,
+        _VELOCITY_LIMIT_TOLERANCE * np.where(np.isfinite(velocity_limits), velocity_limits, 0),
+    )
+    if violation is None:
+        return ""
+    joint = machine.joints[violation.joint_index]
+    unit = f"{machine.unit(joint)}/s"
+    return (
+        f"the reference moves '{joint}' with up to {abs(violation.value):.4g} {unit} at t = "
+        f"{violation.time:.4g} s, its limit is {abs(violation.limit):.6g} "
+        f"{unit}{_limit_location(machine, joint)}, "
+        f"{violation.interval_text}{_others_text(violation.other_count)}: move slower, or raise "
+        f"the limit"
+    )
+
+
+class _LimitViolation(NamedTuple):
+    """Where a column is farthest beyond its limits."""
+
+    joint_index: int
+    value: float
+    limit: float
+    time: float
+    interval_text: str
+    other_count: int
+
+    @classmethod
+    def find(
+        cls, times: Array, evaluate: ColumnFunction, lower: Array, upper: Array, tolerances: Array
+    ) -> "_LimitViolation | None":
+        """The worst of what has columns (N, n), as a share of what lies between the limits."""
+        q = evaluate(times)
+        excess = np.maximum(lower - q, q - upper)
+        if not q.shape[1] or not (excess > tolerances).any():
+            return None
+        span = upper - lower
+        scale = np.where(np.isfinite(span) & (span > 0), span, 1.0)
+        relative_excess = np.where(excess > tolerances, excess / scale, -np.inf)
+        k, i = (
+            int(x) for x in np.unravel_index(int(relative_excess.argmax()), relative_excess.shape)
+        )
+        is_below = bool(q[k, i] < lower[i])
+        limit, sign = float(lower[i] if is_below else upper[i]), -1.0 if is_below else 1.0
+        other_count = int((excess > tolerances).any(axis=0).sum()) - 1
+
+        def excess_at(time: float) -> float:
+            return float(sign * (evaluate(np.array([time]))[0, i] - limit))
+
+        interval_text = _violation_interval(times, excess[:, i], k, excess_at)
+        time, largest_excess = _largest_excess(times, excess[:, i], k, excess_at)
+        return cls(i, limit + sign * largest_excess, limit, time, interval_text, other_count)
+
+
+def _largest_excess(
+    times: Array, excess: Array, k: int, evaluate: Callable[[float], float]
+) -> tuple[float, float]:
+    """When it is farthest beyond, around sample k, and by how much."""
+    from scipy.optimize import minimize_scalar
+
+    interval = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
+    optimum = minimize_scalar(lambda t: -evaluate(t), bounds=interval, method="bounded")
+    if -optimum.fun > excess[k]:
+        return float(optimum.x), float(-optimum.fun)
+    return float(times[k]), float(excess[k])
+
+
+def _violation_interval(
+    times: Array, excess: Array, k: int, evaluate: Callable[[float], float]
+) -> str:
+    """From when to when it is beyond around sample k, with what it is at any time."""
+    from scipy.optimize import brentq
+
+    first = last = k
+    while first > 0 and excess[first - 1] > 0:
+        first -= 1
+    while last < len(times) - 1 and excess[last + 1] > 0:
+        last += 1
+    start_time = times[first]
+    if first > 0:
+        start_time = brentq(evaluate, times[first - 1], start_time, xtol=_TIME_TOLERANCE)
+    if last == len(times) - 1:
+        return f"from t = {start_time:.4g} s on"
+    return (
+        f"from t = {start_time:.4g} to "
+        f"{brentq(evaluate, times[last], times[last + 1], xtol=_TIME_TOLERANCE):.4g} s"
+    )
+
+
+def _violation_text(
+    machine: Machine, joint: str, violation: _LimitViolation, verb: str = "goes to"
+) -> str:
+    unit = machine.unit(joint)
+    return (
+        f"'{joint}' {verb} {violation.value:.6g} {unit} at t = {violation.time:.4g} s, beyond "
+        f"its limit "
+        f"{violation.limit:.6g} {unit}{_limit_location(machine, joint)} {violation.interval_text}"
+    )
+
+
+def _limit_location(machine: Machine, joint: str) -> str:
+    location = (
+        machine.tree.joints[joint].limits.source_location if joint in machine.tree.joints else ""
+    )
+    return f" ({location})" if location else ""
+
+
+def _others_text(other_count: int) -> str:
+    return f" ({other_count} other joint{'s' * (other_count > 1)} likewise)" if other_count else ""
+
+
+def _sample_times(reference: Trajectory, end_time: float) -> Array:
+    end = min(end_time, reference.duration)
+    return np.linspace(0.0, end, min(int(_SAMPLES_PER_SECOND * end) + _MIN_SAMPLES, _MAX_SAMPLES))

@@ -1,0 +1,242 @@
+"""Splines of fifth order: through given derivatives, with least jerk, or near noisy samples."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.common.samples import Array
+from crane.motion.piecewise_polynomial import PiecewisePolynomial
+
+_VALUES_PER_KNOT = 3  # value, rate and second rate at a knot
+_DIVIDED_DIFFERENCE_POINTS = 7  # of a divided difference that noise alone is left of
+_MIN_KNOT_SPACING = 0.01  # [s] between knots near samples
+_MIN_CUTOFF_PER_KNOT = 2.5e-3  # cut-off per knot: below, rounding spoils what is left
+_RELATIVE_TOLERANCE = 1e-3  # of the scatter and of the cut-off, to which both are found
+
+
+def quintic_polynomials(time: Array, x: Array, v: Array, a: Array) -> PiecewisePolynomial:
+    """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
+
+    With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,
+
+        d = x_i+1 - x_i - v_i h - a_i h^2/2,   e = v_i+1 - v_i - a_i h,   f = a_i+1 - a_i,
+        x = x_i + v_i u + a_i u^2/2 + (10 d - 4 e h + f h^2/2) (u/h)^3
+            + (-15 d + 7 e h - f h^2) (u/h)^4 + (6 d - 3 e h + f h^2/2) (u/h)^5.
+    """
+    h = np.diff(time)[:, None]
+    d = x[1:] - x[:-1] - h * (v[:-1] + h * a[:-1] / 2)
+    e = h * (v[1:] - v[:-1] - h * a[:-1])
+    f = h * h * (a[1:] - a[:-1])
+    coefficients = [
+        (6 * d - 3 * e + f / 2) / h**5,
+        (-15 * d + 7 * e - f) / h**4,
+        (10 * d - 4 * e + f / 2) / h**3,
+        a[:-1] / 2,
+        v[:-1],
+        x[:-1],
+    ]
+    return PiecewisePolynomial(np.array(coefficients), np.asarray(time, dtype=np.float64))
+
+
+def _quintic_basis() -> Array:
+    """(6, 6) the powers of u in a quintic, of its (x, x', x'') at u = 0 and u = 1."""
+    d, e, f = np.array(
+        [[-1.0, -1.0, -0.5, 1.0, 0.0, 0.0], [0, -1, -1, 0, 1, 0], [0, 0, -1, 0, 0, 1]]
+    )
+    start = np.eye(6)[:3] * np.array([1.0, 1.0, 0.5])[:, None]
+    basis: Array = np.vstack(
+        [start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2]
+    )
+    return basis
+
+
+def _jerk_form() -> Array:
+    """(6, 6) the integral of the squared third derivative over 0 <= u <= 1, as a form of those."""
+    scale = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
+    gram = np.outer(scale, scale) / np.add.outer(np.arange(3.0), np.arange(1.0, 4.0))
+    form: Array = _QUINTIC_BASIS[3:].T @ gram @ _QUINTIC_BASIS[3:]
+    return form
+
+
+_QUINTIC_BASIS = _quintic_basis()
+_JERK_FORM = _jerk_form()
+
+
+class _JerkQuadraticForm:
+    """The jerk of all quintics between knots, as a quadratic form in what they are at these.
+
+    J(y) = sum_i h_i^-5 y_i^T K y_i = y^T H y, with y_i = (x, h x', h^2 x'') at both ends of a
+    part. At each knot rates are scaled by the parts beside it, so that H is well conditioned.
+
+    Args:
+        time: (N,) [s].
+    """
+
+    def __init__(self, time: Array):
+        self.time = time
+        h = np.diff(time)
+        self.time_unit = float(np.exp(np.mean(np.log(h))))
+        h = h / self.time_unit
+        adjacent_lengths = np.concatenate([h[:1], np.sqrt(h[1:] * h[:-1]), h[-1:]])
+        knot_scales = adjacent_lengths[:, None] ** np.arange(_VALUES_PER_KNOT)
+        self._interval_scales = (
+            h[:, None, None] ** np.arange(_VALUES_PER_KNOT)
+            / np.stack([knot_scales[:-1], knot_scales[1:]], axis=1)
+        ).reshape(-1, 2 * _VALUES_PER_KNOT)  # from scaled ones to those of a part
+        self._knot_scales = knot_scales * self.time_unit ** np.arange(_VALUES_PER_KNOT)
+        all_intervals = np.arange(len(h))
+        self.jerk = self.assemble_banded(all_intervals, h[:, None, None] ** -5 * _JERK_FORM)
+
+    def assemble_banded(self, intervals: NDArray[np.intp], forms: Array) -> Array:
+        """Lower diagonals (6, 3 N) of a sum of forms (k, 6, 6), each of one of the parts (k,)."""
+        size = 2 * _VALUES_PER_KNOT
+        band = np.zeros((size, _VALUES_PER_KNOT * len(self.time)))
+        interval_scales = self._interval_scales[intervals]
+        for k in range(size):
+            for a in range(size - k):
+                values = forms[:, a + k, a] * interval_scales[:, a + k] * interval_scales[:, a]
+                np.add.at(band[k], _VALUES_PER_KNOT * intervals + a, values)
+        return band
+
+    def interpolation_rows(self, time: Array) -> tuple[NDArray[np.intp], Array]:
+        """The parts (M,) that times (M,) lie in, and what (M, 6) of a part is the value there."""
+        interval = np.clip(np.searchsorted(self.time, time, "right") - 1, 0, len(self.time) - 2)
+        u = (time - self.time[interval]) / np.diff(self.time)[interval]
+        return interval, u[:, None] ** np.arange(2 * _VALUES_PER_KNOT) @ _QUINTIC_BASIS
+
+    def apply_transpose(self, intervals: NDArray[np.intp], rows: Array, values: Array) -> Array:
+        """The sum (3 N,) of rows (M, 6) times values (M,)."""
+        out = np.zeros(_VALUES_PER_KNOT * len(self.time))
+        indices = _VALUES_PER_KNOT * intervals[:, None] + np.arange(2 * _VALUES_PER_KNOT)
+        np.add.at(out, indices, rows * self._interval_scales[intervals] * values[:, None])
+        return out
+
+    def interpolate(self, intervals: NDArray[np.intp], rows: Array, y: Array) -> Array:
+        """Values (M,) at rows (M, 6) of scaled ones (3 N,)."""
+        indices = _VALUES_PER_KNOT * intervals[:, None] + np.arange(2 * _VALUES_PER_KNOT)
+        return np.asarray(
+            np.einsum("ij,ij->i", rows * self._interval_scales[intervals], y[indices])
+        )
+
+    def scale_values(self, knot_values: Array) -> Array:
+        """Values and rates (N, 3) [s] in the units of H, (3 N,)."""
+        return np.asarray(knot_values * self._knot_scales).ravel()
+
+    def unscale_values(self, y: Array) -> Array:
+        """The way back."""
+        return np.asarray(y.reshape(-1, _VALUES_PER_KNOT) / self._knot_scales)
+
+
+def _multiply_banded(band: Array, y: Array) -> Array:
+    """A symmetric matrix, of its lower diagonals, times a vector."""
+    out: Array = band[0] * y
+    for k in range(1, len(band)):
+        out[k:] += band[k, :-k] * y[:-k]
+        out[:-k] += band[k, :-k] * y[k:]
+    return out
+
+
+def least_jerk(time: Array, x: Array, v: Array) -> Array:
+    """Values and rates at knots of the curve with the least integral of its squared jerk.
+
+    It is of fifth order between the knots and C4 at each; C3 where a rate is given. With what is
+    given at the ends as rates and no second rates there, it is the only one that makes
+
+        J = int (x''')^2 dt
+
+    least among all curves with these values: x^(6) = 0 between the knots (Flash and Hogan, J.
+    Neurosci. 5 (1985) 1688-1703, for one knot between the ends).
+
+    Args:
+        time: (N,) [s].
+        x: (N,) values.
+        v: (N,) rates, NaN where they follow; given at both ends.
+
+    Returns:
+        (N, 3) values, rates and second rates.
+    """
+    from scipy.linalg import solveh_banded  # slow to import
+
+    knots, offset = _JerkQuadraticForm(time), x[0]  # what is far from zero keeps its digits
+    given_values = np.column_stack([x - offset, v, np.full(len(time), np.nan)])
+    given_values[[0, -1], 2] = 0.0
+    y = knots.scale_values(given_values)
+    is_unknown = np.isnan(y)
+    y[is_unknown] = 0.0
+    right_side = np.where(is_unknown, -_multiply_banded(knots.jerk, y), 0.0)
+    band = knots.jerk.copy()
+    for k in range(1, len(band)):  # rows and columns of what is given
+        band[k, :-k] *= is_unknown[k:] & is_unknown[:-k]
+    band[0] = np.where(is_unknown, band[0], 1.0)
+    knot_values = knots.unscale_values(y + solveh_banded(band, right_side, lower=True))
+    knot_values[:, 0] = x
+    return knot_values
+
+
+def estimate_noise(time: Array, x: Array) -> float:
+    """How much samples (N,) scatter about any smooth curve: of their sixth divided differences.
+
+    Differences of seven samples each, with weights whose squares add up to one, are left with the
+    noise of one sample: its root mean square.
+    """
+    i = (
+        np.arange(_DIVIDED_DIFFERENCE_POINTS)
+        + np.arange(len(x) - _DIVIDED_DIFFERENCE_POINTS + 1)[:, None]
+    )
+    differences = time[i][:, :, None] - time[i][:, None, :]
+    differences /= np.ptp(time[i], axis=1)[:, None, None]
+    np.einsum("ijj->ij", differences)[:] = 1.0
+    weights = 1.0 / differences.prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1)[:, None]
+    return float(np.sqrt(np.mean(np.einsum("ij,ij->i", weights, x[i] - x[i[:, :1]]) ** 2)))
+
+
+def smooth_samples(time: Array, x: Array, noise_rms: float) -> tuple[Array, Array, float]:
+    """The curve with the least jerk that is as near to samples as these scatter about it.
+
+    It makes J + w sum (x - x_i)^2 least, w such that the root mean square of x - x_i is the
+    scatter (Reinsch, Numer. Math. 10 (1967) 177-183, there for cubic splines). Of samples every h
+    it is, far from the ends, the filter 1 / (1 + (f/f_c)^6) without delay, that of a Butterworth
+    filter of third order forwards and back, with (2 pi f_c)^6 = w / h. Samples that are closer
+    than 10 ms share knots.
+
+    Args:
+        time: (N,) [s].
+        x: (N,) samples.
+        noise_rms: See `estimate_noise`.
+
+    Returns:
+        Times (K,) of the knots, values, rates and second rates there (K, 3), and f_c [Hz].
+    """
+    from scipy.linalg import solveh_banded  # slow to import
+
+    grid = np.arange(time[0], time[-1], _MIN_KNOT_SPACING)
+    first = np.searchsorted(time, grid)
+    knots = _JerkQuadraticForm(time[np.unique(np.r_[first, len(time) - 1])])
+    intervals, rows = knots.interpolation_rows(time)
+    gram = knots.assemble_banded(intervals, rows[:, :, None] * rows[:, None, :])
+    mean = float(x.mean())
+    centred = x - mean
+    right_side = knots.apply_transpose(intervals, rows, centred)
+    step = float(np.ptp(time)) / (len(time) - 1) / knots.time_unit
+    lower_cutoff, upper_cutoff = 1.0 / float(np.ptp(time)), 0.5 / knots.time_unit
+    lower_cutoff = max(lower_cutoff, _MIN_CUTOFF_PER_KNOT / knots.time_unit)
+    while True:
+        cutoff_frequency = float(np.sqrt(lower_cutoff * upper_cutoff))
+        weight = step * (2 * np.pi * cutoff_frequency * knots.time_unit) ** 6
+        y = solveh_banded(knots.jerk + weight * gram, weight * right_side, lower=True)
+        residual_rms = float(
+            np.sqrt(np.mean((knots.interpolate(intervals, rows, y) - centred) ** 2))
+        )
+        if (
+            abs(residual_rms - noise_rms) < _RELATIVE_TOLERANCE * noise_rms
+            or upper_cutoff < (1.0 + _RELATIVE_TOLERANCE) * lower_cutoff
+        ):
+            break
+        lower_cutoff, upper_cutoff = (
+            (cutoff_frequency, upper_cutoff)
+            if residual_rms > noise_rms
+            else (lower_cutoff, cutoff_frequency)
+        )
+    knot_values = knots.unscale_values(y)
+    knot_values[:, 0] += mean
+    return knots.time, knot_values, cutoff_frequency

@@ -1,0 +1,248 @@
+"""How far a workspace reaches."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.motion.workspaces.workspace_kinematics import WorkspaceKinematics
+from crane.motion.workspaces.workspace_patch import last_closed_configuration
+from crane.motion.workspaces.workspace_result import SingularCurve, WorkspaceExtreme
+
+Objective = Callable[[Array], tuple[float, Array]]
+ObjectiveConstraint = tuple[str, Objective]  # "eq": the goal is 0, "ineq": it is at least 0
+
+# in rad and shares of the machine's size
+_DIFFERENCE_STEP = 1e-6  # of the differences that give the slope of a determinant
+_CLOSURE_TOLERANCE = 1e-9  # residual of the loops up to which an extreme is one
+_CONSTRAINT_TOLERANCE = 1e-9  # of a demand that is met
+_CONTINUATION_POINTS, _NEWTON_ITERATIONS = (
+    8,
+    6,
+)  # points of the way to a singular posture, steps of Newton's method
+_MAX_CHORD_DEVIATION = 0.3  # of the length of that way, how far it may be from a straight one
+
+
+def workspace_extremes(
+    kinematics: WorkspaceKinematics,
+    q: Array,
+    section_positions: Array,
+    limits: tuple[Array, Array],
+    curves: Sequence[SingularCurve],
+) -> tuple[WorkspaceExtreme, ...]:
+    """Least and largest coordinates of a section.
+
+    The best posture of a grid, or of a singular curve, improved by `maximize_on_branch`.
+
+    Args:
+        kinematics: The machine and the section.
+        q: (N, nq) postures.
+        section_positions: (N, 2) theirs.
+        limits: Limits (n,) of the active coordinates.
+        curves: Singular curves.
+    """
+    active = kinematics.machine.closure.active
+    results = []
+    names, signs = (
+        enumerate(kinematics.section.coordinate_names),
+        ((1.0, "least"), (-1.0, "largest")),
+    )
+    for (axis, name), (sign, adjective) in itertools.product(names, signs):
+
+        def objective(posture: Array, axis: int = axis, sign: float = sign) -> tuple[float, Array]:
+            tips = kinematics.tip_positions(posture[None])
+            tree = kinematics.kinematics.tree_jacobian(posture)[None]
+            gradient = kinematics.section.section_jacobian(tips, tree)[0, axis]
+            return -sign * float(kinematics.section.coordinates(tips)[0, axis]), -sign * gradient
+
+        best_index = int((sign * section_positions[:, axis]).argmin())
+        value, configuration = maximize_on_branch(
+            kinematics.machine, q[best_index], kinematics.strokes, limits, objective
+        )
+        value, q_a = -sign * value, configuration[active]
+        for curve in curves:
+            k = int((sign * curve.section_positions[:, axis]).argmin())
+            if sign * curve.section_positions[k, axis] < sign * value:
+                value, q_a = float(curve.section_positions[k, axis]), curve.q_a[k]
+        results.append(WorkspaceExtreme(f"{adjective} {name}", value, q_a))
+    return tuple(results)
+
+
+def maximize_on_branch(
+    machine: Machine,
+    q: Array,
+    strokes: Sequence[int],
+    limits: tuple[Array, Array],
+    objective: Objective,
+    constraints: Sequence[ObjectiveConstraint] = (),
+) -> tuple[float, Array]:
+    """The largest value of a goal near a posture, on its assembly branch and within the limits.
+
+    Passive joints are unknowns beside the strokes, so that the problem is smooth where the branch
+    ends, too:
+
+        max g(q)   with   phi(q) = 0,   d_k(q) d_k(home) >= 0,   lower <= q_A <= upper,
+
+    d_k the determinants of the blocks of J_P, one of which is zero at the end of a branch. Solved
+    by sequential quadratic programming (SLSQP); a solution counts if the branch leads there.
+
+    Args:
+        machine: The machine.
+        q: (nq,) closed posture to start from.
+        strokes: Indices of the active joints that move; the others are held.
+        limits: Lower and upper limits (n,) of the active coordinates.
+        objective: (nq,) -> value, and its slope (nv,) by the joints of the tree.
+        constraints: What else has to hold, likewise; lengths in shares of the machine's size.
+
+    Returns:
+        The value and its posture (nq,); those of the start where nothing better is found, with
+        -inf where that does not meet the demands.
+    """
+    closure = machine.closure
+    moving = closure.active[list(strokes)]
+    free = np.concatenate([moving, closure.passive])
+    low, stroke_lengths = limits[0][list(strokes)], (limits[1] - limits[0])[list(strokes)]
+    units = np.concatenate([stroke_lengths, closure.units[closure.passive]])
+    initial_value = objective(q)[0]
+    is_initially_feasible = _satisfies_constraints(constraints, q)
+    equations, independent_rows = closure.equations, closure.structure.independent_rows
+    objective_scale = max(
+        abs(initial_value), 1e-3 * closure.characteristic_length
+    )  # so that the accuracy asked for is a relative one
+
+    def configuration(x: Array) -> Array:
+        out = q.copy()
+        out[free] = x * units
+        return out
+
+    def cost(x: Any) -> tuple[float, Any]:
+        value, slope = objective(configuration(x))
+        return -value / objective_scale, -slope[free] * units / objective_scale
+
+    closure_constraint: Any = {
+        "type": "eq",
+        "fun": lambda x: equations.evaluate_scaled(configuration(x))[0][independent_rows],
+        "jac": lambda x: (
+            (equations.evaluate_scaled(configuration(x))[1][independent_rows] / closure.units)[
+                :, free
+            ]
+            * units
+        ),
+    }
+    branch_constraint: Any = {
+        "type": "ineq",
+        "fun": lambda x: _relative_determinants(machine, configuration(x)),
+        "jac": lambda x: _determinant_derivatives(machine, configuration(x), free) * units,
+    }
+    other_constraints: Any = [
+        {
+            "type": kind,
+            "fun": lambda x, demand=demand: demand(configuration(x))[0],
+            "jac": lambda x, demand=demand: demand(configuration(x))[1][free] * units,
+        }
+        for kind, demand in constraints
+    ]
+    bounds = [
+        *zip(low / stroke_lengths, (low + stroke_lengths) / stroke_lengths, strict=True),
+        *[(None, None)] * len(closure.passive),
+    ]
+    for scipy_constraints in (
+        ([closure_constraint], [closure_constraint, branch_constraint])
+        if len(independent_rows)
+        else ([],)
+    ):
+        result = minimize(
+            cost,
+            q[free] / units,
+            jac=True,
+            bounds=bounds,
+            constraints=[*scipy_constraints, *other_constraints],
+            method="SLSQP",
+            options={"ftol": 1e-13, "maxiter": 200},
+        )
+        if (
+            len(independent_rows)
+            and (_relative_determinants(machine, configuration(result.x)) > 0).all()
+        ):
+            break  # few extremes are at the end of a branch, and its slopes are dear
+    target = configuration(result.x)
+    target[moving] = np.clip(target[moving], low, low + stroke_lengths)
+    last_configuration, is_closed = last_closed_configuration(machine, q, target[closure.active])
+    if is_closed or not _is_reachable_on_branch(machine, last_configuration, target, free):
+        target = last_configuration  # closed to rounding
+    value = objective(target)[0]
+    if _satisfies_constraints(constraints, target) and (
+        value > initial_value or not is_initially_feasible
+    ):
+        return value, target
+    return (initial_value if is_initially_feasible else -np.inf), q
+
+
+def _satisfies_constraints(constraints: Sequence[ObjectiveConstraint], q: Array) -> bool:
+    """Whether a posture meets all demands."""
+    values = [(kind, demand(q)[0]) for kind, demand in constraints]
+    return all((abs(x) if kind == "eq" else -x) < _CONSTRAINT_TOLERANCE for kind, x in values)
+
+
+def _is_reachable_on_branch(
+    machine: Machine, q: Array, target: Array, free_columns: Array
+) -> bool:
+    """Whether the branch leads from a posture to another, singular one.
+
+    Points of the straight way are projected on phi(q) = 0 along the shortest way, all joints
+    being free: unlike the strokes alone, these determine the posture where the branch ends.
+    """
+    equations, rows = machine.closure.equations, machine.closure.structure.independent_rows
+    units = machine.closure.units
+    path_length = float(np.abs((target - q) / units).max())
+    for share in np.linspace(0, 1, _CONTINUATION_POINTS + 1)[1:]:
+        chord = q + share * (target - q)
+        projected = chord.copy()
+        for _ in range(_NEWTON_ITERATIONS):
+            phi, jacobian = equations.evaluate_scaled(projected)
+            projected[free_columns] -= (
+                units[free_columns]
+                * np.linalg.lstsq(jacobian[rows][:, free_columns], phi[rows])[0]
+            )
+        if (
+            np.abs((projected - chord) / units).max()
+            > _MAX_CHORD_DEVIATION * path_length + _CLOSURE_TOLERANCE
+        ):
+            return False
+        if not (np.abs(equations.evaluate_scaled(projected)[0]) < _CLOSURE_TOLERANCE).all():
+            return False
+        if (_relative_determinants(machine, projected) < -_CLOSURE_TOLERANCE).any():
+            return False
+    return True
+
+
+def _relative_determinants(machine: Machine, q: Array) -> Array:
+    """(blocks,) determinants of the blocks of J_P, as shares of those at home."""
+    return _block_determinants(machine, q) / _block_determinants(machine, machine.home)
+
+
+def _block_determinants(machine: Machine, q: Array) -> Array:
+    closure = machine.closure
+    jacobian = closure.equations.evaluate_scaled(q)[1][closure.structure.independent_rows][
+        :, closure.passive
+    ]
+    return np.array(
+        [np.linalg.det(jacobian[np.ix_(*block)]) for block in closure.structure.blocks]
+    )
+
+
+def _determinant_derivatives(machine: Machine, q: Array, columns: Array) -> Array:
+    """(blocks, k) slopes of `_relative_determinants` by some coordinates."""
+    out = []
+    for column in columns:
+        step = np.zeros(len(q))
+        step[column] = _DIFFERENCE_STEP * machine.closure.units[column]
+        forward_value, backward_value = (
+            _block_determinants(machine, q + sign * step) for sign in (1, -1)
+        )
+        out.append((forward_value - backward_value) / (2 * step[column]))
+    return np.array(out).T / _block_determinants(machine, machine.home)[:, None]

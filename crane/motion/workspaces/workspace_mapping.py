@@ -1,0 +1,312 @@
+"""Exploring a workspace: patches over the strokes, and what is measured on them."""
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_count, as_seed
+from crane.machine import Machine
+from crane.motion.kinematics import Kinematics
+from crane.motion.workspaces.coverage_raster import CoverageRaster
+from crane.motion.workspaces.covered_triangles import covered_triangles
+from crane.motion.workspaces.singular_curves import branch_edges, patch_curves, singular_curves
+from crane.motion.workspaces.workspace_extremes import workspace_extremes
+from crane.motion.workspaces.workspace_kinematics import WorkspaceKinematics
+from crane.motion.workspaces.workspace_patch import (
+    WorkspacePatch,
+    fill_patch,
+    last_closed_configuration,
+)
+from crane.motion.workspaces.workspace_result import StrokeMap, Workspace
+from crane.motion.workspaces.workspace_section import find_slewing_joint, workspace_section
+
+_MAX_SAMPLES = 1_000_000  # postures
+_MOTION_TOLERANCE = 1e-9  # slope of a tip that a joint moves, in shares of the machine's size
+_MAX_GRID_JOINTS = 3  # joints that a regular grid is made of
+_MAP_VALUES = 81  # values of each stroke of the map
+_SLICE_COUNT = 9  # values of the third of three strokes
+_RANDOM_PATCH_VALUES = 16  # values of both strokes of a patch that is drawn
+_INTERIOR_SHARE = 0.5  # share of patches of many joints that do not lie on limits
+
+
+class _PlannedPatch(NamedTuple):
+    """A patch to be filled; see `WorkspacePatch`.
+
+    Attributes:
+        stroke_pair: Indices of both strokes.
+        held_coordinates: (n,) where the others are held.
+        value_count: Values of each stroke.
+        counts_for_share: Whether it counts for the share of the box that closes.
+    """
+
+    stroke_pair: tuple[int, int]
+    held_coordinates: Array
+    value_count: int
+    counts_for_share: bool
+
+
+def workspace(
+    machine: Machine, samples: int = 10_000, frame: str | None = None, seed: int = 0
+) -> Workspace:
+    """Map where a machine's strokes take its tip, and where its loops do not close.
+
+    The strokes are those of active joints that move loops or the tip, within their limits (half a
+    turn to both sides of home without); passive joints have no limits here. Up to three of them
+    give a regular grid; of more, patches over two of them each, the others drawn at random, half
+    of them at their limits: what such a workspace covers is within the true one. A joint that
+    slews the whole machine is held at home, see `Section`.
+
+    Args:
+        machine: The machine.
+        samples: About how many postures.
+        frame: A link; the machine's tip if not given.
+        seed: Of what is drawn.
+
+    Raises:
+        InputError: Fewer than 100 samples or more than a million, an unknown frame, no tip, or a
+            frame that no driven joint moves.
+    """
+    samples, seed = as_count(samples, "the number of samples", 100, _MAX_SAMPLES), as_seed(seed)
+    kinematics = Kinematics(machine, frame)
+    lower, upper = stroke_limits(machine)
+    random = np.random.default_rng(seed)
+    slewing_joint = find_slewing_joint(machine, kinematics.frame)
+    held_joint = None if slewing_joint is None else slewing_joint[0]
+    strokes = moving_strokes(machine, kinematics, lower, upper, held_joint, random)
+    if not strokes:
+        raise InputError(f"no driven joint moves '{kinematics.frame}', name another frame")
+    patches, counted_patches = _create_patches(machine, strokes, lower, upper, samples, random)
+    q = np.concatenate([patch.configurations[patch.is_closed] for patch in patches])
+    tips = kinematics.positions_at_configurations(q)
+    home = kinematics.position_at_configuration(machine.home)
+    section = workspace_section(machine, kinematics.frame, tips, home)
+    section_positions = section.coordinates(tips)
+    workspace_kinematics = WorkspaceKinematics(
+        machine, kinematics, section, strokes, float(np.ptp(section_positions, axis=0).max())
+    )
+    condition, least_singular_value = workspace_kinematics.condition_measures(q, tips)
+    branch_edges_by_patch = [branch_edges(machine, patch) for patch in patches]
+    covered_by_patch = [
+        covered_triangles(workspace_kinematics, patch, here, patch_edges)
+        for patch, here, patch_edges in zip(
+            patches,
+            _split_by_patch(patches, section_positions),
+            branch_edges_by_patch,
+            strict=True,
+        )
+    ]
+    raster = CoverageRaster(
+        np.concatenate([section_positions, *(part.reshape(-1, 2) for part in covered_by_patch)])
+    )
+    for patch_triangles in covered_by_patch:
+        raster.cover(patch_triangles)
+    curves = singular_curves(workspace_kinematics, patches, branch_edges_by_patch, (lower, upper))
+    closed_share = _closed_share(
+        [patches[i] for i in counted_patches], len(strokes) == _MAX_GRID_JOINTS
+    )
+    if len(strokes) > 2:
+        tip_jacobian = (
+            workspace_kinematics.scaled_tip_jacobian(q, tips, machine.closure.gamma(q))
+            / workspace_kinematics.stroke_scales
+        )
+        tip_displacements = (
+            np.linalg.norm(tip_jacobian, axis=1).mean(axis=0) * (upper - lower)[strokes]
+        )
+        first_stroke, second_stroke = sorted(
+            strokes[int(i)] for i in np.argsort(tip_displacements)[-2:]
+        )
+        axes = tuple(
+            np.linspace(lower[i], upper[i], _MAP_VALUES) for i in (first_stroke, second_stroke)
+        )
+        map_patch = fill_patch(
+            machine,
+            machine.home[machine.closure.active],
+            (first_stroke, second_stroke),
+            (axes[0], axes[1]),
+        )
+        assert map_patch is not None, "home itself closes"
+        map_curves = patch_curves(
+            workspace_kinematics, map_patch, branch_edges(machine, map_patch)
+        )
+    else:
+        map_patch, map_curves = patches[0], curves
+    map_values = np.full((2, *map_patch.is_closed.shape), np.nan)
+    patch_positions = map_patch.configurations[map_patch.is_closed]
+    map_values[:, map_patch.is_closed] = workspace_kinematics.condition_measures(
+        patch_positions, workspace_kinematics.tip_positions(patch_positions)
+    )
+    return Workspace(
+        machine=machine,
+        frame=kinematics.frame,
+        section=section,
+        strokes=tuple(machine.active[i] for i in strokes),
+        lower=lower,
+        upper=upper,
+        q_a=q[:, machine.closure.active],
+        tip_positions=tips,
+        section_positions=section_positions,
+        condition=condition,
+        least_singular_value=least_singular_value,
+        closed_share=closed_share,
+        area=raster.area if len(strokes) > 1 and _is_two_dimensional(section_positions) else 0.0,
+        extremes=workspace_extremes(
+            workspace_kinematics, q, section_positions, (lower, upper), curves
+        ),
+        curves=tuple(curves),
+        patches=tuple(patches),
+        stroke_map=StrokeMap(map_patch, map_values[0], map_values[1], tuple(map_curves)),
+        raster=raster,
+        is_complete=len(strokes) <= _MAX_GRID_JOINTS,
+    )
+
+
+def stroke_limits(machine: Machine) -> tuple[Array, Array]:
+    """Limits of the active joints; half a turn, or the joint's scale, from home without."""
+    home = machine.home[machine.closure.active]
+    units = machine.closure.units[machine.closure.active]
+    half_range = np.where(machine.coordinates.is_translation[machine.closure.active], units, np.pi)
+    return (
+        np.where(np.isfinite(machine.lower), machine.lower, home - half_range),
+        np.where(np.isfinite(machine.upper), machine.upper, home + half_range),
+    )
+
+
+def moving_strokes(
+    machine: Machine,
+    kinematics: Kinematics,
+    lower: Array,
+    upper: Array,
+    held_joint: int | None,
+    random: np.random.Generator,
+) -> list[int]:
+    """Driven joints that move the frame or open loops, the slewing joint left out."""
+    closure = machine.closure
+    configurations = [machine.home]
+    for _ in range(8):
+        configurations.append(
+            last_closed_configuration(machine, machine.home, random.uniform(lower, upper))[0]
+        )
+    tip_motion = np.zeros(len(machine.active))
+    units = closure.units[closure.active] / closure.characteristic_length
+    for q in configurations:
+        gamma = closure.gamma(q)
+        tip_derivatives = np.abs(kinematics.tree_jacobian(q) @ gamma * units).max(axis=0)
+        tip_motion = np.maximum(tip_motion, tip_derivatives)
+    is_coupled = np.abs(closure.gamma(machine.home)[closure.passive]).max(axis=0, initial=0.0) > 0
+    tip_motion[~machine.is_driven] = 0.0
+    relevant_joints = [
+        i
+        for i in np.flatnonzero(machine.is_driven)
+        if tip_motion[i] > _MOTION_TOLERANCE or is_coupled[i]
+    ]
+    return (
+        [int(i) for i in relevant_joints if i != held_joint]
+        if tip_motion.max() > _MOTION_TOLERANCE
+        else []
+    )
+
+
+def _create_patches(
+    machine: Machine,
+    strokes: list[int],
+    lower: Array,
+    upper: Array,
+    samples: int,
+    random: np.random.Generator,
+) -> tuple[list[WorkspacePatch], list[int]]:
+    """Patches over the strokes, and which of them count for the share of the box that closes."""
+    home = machine.home[machine.closure.active]
+    if len(strokes) == 1:
+        axis = np.linspace(lower[strokes[0]], upper[strokes[0]], min(samples, 2001))
+        patch = fill_patch(machine, home.copy(), (strokes[0], strokes[0]), (axis, home[strokes]))
+        assert patch is not None, "home itself closes"
+        return [patch], [0]
+    if len(strokes) == 2:
+        planned = [_PlannedPatch((strokes[0], strokes[1]), home.copy(), int(samples**0.5), True)]
+    elif len(strokes) == _MAX_GRID_JOINTS:
+        planned = list(_sliced_patches(home, strokes, lower, upper, samples))
+    else:
+        planned = list(_random_patches(home, strokes, lower, upper, samples, random))
+    patches: list[WorkspacePatch] = []
+    for pair, base, size, _ in planned:
+        first_values, second_values = (
+            np.linspace(lower[joint], upper[joint], size) for joint in pair
+        )
+        patch = fill_patch(machine, base, pair, (first_values, second_values))
+        if patch is None:
+            none_closed: NDArray[np.bool_] = np.zeros((size, size), dtype=bool)
+            q = np.full((size, size, machine.model.nv), np.nan)
+            patch = WorkspacePatch(pair, base, (first_values, second_values), none_closed, q)
+        patches.append(patch)
+    return patches, [k for k, plan in enumerate(planned) if plan.counts_for_share]
+
+
+def _sliced_patches(
+    home: Array, strokes: list[int], lower: Array, upper: Array, samples: int
+) -> Iterator[_PlannedPatch]:
+    """Every pair of three strokes, at values of the third all over its range."""
+    count = max(5, round((samples / _SLICE_COUNT) ** 0.5))
+    for pair in itertools.combinations(strokes, 2):
+        (other,) = set(strokes) - set(pair)
+        for value in np.linspace(lower[other], upper[other], _SLICE_COUNT):
+            base = home.copy()
+            base[other] = value
+            yield _PlannedPatch(pair, base, count, pair == (strokes[0], strokes[1]))
+
+
+def _random_patches(
+    home: Array,
+    strokes: list[int],
+    lower: Array,
+    upper: Array,
+    samples: int,
+    random: np.random.Generator,
+) -> Iterator[_PlannedPatch]:
+    """Pairs of many strokes through home, then with the others drawn: inside, or at limits."""
+    pairs = list(itertools.combinations(strokes, 2))
+    for pair in pairs:
+        yield _PlannedPatch(pair, home.copy(), _RANDOM_PATCH_VALUES, False)
+    for k in range(max(len(pairs), 4 * samples // _RANDOM_PATCH_VALUES**2)):
+        base, random_values = home.copy(), random.uniform(lower, upper)
+        is_interior = random.random() < _INTERIOR_SHARE
+        if not is_interior:
+            random_values = np.where(random.random(len(lower)) < 0.5, lower, upper)
+        base[strokes] = random_values[strokes]
+        yield _PlannedPatch(pairs[k % len(pairs)], base, _RANDOM_PATCH_VALUES, is_interior)
+
+
+def _closed_share(patches: list[WorkspacePatch], is_sliced: bool) -> float:
+    """Share of the box that closes; nodes on its faces count half."""
+    closed = total = 0.0
+    for k, patch in enumerate(patches):
+        is_face = is_sliced and k in (0, len(patches) - 1)
+        first_weights, second_weights = (_node_weights(len(values)) for values in patch.axes)
+        weights = np.outer(first_weights, second_weights) * (0.5 if is_face else 1.0)
+        closed, total = (
+            closed + float(weights[patch.is_closed].sum()),
+            total + float(weights.sum()),
+        )
+    return closed / total if total else 0.0
+
+
+def _node_weights(count: int) -> Array:
+    """Shares (count,) of the nodes along an axis: half at both ends, one if there is one node."""
+    weights = np.ones(count)
+    if count > 1:
+        weights[[0, -1]] = 0.5
+    return weights
+
+
+def _split_by_patch(patches: list[WorkspacePatch], stacked: Array) -> list[Array]:
+    counts = np.cumsum([patch.is_closed.sum() for patch in patches])[:-1]
+    return np.split(stacked, counts)
+
+
+def _is_two_dimensional(positions: Array) -> bool:
+    """Whether places (N, 2) fill more than a line."""
+    values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(values[-1] > 1e-6 * values[0])

@@ -1,0 +1,255 @@
+"""Where a machine was, and how fast, by whichever of its joints were measured.
+
+Coordinates of active joints are taken where they are measured. The others follow from other joints
+by closing the machine's loops, velocities by v_A = gamma_A v_B with q_B what was measured.
+"""
+
+import re
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from crane.closure import Closure
+from crane.common.errors import ClosureError, MechanismError, RecordingError
+from crane.common.samples import Array
+from crane.description.sensors import VELOCITY_SUFFIX, VELOCITY_UNITS
+from crane.machine import Machine
+from crane.recordings.ideal_sensors import ideal_readings
+from crane.recordings.missing_measurements import MissingMeasurementError
+from crane.recordings.pin_derivatives import pin_derivatives
+from crane.recordings.recording import time_derivative
+from crane.recordings.timeseries import TIME, Table, table_column
+
+_MIN_INDEPENDENT_SHARE = 1e-6  # least share of a joint's motion that others do not tell
+_CONFIGURATION_TOLERANCE = 1e-6  # [rad], [machine's size]
+_COMPARED_SAMPLES, _DERIVATIVE_SAMPLES = (
+    2000,
+    200,
+)  # samples that are compared, and enough for slopes
+_BLOCK_SAMPLES = 1 << 16  # samples whose postures are held
+_SAMPLE_PATTERN = re.compile(r"\(sample (\d+)\)")  # of an error of the closure
+_LIMIT_TOLERANCE = 0.1  # of a range, by which sensors may be off
+
+
+def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
+    """Measured joints that determine all others: active ones, then such as tell something new.
+
+    Raises:
+        MissingError: They do not determine all.
+    """
+    drives = independent_joints(machine, names)
+    if len(drives) == len(machine.active):
+        return drives
+    missing = independent_joints(machine, [*drives, *machine.active], first=drives)[len(drives) :]
+    others = [x for x in machine.joints if x not in machine.active]
+    others = [
+        x for x in others if len(independent_joints(machine, [x], first=drives)) > len(drives)
+    ]
+    it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
+    requested = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
+    alternatives = f", or a joint that moves with {it} ({', '.join(others)})" if others else ""
+    text = (
+        f"nothing tells where {', '.join(map(repr, missing))} {are}, give "
+        f"{requested}{alternatives}"
+    )
+    raise MissingMeasurementError(text, missing)
+
+
+def independent_joints(
+    machine: Machine, names: Sequence[str], first: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Joints that each tell something that those before do not: the first, active ones, others.
+
+    A joint tells what its row of gamma = dq/dq_A at home has in the directions that the rows
+    before it leave open.
+    """
+    gamma = machine.closure.gamma(machine.home) * _stroke_ranges(machine)
+    basis = np.zeros((0, len(machine.active)))
+    found = []
+    measured = [x for x in names if x in machine.joints and x not in first]
+    for joint in (*first, *sorted(measured, key=lambda x: x not in machine.active)):
+        row = gamma[machine.column(joint)]
+        rest = row - basis.T @ (basis @ row)
+        rest -= basis.T @ (basis @ rest)  # once more for rounding
+        size = np.linalg.norm(rest)
+        if size > _MIN_INDEPENDENT_SHARE * np.linalg.norm(row):
+            basis = np.vstack([basis, rest / size])
+            found.append(joint)
+    return tuple(found)
+
+
+def _stroke_ranges(machine: Machine) -> Array:
+    """Ranges (n,) of the active coordinates, 1 where they are endless."""
+    span = machine.upper - machine.lower
+    return np.where(np.isfinite(span), span, 1.0)
+
+
+class MeasuredConfigurations:
+    """Where the joints that are used put a machine, at some samples.
+
+    Args:
+        machine: What was recorded.
+        table: Its quantities.
+
+    Attributes:
+        machine: Driven by them.
+        drives: Their names.
+        sample_slice: Which samples.
+        time: (N,) [s].
+    """
+
+    def __init__(self, machine: Machine, table: Table):
+        self.table, self.drives = table, determining_joints(machine, list(table.units))
+        self.sample_slice = slice(None, None, max(1, len(table.values) // _COMPARED_SAMPLES))
+        self.time = table_column(table, TIME)[self.sample_slice]
+        self._recorded_machine = machine
+
+    @cached_property
+    def machine(self) -> Machine:
+        """Driven by what is used."""
+        same = set(self.drives) == set(self._recorded_machine.active)
+        return (
+            self._recorded_machine
+            if same
+            else self._recorded_machine.with_active_joints(self.drives)
+        )
+
+    @cached_property
+    def q_b(self) -> Array:
+        """(N, n) as measured."""
+        machine = self.machine
+        columns = [
+            table_column(self.table, x, machine.unit(x))[self.sample_slice] for x in machine.active
+        ]
+        return np.column_stack(columns)
+
+    @cached_property
+    def q(self) -> Array:
+        """(N, nv) closed."""
+        return self.machine.closure.solve(self.q_b)
+
+    def expected_reading(self, name: str, q: Array | None = None) -> Array:
+        """(N,) of a joint or an inclination in these postures, or in others."""
+        q = self.q if q is None else q
+        return ideal_readings(self.machine, q, np.zeros_like(q), [name])[name]
+
+    def directional_derivative(self, name: str, q: Array, dq: Array) -> Array:
+        """(N,) of the same along changes (N, nv) of postures."""
+        return ideal_readings(self.machine, q, dq, [name + VELOCITY_SUFFIX])[
+            name + VELOCITY_SUFFIX
+        ]
+
+    @cached_property
+    def derivative_slice(self) -> slice:
+        """Samples enough for slopes, which are smooth."""
+        return slice(None, None, max(1, len(self.time) // _DERIVATIVE_SAMPLES))
+
+    @cached_property
+    def link_positions(self) -> dict[str, tuple[float, float, float]]:
+        """Of links on those that carry them [m]."""
+        return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
+
+    @cached_property
+    def pin_derivatives(self) -> dict[str, Array]:
+        """Derivatives of a few postures by the places of pins, see `pin_derivatives`."""
+        return pin_derivatives(self.machine, self.q[self.derivative_slice])
+
+
+def joint_motion(machine: Machine, table: Table) -> tuple[Array, Array]:
+    """Active coordinates and velocities (N, n) of what a table tells of the machine's joints.
+
+    Raises:
+        RecordingError: It does not tell all of them, or what the machine cannot do.
+    """
+    return motion_from_joints(machine, determining_joints(machine, list(table.units)), table)
+
+
+def motion_from_joints(
+    machine: Machine, drives: tuple[str, ...], table: Table
+) -> tuple[Array, Array]:
+    """Active coordinates and velocities (N, n) from those of the joints that were measured."""
+    time = table_column(table, TIME)
+    q_b = np.column_stack([table_column(table, x, machine.unit(x)) for x in drives])
+    v_b = np.empty_like(q_b)
+    for x, v, joint in zip(q_b.T, v_b.T, drives, strict=True):
+        v[:] = (
+            time_derivative(x, time)
+            if (recorded := recorded_velocity(machine, joint, table)) is None
+            else recorded
+        )
+    if set(drives) == set(machine.active):
+        order = [drives.index(x) for x in machine.active]
+        return q_b[:, order], v_b[:, order]
+    angles = ", ".join(x for x in drives if x not in machine.active)
+    hint = (
+        f"see that zero and sign of {angles} are the machine's, and that none of them counts from "
+        "the horizon (inclination_LINK)"
+    )
+    q_a, v_a = np.empty_like(q_b), np.empty_like(v_b)
+    try:
+        closure = machine.with_active_joints(drives).closure
+    except MechanismError as error:
+        raise RecordingError(f"{error}; {hint}") from None
+    for start in range(0, len(time), _BLOCK_SAMPLES):
+        block = slice(start, start + _BLOCK_SAMPLES)
+        try:
+            q_a[block], v_a[block], distance = _active_joint_motion(
+                machine, closure, q_b[block], v_b[block]
+            )
+        except ClosureError as error:
+            raise RecordingError(f"{_renumber_samples(start, error)}; {hint}") from None
+        if (distance > _CONFIGURATION_TOLERANCE).any():
+            raise RecordingError(
+                f"sample {start + int(np.argmax(distance > _CONFIGURATION_TOLERANCE))} is "
+                f"beyond a dead centre, where "
+                f"{', '.join(machine.active)} do not tell the posture: {hint}, or cut the "
+                "recording"
+            )
+    low, high = q_a.min(axis=0), q_a.max(axis=0)
+    slack = _LIMIT_TOLERANCE * _stroke_ranges(machine)
+    computed = np.array([x not in drives for x in machine.active])
+    outside = (low < machine.lower - slack) | (high > machine.upper + slack)
+    for i in np.flatnonzero(computed & outside):
+        raise RecordingError(
+            f"by {angles} '{machine.active[i]}' goes from {low[i]:.4g} to {high[i]:.4g} "
+            f"{machine.unit(machine.active[i])}, its limits are {machine.lower[i]:.4g} and "
+            f"{machine.upper[i]:.4g}: {hint}"
+        )
+    for v, joint in zip(v_a.T, machine.active, strict=True):
+        if (recorded := recorded_velocity(machine, joint, table)) is not None:
+            v[:] = recorded
+    return q_a, v_a
+
+
+def _active_joint_motion(
+    machine: Machine, closure: Closure, q_b: Array, v_b: Array
+) -> tuple[Array, Array, Array]:
+    """q_A and v_A = gamma_A v_B, and how far from the posture q_A leads (N,).
+
+    Args:
+        machine: Driven by q_A.
+        closure: Of the same machine driven by q_B.
+        q_b: (N, n).
+        v_b: (N, n).
+
+    Raises:
+        ClosureError: No posture has these coordinates.
+    """
+    q = closure.solve(q_b)
+    gamma = closure.gamma(q)[:, machine.closure.active]
+    q_a = q[:, machine.closure.active]
+    distance = np.abs(machine.closure.solve(q_a) - q).max(axis=1)
+    return q_a, np.einsum("nij,nj->ni", gamma, v_b), distance
+
+
+def _renumber_samples(start: int, error: ClosureError) -> str:
+    """What an error says of a block of samples, its samples counted from the first of all."""
+    return _SAMPLE_PATTERN.sub(lambda found: f"(sample {start + int(found[1])})", str(error))
+
+
+def recorded_velocity(machine: Machine, joint: str, table: Table) -> Array | None:
+    """A joint's velocity (N,) where it is recorded."""
+    if joint + VELOCITY_SUFFIX not in table.units:
+        return None
+    return table_column(table, joint + VELOCITY_SUFFIX, VELOCITY_UNITS[machine.unit(joint)])

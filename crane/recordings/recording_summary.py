@@ -1,0 +1,312 @@
+"""The few numbers that sum a recording up."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.common.scratch_arrays import compute_in_blocks, release_pages
+from crane.common.units import format_quantity
+from crane.description.machine_lookup import without_changes
+from crane.recordings.limit_cycles import ringing
+from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, Recording
+
+SUPPORT_PREFIX = "support_"
+_MIN_LIFT_DURATION = 0.05  # [s] in the air that is worth telling
+
+# Unit to read a coordinate in, and how many of it make one rad or m.
+DISPLAY_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1000.0)}
+
+
+@dataclass(frozen=True)
+class JointSummary:
+    """Extremes of one active joint, in SI units.
+
+    Attributes:
+        name: The joint.
+        unit: Unit of its coordinate, "rad" or "m".
+        lowest: Smallest coordinate.
+        highest: Largest coordinate.
+        peak_speed: Largest absolute velocity.
+        peak_force: Largest absolute force or torque; None where nothing drives the joint.
+        rms_force: Root of the time average of its square; likewise.
+        peak_error: Largest distance from the reference; None without one.
+        rms_error: Root of the time average of its square; None without one.
+    """
+
+    name: str
+    unit: str
+    lowest: float
+    highest: float
+    peak_speed: float
+    peak_force: float | None
+    rms_force: float | None
+    peak_error: float | None
+    rms_error: float | None
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """Extremes of a recording.
+
+    Attributes:
+        duration: From the first sample to the last [s].
+        joints: One entry per active joint.
+        tip_peak_error: Largest distance of the tip from its reference [m]; None without one.
+        tip_rms_error: Root of the time average of its square [m]; None without one.
+        stability_text: How far it is from tipping, in words, "" where that is not recorded.
+        balance_text: How far the balance of energy is off, see `energy_imbalance`, likewise.
+        ringing: Pressures that swing without decaying, see `limit_cycles`, likewise.
+        stopped: When and why it ended before its time, "" if it did not.
+        start: How it starts where that is not what the machine's file says.
+    """
+
+    duration: float
+    joints: tuple[JointSummary, ...]
+    tip_peak_error: float | None
+    tip_rms_error: float | None
+    stability_text: str = ""
+    balance_text: str = ""
+    ringing: str = ""
+    stopped: str = ""
+    start: str = ""
+
+    def to_markdown(self) -> str:
+        """A table with one row per joint, in degrees and millimetres, and what is to be said."""
+        head = (
+            "joint",
+            "range",
+            "peak speed",
+            "peak force",
+            "RMS force",
+            "peak error",
+            "RMS error",
+        )
+        rows = [head, ("---",) + ("---:",) * (len(head) - 1)]
+        for joint in self.joints:
+            unit, scale = DISPLAY_UNITS[joint.unit]
+            force = FORCE_UNITS[joint.unit]
+            rows.append(
+                (
+                    joint.name,
+                    f"{scale * joint.lowest:z.2f} to {scale * joint.highest:z.2f} {unit}",
+                    f"{scale * joint.peak_speed:.2f} {unit}/s",
+                    *(
+                        "free" if x is None else format_quantity(x, force, 4)
+                        for x in (joint.peak_force, joint.rms_force)
+                    ),
+                    _format_value(joint.peak_error, scale, unit),
+                    _format_value(joint.rms_error, scale, unit),
+                )
+            )
+        if self.tip_peak_error is not None:
+            errors = (
+                _format_value(x, 1e3, "mm") for x in (self.tip_peak_error, self.tip_rms_error)
+            )
+            rows.append(("tip", "", "", "", "", *errors))
+        table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+        balance = f"energy balance: {self.balance_text}" if self.balance_text else ""
+        start = f"starts {self.start}" if self.start else ""
+        end = f"**Stopped {self.stopped}**\n\n" if self.stopped else ""
+        below = (
+            f"{text}\n" for text in (start, self.stability_text, self.ringing, balance) if text
+        )
+        return end + "\n".join([table, *below])
+
+
+def tipping_message(recording: Recording) -> str:
+    """What to say of supports that lift, or would if they could, else nothing.
+
+    By the channels stability, stability_<line> and support_<name>, see
+    `crane.dynamics.tipping_stability`.
+    """
+    time, channels = recording.time, recording.channels
+    if "stability" not in channels:
+        return ""
+    names = [x.removeprefix(SUPPORT_PREFIX) for x in channels if x.startswith(SUPPORT_PREFIX)]
+    if any(f"work_{name}" in channels for name in names):  # contacts
+        lifted = {name: _lift_time(time, channels[SUPPORT_PREFIX + name]) for name in names}
+        words = [f"'{name}' at t = {at:.4g} s" for name, at in lifted.items() if at is not None]
+        return f"supports lift: {', '.join(words)}" if words else ""
+    if channels["stability"].min() >= 0:
+        return ""
+    first = int(np.argmax(channels["stability"] < 0))
+    lines = {x: channels[x] for x in channels if x.startswith("stability_")}
+    line = min(lines, key=lambda x: float(lines[x][first]))
+    return (
+        f"it would tip at t = {time[first]:.4g} s, where it is fixed all the same: {line} is "
+        f"{lines[line].min():.3g} N m at worst; let a machine that may tip float on contacts"
+    )
+
+
+def _lift_time(time: Array, force: Array) -> float | None:
+    """When what has stood is in the air for a while [s]."""
+    is_lifted = (force <= 0) & np.maximum.accumulate(force > 0)
+    edges = np.flatnonzero(np.diff(is_lifted.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    lift_starts = [
+        first
+        for first, behind in edges.tolist()
+        if time[behind - 1] - time[first] > _MIN_LIFT_DURATION
+    ]
+    return float(time[lift_starts[0]]) if lift_starts else None
+
+
+def _stability_text(recording: Recording) -> str:
+    if "stability" not in recording.channels:
+        return ""
+    shares, static_shares = (recording.channels[x] for x in ("stability", "static_stability"))
+    least = int(np.argmin(shares))
+    text = (
+        f"stability: at least {100 * shares[least]:.1f} % of the weight hold it down, at t = "
+        f"{recording.time[least]:.4g} s (at rest {100 * static_shares.min():.1f} %)"
+    )
+    tipping_text = tipping_message(recording)
+    return f"{text}; {tipping_text}" if tipping_text else text
+
+
+def result_title(machine: str, what: str = "") -> str:
+    """What results are headed with, as figures, pages and tables alike: "patu655: swing"."""
+    return ": ".join(word for word in (machine, what) if word)
+
+
+def recorded_machine_name(recording: Recording) -> str:
+    """Name of what a recording is of: the machine's own, or else of the file that it names."""
+    return recording.machine_name or Path(without_changes(recording.machine)).stem
+
+
+def label(recording: Recording) -> str:
+    """What a recording shows: its task, and until when where it was stopped."""
+    until = f"(stopped at {recording.time[-1]:.4g} s)" if recording.stopped else ""
+    return f"{recording.task} {until}".strip()
+
+
+def heading(recording: Recording) -> str:
+    """What its results are headed with."""
+    return result_title(recorded_machine_name(recording), label(recording))
+
+
+def summarize(recording: Recording) -> RecordingSummary:
+    """Ranges, peaks, RMS values and tracking errors of a recording.
+
+    Tracking errors need the channels reference_<joint> and reference_tip_x, _y, _z beside tip_x,
+    _y, _z.
+    """
+    time, channels = recording.time, recording.channels
+    joints = []
+    for i, name in enumerate(recording.joints):
+        release_pages()
+        q, v, tau = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
+        error = recording.error(name) if REFERENCE_PREFIX + name in channels else None
+        joints.append(
+            JointSummary(
+                name=name,
+                unit=recording.units[name],
+                lowest=float(q.min()),
+                highest=float(q.max()),
+                peak_speed=_peak(v),
+                peak_force=None if name in recording.free else _peak(tau),
+                rms_force=None if name in recording.free else rms(time, tau),
+                peak_error=None if error is None else _peak(error),
+                rms_error=None if error is None else rms(time, error),
+            )
+        )
+    distance = tip_error(recording)
+    return RecordingSummary(
+        duration=float(time[-1] - time[0]),
+        joints=tuple(joints),
+        tip_peak_error=None if distance is None else _peak(distance),
+        tip_rms_error=None if distance is None else rms(time, distance),
+        stability_text=_stability_text(recording),
+        balance_text=_balance_text(recording),
+        ringing=ringing(recording),
+        stopped=recording.stopped,
+        start=recording.start,
+    )
+
+
+def energy_imbalance(recording: Recording) -> Array | None:
+    """Energy (N,) that came from nowhere since the start [J], None where it is not recorded.
+
+    kinetic + potential + dissipated less work of the active forces and of the loads, less its
+    first value: zero but for the error of the integration. The work of a circuit's forces is in
+    `work`, see `oil_energy_imbalance` for where that comes from.
+    """
+    loads = [x for x in recording.channels if x.startswith("work_")]
+    return _energy_difference(recording, ("kinetic", "potential", "dissipated"), ("work", *loads))
+
+
+def oil_energy_imbalance(recording: Recording) -> Array | None:
+    """The same of a circuit: work + hydraulic_loss + oil_energy less pump_work (N,) [J]."""
+    return _energy_difference(recording, ("work", "hydraulic_loss", "oil_energy"), ("pump_work",))
+
+
+def _energy_difference(
+    recording: Recording, stored_channels: Sequence[str], supplied_channels: Sequence[str]
+) -> Array | None:
+    """What channels hold [J] beyond what was given since the start; None if one is not there."""
+    seen, units = recording.channels, recording.channel_units
+    if any(units.get(name) != "J" for name in (*stored_channels, *supplied_channels)):
+        return None
+
+    def since_start(names: Sequence[str], part: slice) -> Array:
+        return np.sum([seen[name][part] - seen[name][0] for name in names], axis=0)
+
+    return compute_in_blocks(
+        lambda part: (since_start(stored_channels, part) - since_start(supplied_channels, part))[
+            :, None
+        ],
+        len(recording.time),
+    )[:, 0]
+
+
+def _balance_text(recording: Recording) -> str:
+    balances = (
+        ("", energy_imbalance(recording)),
+        ("of the oil ", oil_energy_imbalance(recording)),
+    )
+    return ", ".join(
+        f"{what}off by at most {_peak(gap):.2g} J" for what, gap in balances if gap is not None
+    )
+
+
+def point_channel(recording: Recording, name: str) -> Array | None:
+    """The channels <name>_x, <name>_y, <name>_z as (N, 3) [m], None if one is not there."""
+    axes = [f"{name}_{axis}" for axis in "xyz"]
+    if any(axis not in recording.channels for axis in axes):
+        return None
+    columns = [recording.channels[axis] for axis in axes]
+    return compute_in_blocks(
+        lambda part: np.column_stack([x[part] for x in columns]), len(recording.time)
+    )
+
+
+def tip_error(recording: Recording) -> Array | None:
+    """Distance (N,) of the tip from its reference [m], None if one is not there."""
+    tip, reference = point_channel(recording, "tip"), point_channel(recording, "reference_tip")
+    if tip is None or reference is None:
+        return None
+    return compute_in_blocks(
+        lambda part: np.linalg.norm(tip[part] - reference[part], axis=1, keepdims=True), len(tip)
+    )[:, 0]
+
+
+def rms(time: Array, values: Array) -> float:
+    """Root of the time average of the square, by the trapezoidal rule.
+
+    Args:
+        time: Instants (N,) [s].
+        values: Samples (N,).
+    """
+    if len(time) == 1:
+        return float(abs(values[0]))
+    return float(np.sqrt(np.trapezoid(values**2, time) / (time[-1] - time[0])))
+
+
+def _peak(values: Array) -> float:
+    return float(np.max(np.abs(values)))
+
+
+def _format_value(value: float | None, scale: float, unit: str) -> str:
+    return "" if value is None else f"{scale * value:.3f} {unit}"

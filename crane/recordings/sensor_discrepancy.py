@@ -1,0 +1,413 @@
+"""Sensors that say more than is needed, compared through the machine's loops.
+
+Those that determine the posture put every other sensor where it should be. What it reads instead
+is explained by the simplest that leaves no more than noise, by least squares over the recording:
+a zero of the sensor or of one of those that determine it, then a delay, a scale, or a pin that is
+not where the file has it. Rates are compared as what they add up to, so that noise does not hide
+their zero.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from crane.common.errors import ClosureError, CraneWarning, MechanismError
+from crane.common.samples import Array
+from crane.description.sensors import (
+    INCLINATION_PREFIX,
+    SENSOR_PREFIX,
+    VELOCITY_SUFFIX,
+    Sensor,
+    quantity_unit,
+)
+from crane.machine import Machine
+from crane.recordings.inclination_angles import add_inclination_angles
+from crane.recordings.measured_configurations import MeasuredConfigurations
+from crane.recordings.recording_reader import known_sensors
+from crane.recordings.sensor_tolerances import AGREEMENT_TOLERANCE, tolerance
+from crane.recordings.timeseries import TIME, Table, table_column
+
+_NOISE_FACTORS = (
+    3.3,
+    2.0,
+)  # standard deviations that tell a difference, and that explain what is left
+_RANDOM_WALK_FACTOR = 1.5  # of what white noise adds up to, which it hardly spreads over
+_EQUIVALENT_FACTOR = 2.0  # times what the best explanation leaves
+_IMPROVEMENT_SHARE = 0.8  # of what a zero leaves, below which more is told
+_NEAR_BEST_FACTOR, _MAX_LISTED = 1.3, 2  # times the best of those, and how many
+_STANDSTILL_SHARE = 0.05  # of the motion that it should tell
+_MIN_MOTION_FACTOR = 4.0  # times what sensors may differ by, over which scale and delay show
+_ZERO_DERIVATIVE = 1e-6  # slope of what does not depend on something
+_MAX_ITERATIONS = 4  # of Gauss and Newton
+_DISPLAY_UNITS = {"rad": ("deg", 180 / np.pi), "m": ("mm", 1e3)}
+
+
+def warn_discrepancies(machine: Machine, table: Table) -> None:
+    """Warn where sensors of one quantity disagree through the machine's loops, a line each.
+
+    Joints and inclinations that are recorded beside the joints that determine the posture, and
+    rates, are compared with where these put them.
+    """
+    known = known_sensors(table, machine)
+    try:
+        configurations = MeasuredConfigurations(machine, add_inclination_angles(machine, table))
+        sensors = [
+            _RedundantSensor(configurations, name)
+            for name in _redundant_columns(machine, table, configurations.drives)
+        ]
+        messages = [
+            text
+            for pair in sensors
+            if (text := pair.discrepancy_message(known, list(table.units)))
+        ]
+    except (ClosureError, MechanismError):  # whoever closes the loops tells it
+        return
+    for text in messages:
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def _redundant_columns(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str]:
+    """Columns, in units of the machine, that the posture and its motion tell as well."""
+    found = []
+    for name, unit in table.units.items():
+        base = name.removesuffix(VELOCITY_SUFFIX)
+        is_determined = base in machine.joints or base.startswith(INCLINATION_PREFIX)
+        if is_determined and name not in drives and unit == quantity_unit(machine.tree, name):
+            found.append(name)
+    return found
+
+
+@dataclass(frozen=True)
+class _DiscrepancyCause:
+    """What may explain a difference.
+
+    Attributes:
+        sensor_parameters: By sensor its zero, scale and delay, on top of what is known of it.
+        residual_rms: Root mean square of what it leaves.
+        description: What it is.
+        pin_positions: By name where a pin would have to be [m].
+    """
+
+    sensor_parameters: dict[str, dict[str, float]]
+    residual_rms: float
+    description: str
+    pin_positions: dict[str, float] = field(default_factory=dict)
+
+    def format_parameters(self, known: Mapping[str, Sensor]) -> str:
+        """As machine files, notes and options take them."""
+        found = []
+        for name, now in self.sensor_parameters.items():
+            was = known.get(name, Sensor())
+            values = {
+                "zero": was.zero + was.scale * now.get("zero", 0.0),
+                "scale": was.scale * now.get("scale", 1.0),
+                "delay": was.delay + now.get("delay", 0.0),
+            }
+            found += [f"{SENSOR_PREFIX}{name}.{what} = {values[what]:.4g}" for what in now]
+        return ", ".join(
+            found + [f"{name} = {value:.4g}" for name, value in self.pin_positions.items()]
+        )
+
+
+class _RedundantSensor:
+    """One sensor beside what the others say of it.
+
+    Args:
+        configurations: Of those that are used.
+        name: Its column.
+    """
+
+    def __init__(self, configurations: MeasuredConfigurations, name: str):
+        self._configurations, self.name = configurations, name
+        self.time = configurations.time
+        self.quantity = name.removesuffix(VELOCITY_SUFFIX)
+        self.is_rate = self.quantity != name
+        self.unit = str(quantity_unit(configurations.machine.tree, self.quantity))
+        reading, random_walk = table_column(configurations.table, name), 0.0
+        if self.is_rate:
+            time = table_column(configurations.table, TIME)
+            random_walk = (
+                noise_std(reading) * float(time[-1] - time[0]) / float(np.sqrt(len(time)))
+            )
+            reading = _integral(time, reading)
+        self.measured = reading[configurations.sample_slice]
+        self.expected = configurations.expected_reading(self.quantity)
+        self.off = self.measured - self.expected
+        if self.is_rate:
+            self.off = self.off - self.off.mean()
+        elif self.unit == "rad":
+            self.off = self.off - 2 * np.pi * np.round(np.median(self.off) / (2 * np.pi))
+        noise = noise_std(self.off)
+        self.tolerance = tolerance(AGREEMENT_TOLERANCE, configurations.machine, self.unit)
+        # of what differs, and of what a cause may leave; noise that is added up walks at random
+        self.most = max(
+            self.tolerance, _NOISE_FACTORS[0] * noise, _RANDOM_WALK_FACTOR * random_walk
+        )
+        self.limit = max(self.tolerance, _NOISE_FACTORS[1] * noise, random_walk)
+
+    def discrepancy_message(
+        self, known: Mapping[str, Sensor], measured_columns: Sequence[str]
+    ) -> str:
+        """How they disagree, and why; "" where they do not.
+
+        Args:
+            known: What is known of the sensors.
+            measured_columns: Columns that were measured, whose zeros may explain it.
+        """
+        mean, spread = float(self.off.mean()), float(self.off.std())
+        if abs(mean) <= self.tolerance and spread <= self.most:
+            return ""
+        cause = self._explanation(known, measured_columns)
+        if self.is_rate and not cause:
+            return ""  # what it adds up to drifts for many reasons
+        unit, factor = _DISPLAY_UNITS[self.unit]
+        used = ", ".join(self._determining_joints)
+        if self.is_rate:
+            drift_rate = factor * float(self._fit_discrepancy([self.time])[0][0])
+            return (
+                f"sensors disagree: '{self.name}' is {drift_rate:+.3g} {unit}/s off on the mean "
+                f"against {used}: {cause}"
+            )
+        low, high = factor * self.off.min(), factor * self.off.max()
+        return (
+            f"sensors disagree: '{self.name}' is {factor * mean:+.3g} {unit} off on the mean "
+            f"({low:+.3g} to {high:+.3g} over the motion) against {used}: {cause}"
+        )
+
+    @property
+    def _determining_joints(self) -> list[str]:
+        """Joints that tell it."""
+        configurations = self._configurations
+        q = configurations.q[configurations.derivative_slice]
+        gamma = configurations.machine.closure.gamma(q)
+        derivatives = [
+            configurations.directional_derivative(self.quantity, q, g)
+            for g in np.moveaxis(gamma, 2, 0)
+        ]
+        pairs = zip(configurations.machine.active, derivatives, strict=True)
+        return [joint for joint, slope in pairs if np.abs(slope).max() > _ZERO_DERIVATIVE]
+
+    def _explanation(self, known: Mapping[str, Sensor], measured_columns: Sequence[str]) -> str:
+        """In words; of a rate "" where nothing explains it."""
+        own_zero, explanation_limit = self._zero_cause(), self.limit
+        zeros = sorted(
+            [own_zero, *self._drive_zero_causes(measured_columns)], key=lambda x: x.residual_rms
+        )
+        zero = (
+            zeros[0]
+            if zeros[0].residual_rms < _IMPROVEMENT_SHARE * own_zero.residual_rms
+            else own_zero
+        )
+        if zeros[0].residual_rms <= explanation_limit:
+            detection_limit = max(_EQUIVALENT_FACTOR * zeros[0].residual_rms, 0.2 * self.tolerance)
+            named = " or ".join(
+                x.format_parameters(known) for x in zeros if x.residual_rms <= detection_limit
+            )
+            return (
+                f"a constant offset explains it but for "
+                f"{self._format_residual(zeros[0].residual_rms)}, {named}"
+            )
+        if np.ptp(self.measured) < _STANDSTILL_SHARE * np.ptp(self.expected):
+            return "" if self.is_rate else "it does not move"
+        other_causes = sorted(
+            [*self._scale_and_delay_causes(), *self._pin_causes()], key=lambda x: x.residual_rms
+        )
+        if self.is_rate:
+            other_causes = [x for x in other_causes if x.residual_rms <= explanation_limit]
+            return self._format_causes([zero, other_causes[0]], known) if other_causes else ""
+        if absolute_angle := self._absolute_angle_hint(zero):
+            return absolute_angle
+        detection_limit = (
+            min(
+                _IMPROVEMENT_SHARE * zero.residual_rms,
+                max(explanation_limit, _NEAR_BEST_FACTOR * other_causes[0].residual_rms),
+            )
+            if other_causes
+            else 0.0
+        )
+        best = sorted(
+            (x for x in other_causes if x.residual_rms <= detection_limit),
+            key=lambda x: len(x.sensor_parameters),
+        )
+        rest = "" if best else ", and no delay, scale or pin explains the rest"
+        return self._format_causes([zero, *best[:_MAX_LISTED]], known) + rest
+
+    def _format_causes(self, causes: list[_DiscrepancyCause], known: Mapping[str, Sensor]) -> str:
+        first, *more = (
+            (x.description, self._format_residual(x.residual_rms), x.format_parameters(known))
+            for x in causes
+        )
+        texts = [f"{first[0]} leaves {first[1]} of it ({first[2]})"]
+        return ", ".join(texts + [f"{words} {left} ({numbers})" for words, left, numbers in more])
+
+    def _format_residual(self, residual_rms: float) -> str:
+        unit, factor = _DISPLAY_UNITS[self.unit]
+        return f"{factor * residual_rms:.2g} {unit}"
+
+    def _fit_discrepancy(
+        self, columns: list[Array], discrepancy: Array | None = None
+    ) -> tuple[Array, float]:
+        """Least squares of the difference (N,) over columns (N,), and what they leave."""
+        discrepancy = self.off if discrepancy is None else discrepancy
+        rate_columns = [np.ones_like(self.time)] if self.is_rate else []
+        A = np.column_stack([*columns, *rate_columns])
+        values: Array = np.asarray(np.linalg.lstsq(A, discrepancy, rcond=None)[0])
+        return values, float(np.sqrt(np.mean((discrepancy - A @ values) ** 2)))
+
+    @property
+    def _zero_column(self) -> Array:
+        """(N,) what a zero adds."""
+        return self.time - self.time[0] if self.is_rate else np.ones_like(self.time)
+
+    def _zero_cause(self) -> _DiscrepancyCause:
+        values, residual_rms = self._fit_discrepancy([self._zero_column])
+        return _DiscrepancyCause(
+            {self.name: {"zero": float(values[0])}}, residual_rms, "a constant offset"
+        )
+
+    def _scale_and_delay_causes(self) -> list[_DiscrepancyCause]:
+        """A zero with a delay, and with a scale."""
+        if np.ptp(self.expected) < _MIN_MOTION_FACTOR * self.tolerance:
+            return []
+        (zero, change, *_), residual_rms = self._fit_discrepancy(
+            [self._zero_column, self.expected]
+        )
+        numbers = {"zero": float(zero), "scale": 1.0 + float(change)}
+        found = [_DiscrepancyCause({self.name: numbers}, residual_rms, "a scale besides")]
+        delay = 0.0
+        for _ in range(_MAX_ITERATIONS):
+            delayed = np.interp(self.time - delay, self.time, self.expected)
+            discrepancy = self.off + self.expected - delayed
+            derivative = -np.gradient(delayed, self.time)
+            (zero, change, *_), residual_rms = self._fit_discrepancy(
+                [self._zero_column, derivative], discrepancy
+            )
+            delay += float(change)
+        if delay > 0:  # a sensor does not know what comes
+            numbers = {"zero": float(zero), "delay": delay}
+            found.append(_DiscrepancyCause({self.name: numbers}, residual_rms, "a delay besides"))
+        return found
+
+    def _drive_zero_causes(self, measured_columns: Sequence[str]) -> list[_DiscrepancyCause]:
+        """Zeros of what is used, one at a time, by Gauss and Newton's method."""
+        found = []
+        drives = self._configurations.machine.active
+        for i, joint in enumerate(drives if not self.is_rate else ()):
+            if joint not in measured_columns:
+                continue
+            zero, residual_rms = 0.0, np.inf
+            try:
+                for _ in range(_MAX_ITERATIONS):
+                    shifted = self._configurations.q_b.copy()
+                    shifted[:, i] -= zero
+                    q = self._configurations.machine.closure.solve(shifted)
+                    discrepancy = (
+                        self.off
+                        + self.expected
+                        - self._configurations.expected_reading(self.name, q)
+                    )
+                    residual_rms = float(np.sqrt(np.mean(discrepancy**2)))
+                    gamma = self._configurations.machine.closure.gamma(q)
+                    derivative = -self._configurations.directional_derivative(
+                        self.name, q, gamma[:, :, i]
+                    )
+                    if np.abs(derivative).max() < _ZERO_DERIVATIVE:
+                        break
+                    zero += float(derivative @ discrepancy / (derivative @ derivative))
+            except ClosureError:
+                continue
+            found.append(
+                _DiscrepancyCause({joint: {"zero": zero}}, residual_rms, "a constant offset")
+            )
+        return found
+
+    def _pin_causes(self) -> list[_DiscrepancyCause]:
+        """The place of a pin, alone or with a zero, to first order: of each the least move."""
+        configurations = self._configurations
+        q, time = (
+            configurations.q[configurations.derivative_slice],
+            self.time[configurations.derivative_slice],
+        )
+        found: dict[str, list[tuple[float, _DiscrepancyCause]]] = {}
+        for name, dq in configurations.pin_derivatives.items() if not self.is_rate else ():
+            sampled_derivative = configurations.directional_derivative(self.name, q, dq)
+            if np.abs(sampled_derivative).max() < _ZERO_DERIVATIVE:
+                continue
+            link, _, axis = name.rpartition(".")
+            position = configurations.link_positions[link]["xyz".index(axis)]
+            derivative = np.interp(self.time, time, sampled_derivative)
+            (move, zero), residual_rms = self._fit_discrepancy([derivative, self._zero_column])
+            (move_alone,), residual_without_zero = self._fit_discrepancy([derivative])
+            if residual_without_zero <= max(_NEAR_BEST_FACTOR * residual_rms, self.limit):
+                move, zero_parameters, residual_rms, description = (
+                    move_alone,
+                    {},
+                    residual_without_zero,
+                    "a pin elsewhere alone",
+                )
+            else:
+                zero_parameters, description = (
+                    {self.name: {"zero": float(zero)}},
+                    "a pin elsewhere besides",
+                )
+            cause = _DiscrepancyCause(
+                zero_parameters, residual_rms, description, {name: float(position + move)}
+            )
+            found.setdefault(link, []).append((abs(float(move)), cause))
+        return [_smallest_pin_move(causes, self.limit) for causes in found.values()]
+
+    def _absolute_angle_hint(self, best: _DiscrepancyCause) -> str:
+        """That an angle counts from the horizon and is taken for that of a joint, if it does."""
+        configurations, joints = self._configurations, self._configurations.machine.tree.joints
+        if self.unit != "rad":
+            return ""
+        if self.quantity.startswith(INCLINATION_PREFIX):
+            link = self.quantity.removeprefix(INCLINATION_PREFIX)
+            pairs = [
+                (
+                    joint,
+                    table_column(configurations.table, joint)[configurations.sample_slice],
+                    self.measured,
+                )
+                for joint in configurations.drives
+                if joints[joint].child == link and joints[joint].kind == "revolute"
+            ]
+        else:
+            link = joints[self.quantity].child
+            pairs = [
+                (
+                    self.quantity,
+                    self.measured,
+                    configurations.expected_reading(INCLINATION_PREFIX + link),
+                )
+            ]
+        for joint, angle, inclination in pairs:
+            for sign_text, sign in (("", 1.0), (" with its sign turned", -1.0)):
+                residual_std = float(np.std(angle - sign * inclination))
+                if residual_std <= self.limit < best.residual_rms:
+                    what = f"'{joint}' follows the inclination of '{link}' against the horizon"
+                    name = f"an absolute angle is called '{INCLINATION_PREFIX}{link}'{sign_text}"
+                    return f"{what} within {self._format_residual(residual_std)}, {name}"
+        return ""
+
+
+def _smallest_pin_move(
+    causes: list[tuple[float, _DiscrepancyCause]], limit: float
+) -> _DiscrepancyCause:
+    """Of moves of one pin that explain about as much, the smallest."""
+    max_residual = max(limit, _NEAR_BEST_FACTOR * min(cause.residual_rms for _, cause in causes))
+    similar = [(move, cause) for move, cause in causes if cause.residual_rms <= max_residual]
+    return min(similar, key=lambda pair: (len(pair[1].sensor_parameters), pair[0]))[1]
+
+
+def noise_std(x: Array) -> float:
+    """Standard deviation of white noise on a smooth signal (N,), by its second differences."""
+    return float(np.median(np.abs(np.diff(x, 2)))) / 1.65 if len(x) > 2 else 0.0
+
+
+def _integral(time: Array, rate: Array) -> Array:
+    """Integral (N,) of a rate (N,), by trapezia."""
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,0 +1,198 @@
+"""A machine's formulas as functions of CasADi, for optimal control and estimation."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics
+from crane.codegen import Scalar, Tape
+from crane.codegen.casadi_expressions import casadi_expressions
+from crane.codegen.symbolic import add_vectors, matvec, subtract_vectors, transpose
+from crane.common.errors import InputError, MechanismError, suggest_names
+from crane.common.optional_libraries import import_optional_library
+from crane.control import ValveDrive, ValveSignals
+from crane.dynamics import Dynamics
+from crane.dynamics.compiled_dynamics import QUANTITIES, WITH_FRICTION
+from crane.dynamics.dynamics import QUANTITY_ARGUMENTS
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
+from crane.dynamics.joint_forces import find_stick_slip_columns
+from crane.formats import load
+from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.machine import Machine
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.machine_formulas import controller_settings, trace_machine
+from crane.simulation.integration.state_layouts import state_layout
+
+_KINEMATIC_QUANTITIES = ("loops", "gamma", "tip")  # what depends on q alone
+_SIMULATION_QUANTITY = "simulation"
+
+FormulaOutputs = dict[str, tuple[Sequence[Scalar], tuple[int, ...]]]  # formulas and their shapes
+
+
+def casadi_function(
+    machine: Machine | str | Path, quantity: str, *, friction: bool = False
+) -> Any:
+    """A quantity of a machine as a `casadi.Function`, generated from the formulas of its programs.
+
+    All coordinates q of the spanning tree are an argument, in the order of `machine.joints`, not
+    the active ones alone: the loops are no part of the function but equations `loops`, phi(q) = 0,
+    for the optimisation to hold. So the branch is the one that its variables are on, where an
+    iteration inside might end on another; and a function is one expression, of which CasADi has
+    exact sparse derivatives of any order, and makes code. Along the closed machine
+
+        d f / d q_A = (df/dq) gamma,    q' = gamma v_A,
+
+    but for a base that floats, whose q holds a rotation vector. Where only q_A is wanted,
+    `casadi.rootfinder` makes q_P from `loops`.
+
+    | quantity | arguments | result |
+    |---|---|---|
+    | "loops" | q | phi (r,) of the independent equations |
+    | "gamma" | q | dq/dq_A (nq, n) |
+    | "tip" | q | place of the tip (3,) [m] |
+    | "inverse", "regressor" | q, v_a, a_a | as `Dynamics` |
+    | "forward" | q, v_a, tau_a | as `Dynamics` |
+    | "mass_matrix", "gravity" | q | as `Dynamics` |
+    | "bias", "friction", "passive" | q, v_a | as `Dynamics` |
+    | "energy" | q, v_a | kinetic, potential (2,) [J] |
+    | "simulation" | q, v_a, circuit, signals | what a machine with valves is simulated by |
+
+    "simulation" gives the rates q_rate (nq,), a_a (n,), circuit_rate of the states of
+    `crane.hydraulics.CircuitEquations` (`ValveDrive(machine, command).circuit.states` names them,
+    its `start` has those at rest) and balance_rate (6,) of the oil's and the energy's balances, in
+    `crane.hydraulics.circuit_equations.BALANCE_UNITS`. `signals` are those of the valves [V].
+
+    Args:
+        machine: The machine, or what `crane.load` takes.
+        quantity: See above.
+        friction: Whether inverse or forward dynamics have friction.
+
+    Raises:
+        InputError: Unknown quantity, no CasADi, no tip, no valves, or friction that sticks, whose
+            accelerations jump, in "simulation".
+        MechanismError: Its formulas are too long.
+    """
+    ca = import_optional_library("casadi", "a symbolic function")
+    if not isinstance(machine, Machine):
+        machine = load(machine)
+    names = [*_KINEMATIC_QUANTITIES, *QUANTITY_ARGUMENTS, _SIMULATION_QUANTITY]
+    if quantity not in names:
+        raise InputError(f"quantity '{quantity}' is unknown, {suggest_names(names, quantity)}")
+    if friction and quantity not in ("inverse", "forward"):
+        raise InputError(f"'{quantity}' is without friction or with its own, leave friction out")
+    if not machine.closure.is_compiled:
+        raise MechanismError(f"'{machine.name}' is too large to have formulas: lock joints")
+    if quantity == _SIMULATION_QUANTITY:
+        sizes, arguments, outputs = _simulation_quantity(machine)
+    else:
+        sizes, arguments, outputs = _dynamics_quantity(machine, quantity, friction)
+    symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    flat = [x for formulas, _ in outputs.values() for x in formulas]
+    inputs = [_casadi_argument(ca, symbols, one) for one in arguments]
+    values, results = casadi_expressions(flat, inputs), []
+    for formulas, shape in outputs.values():
+        part = ca.vertcat(*values[: len(formulas)]) if formulas else ca.SX(0, 1)
+        values = values[len(formulas) :]
+        results.append(ca.reshape(part, shape[1], shape[0]).T if len(shape) == 2 else part)
+    return ca.Function(quantity, list(symbols.values()), results, list(sizes), list(outputs))
+
+
+def _casadi_argument(ca: Any, symbols: dict[str, Any], argument: Any) -> Any:
+    """What stands for an argument of the tape: numbers, or parts named in a tuple."""
+    if not isinstance(argument, tuple):
+        return argument
+    return [x for name in argument for x in ca.vertsplit(symbols[name])]
+
+
+def _dynamics_quantity(
+    machine: Machine, quantity: str, friction: bool
+) -> tuple[dict[str, int], list[Any], FormulaOutputs]:
+    """Sizes of the arguments, what the tape's are, and formulas."""
+    fast, tape, n = machine.closure.compiled_closure, Tape(), len(machine.active)
+    q, kinematics, loops = fast.trace_kinematics(tape, 0, 1)
+    geometry = fast.geometry.constants
+    if quantity in _KINEMATIC_QUANTITIES:
+        formulas, shape = _kinematic_quantity(machine, quantity, kinematics, loops)
+        return {"q": len(q)}, [geometry, ("q",)], {quantity: (formulas, shape)}
+    dynamics = Dynamics(machine)
+    constants = FormulaConstants(tape, 2, dynamics.constant_pattern)
+    names = QUANTITY_ARGUMENTS[quantity][1:]
+    v_a, x = tape.load_vector(3, 0, n), tape.load_vector(4, 0, n)
+    dynamics_formulas = DynamicsFormulas(
+        kinematics, loops, constants, q, v_a, dynamics.formula_structure
+    )
+    formulas = QUANTITIES[quantity.replace("_", " ") + WITH_FRICTION * friction](
+        dynamics_formulas, x
+    )
+    zeros = [0.0] * n
+    arguments = [geometry, ("q",), dynamics.numbers, *((name,) for name in names)]
+    arguments += [zeros] * (2 - len(names))
+    sizes = {"q": len(q)} | dict.fromkeys(names, n)
+    return sizes, arguments, {quantity: (formulas, dynamics.result_shape(quantity))}
+
+
+def _kinematic_quantity(
+    machine: Machine, quantity: str, kinematics: PositionKinematics, loops: LoopFormulas
+) -> tuple[list[Scalar], tuple[int, ...]]:
+    if quantity == "loops":
+        return [row.phi for row in loops.rows], (len(loops.rows),)
+    if quantity == "gamma":
+        rows = [loops.gamma[i] for i in range(1, machine.model.nv + 1)]
+        return [x for row in rows for x in row], (machine.model.nv, len(machine.active))
+    if machine.tip is None:
+        raise InputError(f"'{machine.name}' has no tip, name a link as its tip")
+    frame = machine.model.frames[machine.frame(machine.tip)]
+    body = machine.coordinates.body_of_joint[frame.parentJoint]
+    rotation = machine.closure.compiled_closure.geometry.body_rotations[body]
+    offset = (rotation.T @ frame.placement.translation).tolist()
+    place = add_vectors(kinematics.origin[body], matvec(kinematics.rotation[body], offset))
+    # formulas are seen from the trunk, which may be another body than the world
+    return matvec(
+        transpose(kinematics.rotation[0]), subtract_vectors(place, kinematics.origin[0])
+    ), (3,)
+
+
+def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], FormulaOutputs]:
+    """The same of what `crane.simulate` integrates."""
+    for column in find_stick_slip_columns(machine):
+        joint = machine.joints[column]
+        raise InputError(
+            f"friction of '{joint}' sticks, so that accelerations jump: say over which "
+            f"velocity it turns, as friction.{joint}.smoothing=2e-3"
+        )
+    # the signals are a command's references
+    drive = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
+    chart, layout = (
+        Chart.from_dynamics(Dynamics(machine)),
+        state_layout(machine, drive.circuit.state_count),
+    )
+    tape, m = Tape(), len(drive.circuit.spools)
+    formulas = trace_machine(chart, tape, layout, 4, [])
+    # zeros among the settings are parts that the circuit has not
+    inputs = formulas.controller_inputs(
+        controller_settings(drive, tape, 2, True), tape.load_vector(3, 0, m)
+    )
+    tau, rates = drive.trace(inputs)
+    formulas = formulas.with_circuit_friction(drive, inputs)
+    accelerations, stiff_state_count = (
+        formulas.accelerations(tau, with_joints_at_rest=False),
+        drive.circuit.stiff_state_count,
+    )
+    numbers = (
+        machine.closure.compiled_closure.geometry.constants,
+        chart.dynamics.numbers,
+        drive.settings,
+    )
+    sizes = {
+        "q": machine.model.nv,
+        "v_a": len(machine.active),
+        "circuit": stiff_state_count,
+        "signals": m,
+    }
+    outputs: FormulaOutputs = {
+        "q_rate": (formulas.dynamics_formulas.coordinate_derivatives, (machine.model.nv,)),
+        "a_a": (accelerations.a_a, (len(machine.active),)),
+        "circuit_rate": (rates[:stiff_state_count], (stiff_state_count,)),
+        "balance_rate": (rates[stiff_state_count:], (len(BALANCE_UNITS),)),
+    }
+    return sizes, [*numbers, ("signals",), ("q", "v_a", "circuit")], outputs

@@ -1,0 +1,102 @@
+"""Motion across postures in which a linkage could go on in several ways.
+
+Where links come in line (a parallelogram folded flat, a slider crank of equal lengths) the loop
+equations lose rank: several branches of motion cross, and no coordinates lead through. The motion
+is smooth along its own branch, so state and observations are polynomials of time there: their
+rates at instants before, and then at one behind the crossing, are integrated across it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.machine import Machine
+
+NODES_BEFORE = 7  # instants before the crossing
+STEPS_BEFORE, STEPS_BEHIND = 2, 4  # steps between the last of them and the crossing, and behind it
+NODES_BEHIND = 3  # nodes behind it
+MAX_MOTION_PER_STEP = 1e-2  # way of the fastest joint in a step [rad], share of the machine's size
+MAX_RELATIVE_RANK = 0.05  # rank of the loop equations there, as a share of that at home
+_CORRECTOR_ITERATIONS = 6
+
+RateFunction = Callable[[float, Array], tuple[Array, Array]]
+"""(time, state) -> rate of the state, observations."""
+
+
+def relative_rank(machine: Machine, q: Array) -> float:
+    """Least singular value of the loop equations at a posture (nq,), as a share of the largest."""
+    equations, rows = machine.closure.equations, machine.closure.structure.independent_rows
+    scaled_jacobian = equations.evaluate(q)[1][rows] * equations.motion_scales
+    values = np.linalg.svd(scaled_jacobian, compute_uv=False)
+    return float(values[-1] / values[0]) if len(values) else 1.0
+
+
+@dataclass(frozen=True)
+class CrossingPolynomial:
+    """State and observations as polynomials of time.
+
+    Attributes:
+        times: (k,) nodes [s].
+        start_state: State at the last node before the crossing.
+        rates: (k, size) of the state at the nodes.
+        outputs: (k, .) observations there.
+        nodes_before: Number of nodes before the crossing.
+    """
+
+    times: Array
+    start_state: Array
+    rates: Array
+    outputs: Array
+    nodes_before: int
+
+    def state_at(self, time: float) -> Array:
+        """The state at an instant [s]."""
+        origin = self.times[self.nodes_before - 1]
+        unit = self.times[self.nodes_before - 1] - self.times[self.nodes_before - 2]
+        at, until = (self.times - origin) / unit, (time - origin) / unit
+        powers = np.arange(len(at))
+        weights = np.linalg.solve(
+            (at[:, None] ** powers).T, until ** (powers + 1.0) / (powers + 1.0)
+        )
+        found: Array = self.start_state + unit * (weights @ self.rates)
+        return found
+
+    def outputs_at(self, time: float) -> Array:
+        """What is observed at an instant [s]."""
+        unit = self.times[1] - self.times[0]
+        at, until = (self.times - time) / unit, np.zeros(len(self.times))
+        until[0] = 1.0
+        found: Array = np.linalg.solve((at[:, None] ** np.arange(len(at))).T, until) @ self.outputs
+        return found
+
+
+def extrapolate_states(times: Array, states: Array, rate: RateFunction) -> CrossingPolynomial:
+    """The path that goes on from states (k, size) at times (k,) [s]."""
+    rates_and_outputs = [rate(time, state) for time, state in zip(times, states, strict=True)]
+    rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
+    return CrossingPolynomial(times, states[-1], rates, outputs, len(times))
+
+
+def correct_polynomial(
+    polynomial: CrossingPolynomial, time: float, rate: RateFunction
+) -> CrossingPolynomial:
+    """The path with the rates at an instant [s] behind the crossing and after it among its nodes.
+
+    Then it is interpolation that leads across, not extrapolation, which errors grow in.
+    """
+    original, unit = polynomial, polynomial.times[1] - polynomial.times[0]
+    node_times_behind = time + unit * np.arange(NODES_BEHIND)
+    times = np.append(polynomial.times, node_times_behind)
+    for _ in range(_CORRECTOR_ITERATIONS):
+        rates_and_outputs = [rate(one, polynomial.state_at(one)) for one in node_times_behind]
+        rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
+        polynomial = CrossingPolynomial(
+            times,
+            original.start_state,
+            np.vstack([original.rates, rates]),
+            np.vstack([original.outputs, outputs]),
+            original.nodes_before,
+        )
+    return polynomial

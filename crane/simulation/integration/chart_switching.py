@@ -1,0 +1,438 @@
+"""Motion through dead centres: in other coordinates where those at hand fail."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Protocol
+
+import numpy as np
+
+from crane.codegen import Scalar, Tape
+from crane.common.samples import Array
+from crane.common.threads import single_threaded_blas
+from crane.control import Controller, ControllerInputs, TracedController, ValveDrive
+from crane.simulation.integration.branch_crossing import (
+    MAX_MOTION_PER_STEP,
+    MAX_RELATIVE_RANK,
+    NODES_BEFORE,
+    STEPS_BEFORE,
+    STEPS_BEHIND,
+    CrossingPolynomial,
+    correct_polynomial,
+    extrapolate_states,
+    relative_rank,
+)
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.integration_halt import IntegrationHaltError
+from crane.simulation.integration.python_stepper import PythonStepper, StepProgress
+from crane.simulation.integration.state_layouts import row_layout
+
+_LIMIT_RELAXATION = np.array([2.0, 0.1])  # how limits move where nothing is better
+_MAX_RECENT_STATES = 500  # states that are kept
+_CONFIGURATION_TOLERANCE = 1e-6  # rad, machine's size, between a posture as foreseen and as closed
+_DEAD_CENTRE_IMPROVEMENT = 10.0  # how many times better others are at a dead centre
+_HALT_IMPROVEMENT = (
+    1.5  # how many times better other coordinates are that are tried where it halts
+)
+
+
+class ChartIntegrator(Protocol):
+    """An integrator in one chart, such as `FixedStepIntegrator` or `ScipyIntegrator`."""
+
+    done: int
+    offset: float  # when the state is, after the next instant without a row [s]
+    python_stepper: PythonStepper
+
+    @property
+    def next_instant(self) -> int:
+        """See `FixedStepIntegrator`."""
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+    ) -> int:
+        """See `FixedStepIntegrator.run`."""
+
+    def final_row(self, time: float, state: Array) -> Array:
+        """See `FixedStepIntegrator.final_row`."""
+
+    def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
+        """See `FixedStepIntegrator.find_finer_step`."""
+
+    def set_chart_limits(self, limits: Array) -> None:
+        """See `FixedStepIntegrator.set_chart_limits`."""
+
+
+class ChartSwitchingIntegrator:
+    """Steps in the user's coordinates, and in others where these come to a dead centre.
+
+    Rows are in the user's coordinates throughout: a velocity of theirs is C v_B, a friction of
+    theirs C^-T times that of the chart, see `crane.simulation.integration.charts`.
+
+    Args:
+        chart: The machine in the user's coordinates.
+        control: Its controller.
+        controller_state_count: Number of the controller's states.
+        make_integrator: What integrates in a chart.
+
+    Attributes:
+        done: Number of instants that have their row, after a run or where it halted.
+        notes: What is to be said of the motion.
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        control: Controller,
+        controller_state_count: int,
+        make_integrator: Callable[[Chart], ChartIntegrator],
+    ):
+        self._make_integrator, self._control = make_integrator, control
+        self._chart, self._integrator = chart, make_integrator(chart)
+        self._chart_limits = chart.chart_limits
+        self._known_integrators = [(chart, self._integrator)]
+        self._row_layout = row_layout(chart.machine, control, controller_state_count)
+        self._segment_start = self.done = 0
+        self._recent_states = np.zeros((0, self._row_layout.start_index("tau")))
+        self.notes: list[str] = []
+        self._orientation, self._has_passed_dead_centre = 1.0, False
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+    ) -> None:
+        """Integrate from each time to the next; arguments as of `FixedStepIntegrator.run`.
+
+        Raises:
+            HaltedError: The machine cannot go on, in no coordinates.
+        """
+        with single_threaded_blas(self._chart.machine.model.nv):
+            self._run(times, state, step, rows, progress)
+
+    def _run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress
+    ) -> None:
+        i = self.done = 0
+        while i < len(times) or self._integrator.offset < 0:
+            self._segment_start, halt = i, None
+            steps_made = self._integrator.done = 0
+            try:
+                steps_made = self._integrator.run(
+                    times[i:], state, step, rows[i:], self._progress_from(i, progress)
+                )
+            except IntegrationHaltError as error:
+                steps_made, halt = self._integrator.next_instant, error
+            finally:  # also where it is interrupted
+                self.done = i + self._integrator.done
+                last = rows[
+                    i + max(steps_made - _MAX_RECENT_STATES, 0) : i + steps_made, : len(state)
+                ]
+                self._recent_states = np.vstack([self._recent_states, last])[-_MAX_RECENT_STATES:]
+                self._to_user_coordinates(times[i : self.done], rows[i : self.done])
+            i += steps_made
+            if i == len(times) and not self._integrator.offset < 0:
+                continue
+            if self._switch_chart(times[0] + i * step, state, halt):
+                continue
+            next_index = self._pass_branch_crossing(times, i, state, step, rows)
+            if next_index is not None:
+                i = next_index
+            elif halt is not None:
+                raise halt
+            else:
+                self._chart_limits = self._chart_limits * _LIMIT_RELAXATION
+                self._integrator.set_chart_limits(self._chart_limits)
+
+    def final_row(self, time: float, state: Array) -> Array:
+        """See `FixedStepIntegrator.final_row`."""
+        row = self._integrator.final_row(time, state)
+        self._to_user_coordinates(np.array([time]), row[None])
+        return row
+
+    def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
+        """See `FixedStepIntegrator.find_finer_step`."""
+        if not self._chart.has_user_coordinates:
+            return 0.0
+        return self._integrator.find_finer_step(
+            times[self._segment_start :], rows[self._segment_start :], step
+        )
+
+    def _progress_from(self, first: int, progress: StepProgress) -> StepProgress:
+        return None if progress is None else lambda done: progress(first + done)
+
+    def _switch_chart(self, time: float, state: Array, halt: IntegrationHaltError | None) -> bool:
+        """Whether there are better coordinates, which the state then is in."""
+        at = self._row_layout.view(np.resize(state, self._row_layout.size))
+        chart = self._chart
+        better_chart = (
+            chart.find_better_chart(at.q)
+            if halt is None
+            else chart.find_better_chart(at.q, _HALT_IMPROVEMENT)
+        )
+        if better_chart is None:
+            return False
+        if self._uses_inverse_dynamics:
+            if (
+                halt is not None
+                and chart.find_better_chart(at.q, _DEAD_CENTRE_IMPROVEMENT) is not None
+            ):
+                raise self._dead_centre_error(time, at.q, better_chart)
+            return False
+        orientation = self._orientation * self._orientation_at(at.q)
+        self._enter_chart(self._find_integrator(better_chart, at.q), self._integrator.offset)
+        self._orientation = orientation * self._orientation_at(at.q)
+        self._recent_states = self._transform_states(
+            np.vstack([self._recent_states, state]), chart
+        )
+        state[:], self._recent_states = self._recent_states[-1], self._recent_states[:-1]
+        return True
+
+    def _pass_branch_crossing(
+        self, times: Array, i: int, state: Array, step: float, rows: Array
+    ) -> int | None:
+        """Go on across a posture where branches of motion cross, if there is one ahead.
+
+        Args:
+            times: See `run`.
+            i: The first instant not before the state.
+            state: Replaced by that at the instant that is returned, if it is one.
+            step: [s].
+            rows: See `run`.
+
+        Returns:
+            The first instant behind the crossing.
+        """
+        chart, integrator, size, recent = (
+            self._chart,
+            self._integrator,
+            len(state),
+            self._recent_states,
+        )
+        machine, now = chart.machine, times[0] + i * step + integrator.offset
+        prediction = self._predict_crossing(now, state, times[0] + (i - 1) * step)
+        if prediction is None:
+            return None
+        crossing, speed = prediction
+        share = max(1, int(np.ceil(step * speed / MAX_MOTION_PER_STEP)))
+        stride = max(
+            1,
+            min(
+                int(np.ceil(MAX_MOTION_PER_STEP / (step * speed))),
+                len(recent) // (NODES_BEFORE + STEPS_BEFORE),
+            ),
+        )
+        fine_step = step / share
+        last_node_time = crossing - STEPS_BEFORE * stride * fine_step
+        first = int((last_node_time - NODES_BEFORE * stride * fine_step - times[0]) // step)
+        if not i - len(recent) <= first < i:
+            return None
+        # again up to it, with nodes far enough from it
+        saved_state, offset = state.copy(), integrator.offset
+        state[:], integrator.offset = recent[first - i], 0.0
+        integrator.set_chart_limits(np.array([np.inf, -np.inf]))
+        instants = np.arange(times[first], last_node_time, fine_step)
+        fine_rows = np.empty((len(instants), rows.shape[1]))
+        steps_made = 0
+        with suppress(IntegrationHaltError):
+            steps_made = integrator.run(instants, state, fine_step, fine_rows)
+        integrator.set_chart_limits(self._chart_limits)
+        behind_time = float(crossing + STEPS_BEHIND * stride * fine_step)
+        if steps_made == len(instants):
+            nodes = slice(len(instants) - 1 - (NODES_BEFORE - 1) * stride, None, stride)
+            path = extrapolate_states(
+                instants[nodes], fine_rows[nodes, :size], integrator.python_stepper.observe
+            )
+            q = self._row_layout.view(
+                np.resize(path.state_at(behind_time), self._row_layout.size)
+            ).q
+            crossed_chart = chart.chart_with_columns(q, machine.closure.active)
+            units = machine.closure.units
+            if (
+                crossed_chart is not None
+                and np.abs((crossed_chart.machine.home - q) / units).max()
+                < _CONFIGURATION_TOLERANCE
+            ):
+                self._enter_chart(self._find_integrator(crossed_chart, q), 0.0)
+                path = correct_polynomial(
+                    path, behind_time, self._integrator.python_stepper.observe
+                )
+                return self._record_crossing(
+                    path, behind_time, fine_step, times, state, step, rows
+                )
+        state[:], integrator.offset = saved_state, offset
+        return None
+
+    def _predict_crossing(
+        self, now: float, state: Array, last_time: float
+    ) -> tuple[float, float] | None:
+        """When branches cross ahead of a state, and how fast the fastest joint moves there.
+
+        Args:
+            now: Time of the state [s].
+            state: The state.
+            last_time: Time of the last of the recent states [s].
+        """
+        chart, closure = self._chart, self._chart.machine.closure
+        if not closure.is_compiled or not len(self._recent_states):
+            return None
+        at, last = (
+            self._row_layout.view(np.resize(one, self._row_layout.size))
+            for one in (state, self._recent_states[-1])
+        )
+        determinant, last_determinant = (
+            closure.compiled_closure.least_determinant(at.q),
+            closure.compiled_closure.least_determinant(last.q),
+        )
+        if not (now > last_time and 0.0 < determinant < last_determinant):
+            return None
+        time_to_crossing = determinant / (last_determinant - determinant) * (now - last_time)
+        v = closure.gamma(at.q) @ at.v_a
+        speed = float(np.abs(v / closure.units).max())
+        home = self._known_integrators[0][0].machine
+        is_singular = relative_rank(
+            chart.machine, at.q + time_to_crossing * v
+        ) < MAX_RELATIVE_RANK * relative_rank(home, home.home)
+        return (
+            (now + time_to_crossing, speed)
+            if is_singular and time_to_crossing * speed < 3.0 * MAX_MOTION_PER_STEP
+            else None
+        )
+
+    def _record_crossing(
+        self,
+        path: CrossingPolynomial,
+        behind_time: float,
+        fine_step: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+    ) -> int:
+        """Record a path across a crossing, and go on to the first instant behind it.
+
+        Raises:
+            HaltedError: It does not go on there.
+        """
+        first = int(np.searchsorted(times, path.times[path.nodes_before - 1], side="right"))
+        i = int(np.searchsorted(times, behind_time))
+        for k in range(first, i):
+            rows[k] = [*path.state_at(times[k]), *path.outputs_at(times[k])]
+        self.done = i
+        self._to_user_coordinates(times[first:i], rows[first:i])
+        self._recent_states = self._recent_states[:0]
+        next_time = times[0] + i * step
+        state[:] = path.state_at(behind_time)
+        if next_time - behind_time > 1e-6 * fine_step:
+            part = (next_time - behind_time) / np.ceil((next_time - behind_time) / fine_step)
+            instants = np.arange(behind_time, next_time - 0.5 * part, part)
+            self._integrator.run(instants, state, part, np.empty((len(instants), rows.shape[1])))
+            if self._integrator.offset < 0:
+                raise self._integrator.python_stepper.halt_error(behind_time, state)
+        self.notes.append(
+            f"at t = {behind_time:.4g} s the linkage passes a posture from which it could go on "
+            f"in "
+            "several ways: it goes on as it moves"
+        )
+        return i
+
+    def _enter_chart(
+        self, chart_and_integrator: tuple[Chart, ChartIntegrator], offset: float
+    ) -> None:
+        """Go on in a chart, from so long after the next instant [s]."""
+        self._chart, self._integrator = chart_and_integrator
+        self._chart_limits, self._integrator.offset = self._chart.chart_limits, offset
+        self._integrator.set_chart_limits(self._chart_limits)
+
+    def _transform_states(self, states: Array, previous_chart: Chart) -> Array:
+        """States (N, .) in the present chart that are in the one before."""
+        nq, n = previous_chart.machine.model.nv, len(previous_chart.user_columns)
+        out = states.copy()
+        gamma = previous_chart.machine.closure.gamma(states[:, :nq])[
+            :, self._chart.machine.closure.active
+        ]
+        out[:, nq : nq + n] = np.einsum("nij,nj->ni", gamma, states[:, nq : nq + n])
+        return out
+
+    def _find_integrator(self, chart: Chart, q: Array) -> tuple[Chart, ChartIntegrator]:
+        """A chart of the same coordinates and branch that was there before, or this one."""
+        active = chart.machine.closure.active
+        for known_chart, integrator in self._known_integrators:
+            closure = known_chart.machine.closure
+            if np.array_equal(closure.active, active) and closure.is_on_branch(q):
+                return known_chart, integrator
+        chart_and_integrator = chart, self._make_integrator(chart)
+        self._known_integrators.append(chart_and_integrator)
+        return chart_and_integrator
+
+    def _orientation_at(self, q: Array) -> float:
+        """The sign of det C at a closed posture (nq,): it changes at the user's dead centres."""
+        return (
+            1.0
+            if self._chart.has_user_coordinates
+            else float(np.linalg.slogdet(self._chart.velocity_map(q))[0])
+        )
+
+    def _to_user_coordinates(self, times: Array, rows: Array) -> None:
+        """Put rows (N, .) at times (N,) [s] into the user's coordinates."""
+        chart = self._chart
+        if chart.has_user_coordinates or not len(rows):
+            return
+        at = self._row_layout.view(rows)
+        velocity_maps = chart.velocity_map(at.q)
+        behind_indices = np.flatnonzero(
+            self._orientation * np.linalg.slogdet(velocity_maps)[0] < 0
+        )
+        if len(behind_indices) and not self._has_passed_dead_centre:
+            self._has_passed_dead_centre, user_machine = (
+                True,
+                self._known_integrators[0][0].machine,
+            )
+            left_columns = np.setdiff1d(user_machine.closure.active, chart.machine.closure.active)
+            names = " and ".join(f"'{user_machine.joints[i]}'" for i in left_columns)
+            verb = "pass" if len(left_columns) > 1 else "passes"
+            self.notes.append(
+                f"{names} {verb} a dead centre at t = {times[behind_indices[0]]:.4g} s: from "
+                f"there on "
+                "active coordinates alone do not tell the posture, take passive joints with them"
+            )
+        at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
+        transposed_maps = np.swapaxes(velocity_maps, 1, 2)
+        at.friction[:] = np.einsum("nij,nj->ni", np.linalg.pinv(transposed_maps), at.friction)
+
+    @property
+    def _uses_inverse_dynamics(self) -> bool:
+        """Whether the controller asks for inverse dynamics or weight, of its own coordinates."""
+        control, call_count = self._control, 0
+        if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
+            return False
+        n, tape = len(self._chart.user_columns), Tape()
+
+        def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
+            nonlocal call_count
+            call_count += 1
+            return tape.load_vector(
+                5, n * call_count, n
+            )  # others each time: laws divide by differences
+
+        def gravity() -> list[Scalar]:
+            return inverse([], False)
+
+        columns = control.references(np.zeros(1)).shape[1]
+        sizes = n, n, self._row_layout.parts["own"], len(control.settings), columns
+        q_a, v_a, state, settings, reference = (
+            tape.load_vector(i, 0, x) for i, x in enumerate(sizes)
+        )
+        control.trace(ControllerInputs(q_a, v_a, state, settings, reference, inverse, gravity))
+        return call_count > 0
+
+    def _dead_centre_error(
+        self, time: float, q: Array, better_chart: Chart
+    ) -> IntegrationHaltError:
+        """What to say of coordinates that the controller cannot do without."""
+        machine = self._chart.machine
+        left_columns = np.setdiff1d(machine.closure.active, better_chart.machine.closure.active)
+        names = " and ".join(f"'{machine.joints[i]}'" for i in left_columns)
+        verb = "come" if len(left_columns) > 1 else "comes"
+        return IntegrationHaltError(
+            time,
+            q[self._chart.user_columns],
+            f": {names} {verb} to a dead centre, where inverse dynamics has no answer",
+            ": keep the reference away from there, or drive other joints",
+        )

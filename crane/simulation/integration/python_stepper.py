@@ -1,0 +1,193 @@
+"""Steps of the classical Runge-Kutta method in Python."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from crane.codegen import LayoutView
+from crane.common.errors import ClosureError, InputError
+from crane.common.samples import Array
+from crane.control import Controller, ValveDrive
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.integration_halt import IntegrationHaltError
+from crane.simulation.integration.state_layouts import state_layout
+
+_EXTRAPOLATION_TIME = (
+    1e-3  # of `Closure.characteristic_time`: how far a machine is thought on that stops
+)
+
+StepProgress = Callable[[int], None] | None
+"""What is told the number of finished steps."""
+
+
+class PythonStepper:
+    """One step at a time, for any controller and on any backend of `Dynamics`.
+
+    Args:
+        chart: The machine.
+        control: Its controller.
+        controller_state_count: Number of the controller's states.
+
+    Attributes:
+        state_layout: Parts of the state.
+        chart_limits: Where other coordinates are looked for, see `Chart.chart_limits`.
+        transition_margin: See `StickSlipAccelerations.transition_margin`, at the state whose rate
+            was computed last.
+    """
+
+    def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
+        self._chart, self._dynamics, self._control = chart, chart.dynamics, control
+        self.state_layout = state_layout(chart.machine, controller_state_count)
+        self.chart_limits, self.transition_margin = chart.chart_limits, 1.0
+
+    def find_modes(self, time: float, state: Array, outputs: Array | None = None) -> None:
+        """Find which joints stick at a state, whose velocities are made those of rest.
+
+        Args:
+            time: [s].
+            state: Then.
+            outputs: What is observed there, if that is known.
+
+        Raises:
+            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+        """
+        at, chart = self.state_layout.view(state), self._chart
+        try:
+            tau = np.zeros(0) if outputs is None else outputs[: len(chart.user_columns)]
+            if outputs is None:
+                tau, _ = self._controller_output(time, at, chart.user_velocities(at.q, at.v_a))
+            self._set_circuit_friction(time, at, chart.user_velocities(at.q, at.v_a))
+            forces = chart.chart_forces(at.q, tau)
+            forces += chart.external_forces(time, at.q, at.v_a, at.shear).generalized_forces
+            at.v_a[:] = chart.stick_slip.find_modes(self._dynamics, at.q, at.v_a, forces)
+        except ClosureError as error:
+            raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
+
+    def exceeds_chart_limits(self, state: Array) -> bool:
+        """Whether a state is beyond the limits."""
+        closure, q = self._chart.machine.closure, self.state_layout.view(state).q
+        if self._chart.largest_gamma_entry(q) > self.chart_limits[0]:
+            return True
+        return (
+            closure.is_compiled
+            and closure.compiled_closure.least_determinant(q) < self.chart_limits[1]
+        )
+
+    def user_coordinates(self, state: Array) -> Array:
+        """(n,) coordinates of the user's."""
+        return self.state_layout.view(state).q[self._chart.user_columns]
+
+    def observe(self, time: float, state: Array) -> tuple[Array, Array]:
+        """Rate of the state, and [tau, friction, kinetic, potential, its channels].
+
+        Raises:
+            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+        """
+        rate, tau = self._state_rate(time, state)
+        at = self.state_layout.view(state)
+        external_values = self._chart.external_forces(time, at.q, at.v_a, at.shear)
+        forces = self._chart.chart_forces(at.q, tau) + external_values.generalized_forces
+        observation = self._dynamics.evaluate_closed("observation", at.q, at.v_a, forces)
+        channels: Array = np.zeros(0)
+        a: Array = np.zeros(0)
+        closure = self._chart.machine.closure
+        if self._chart.machine.supports:
+            gamma = closure.gamma(at.q)
+            a = gamma @ self.state_layout.view(rate).v_a + closure.drift(at.q, gamma @ at.v_a)
+        if isinstance(self._control, ValveDrive):
+            control = self._control
+            v_a = self._chart.user_velocities(at.q, at.v_a)
+            inputs = control.inputs_at(time, self.user_coordinates(state), v_a, at.own)
+            channels = np.array(control.channel_values(inputs), dtype=np.float64)
+        return rate, np.concatenate([tau, observation, external_values.outputs, a, channels])
+
+    def advance(self, time: float, state: Array, start_rate: Array, step: float) -> Array:
+        """The state one step later, its rate at the start given.
+
+        Raises:
+            HaltedError: The motion explodes, or the loops cannot be closed any more.
+        """
+        rate_sum = rate = start_rate
+        units = self._dynamics.machine.closure.units
+        for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            if not np.abs(self.state_layout.view(rate).q / units).max() * step < 1:  # also NaN
+                size = self._dynamics.machine.closure.characteristic_length
+                description = (
+                    f" the motion explodes (over 1 rad or {size:.3g} m in a step of {step:g} s)"
+                )
+                remedy = (
+                    ", and with steps an eighth as long, too: let method DOP853 choose them, or "
+                    "look at its forces and gains"
+                )
+                raise IntegrationHaltError(time, self.user_coordinates(state), description, remedy)
+            rate, _ = self._state_rate(time + share * step, state + share * step * rate)
+            rate_sum = rate_sum + weight * rate
+        after = state + step / 6 * rate_sum
+        machine, q = self._dynamics.machine, self.state_layout.view(after).q
+        try:
+            closed = machine.closure.solve(q[machine.closure.active], initial_guess=q)
+        except ClosureError as error:
+            raise IntegrationHaltError(
+                time + step, self.user_coordinates(after), f": {error}"
+            ) from None
+        q[:] = machine.coordinates.wrap_rotations(closed)
+        return after
+
+    def halt_error(self, time: float, state: Array) -> IntegrationHaltError:
+        """Why the machine cannot go on, whatever the step."""
+        at, closure = self.state_layout.view(state), self._chart.machine.closure
+        try:
+            closure.solve(
+                at.q[closure.active] + _EXTRAPOLATION_TIME * closure.characteristic_time * at.v_a,
+                initial_guess=at.q,
+            )
+        except ClosureError as error:
+            return IntegrationHaltError(time, self.user_coordinates(state), f": {error}")
+        speed = np.abs(at.v_a).max()
+        return IntegrationHaltError(
+            time,
+            self.user_coordinates(state),
+            f" the motion cannot be followed, the fastest joint moves at {speed:.3g} m/s or rad/s",
+            ": look at its forces and gains, or give end stops damping",
+        )
+
+    def _state_rate(self, time: float, state: Array) -> tuple[Array, Array]:
+        at, chart = self.state_layout.view(state), self._chart
+        try:
+            v_a = chart.user_velocities(at.q, at.v_a)
+            tau, controller_rate = self._controller_output(time, at, v_a)
+            self._set_circuit_friction(time, at, v_a)
+            external_values = chart.external_forces(time, at.q, at.v_a, at.shear)
+            forces = chart.chart_forces(at.q, tau) + external_values.generalized_forces
+            rates = self._dynamics.evaluate_closed("rates", at.q, at.v_a, forces)
+        except ClosureError as error:
+            raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
+        self.transition_margin = float(rates[-1])
+        energies = [tau @ v_a, *external_values.powers, rates[-2]]
+        return np.concatenate(
+            [rates[:-2], external_values.state_rates, controller_rate, energies]
+        ), tau
+
+    def _set_circuit_friction(self, time: float, state: LayoutView, v_a: Array) -> None:
+        """Tell the dynamics what seals and brakes of a circuit add to friction."""
+        control = self._control
+        if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
+            inputs = control.inputs_at(time, state.q[self._chart.user_columns], v_a, state.own)
+            self._dynamics.set_circuit_friction(
+                np.array(control.circuit_friction(inputs), dtype=np.float64)
+            )
+
+    def _controller_output(
+        self, time: float, state: LayoutView, v_a: Array
+    ) -> tuple[Array, Array]:
+        """What the controller answers, (n,) and (k,)."""
+        tau, rate = self._control(time, state.q[self._chart.user_columns], v_a, state.own)
+        if np.shape(tau) != v_a.shape or np.shape(rate) != state.own.shape:
+            raise InputError(
+                f"{type(self._control).__name__} gives forces of the shape {np.shape(tau)} and "
+                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {state.own.shape}: "
+                "one per active joint, one per state"
+            )
+        if self._chart.free_joints:
+            self._chart.check_free_joints(np.asarray(tau).tolist(), f" at t = {time:g} s")
+        return np.asarray(tau), rate

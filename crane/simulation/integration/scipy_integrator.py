@@ -1,0 +1,208 @@
+"""Motion in time by scipy's adaptive methods."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from crane.common.errors import ClosureError
+from crane.common.samples import Array
+from crane.control import Controller
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.integration_halt import IntegrationHaltError
+from crane.simulation.integration.python_stepper import StepProgress
+from crane.simulation.integration.stick_slip_integrator import StickSlipIntegrator
+from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
+
+# of a passive joint in rad and shares of the machine's size per `Closure.characteristic_time`: where the branch
+# ends they grow beyond bounds
+_MAX_PASSIVE_VELOCITY = 300.0
+SCIPY_TOLERANCE = 1e-9  # error of a step, per size of the state
+_ABSOLUTE_TOLERANCE_SHARE = 1e-2  # of that what matters, likewise; of all else in SI units
+SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
+
+
+class ScipyIntegrator(StickSlipIntegrator):
+    """An adaptive method with dense output, loops closed to rounding at the recorded instants.
+
+    Args:
+        chart: The machine.
+        control: Its controller.
+        controller_state_count: Number of the controller's states.
+        method: One of `SCIPY_METHODS`.
+        tolerance: Error of a step, per size of the state.
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        control: Controller,
+        controller_state_count: int,
+        method: str,
+        tolerance: float = SCIPY_TOLERANCE,
+    ):
+        self._tolerance = tolerance
+        super().__init__(chart, control, controller_state_count, None)
+        self._chart, self._closure, self._method = chart, chart.machine.closure, method
+        self._end_time = 0.0
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+    ) -> int:
+        """See `FixedStepIntegrator.run`.
+
+        Raises:
+            HaltedError: The method gives up, or the loops cannot be closed any more.
+        """
+        first = times[0] if len(times) else self._end_time
+        self.done = self.next_instant = 0
+        self._prepare_modes(first + self.offset, state)
+        self._end_time = first + step * len(times)
+        instants = np.append(times, self._end_time)
+        while self.next_instant < len(times) or self.offset < 0:
+            start_time = instants[self.next_instant] + self.offset
+            if not self._integrate_until(start_time, instants, state, rows, progress):
+                break
+            self.offset = self._rounded_offset(self.offset, step)
+        return self.next_instant
+
+    def _integrate_until(
+        self, start_time: float, instants: Array, state: Array, rows: Array, progress: StepProgress
+    ) -> bool:
+        """Integrate to the last instant, or to where a joint starts or stops.
+
+        Returns:
+            False where other coordinates are better.
+        """
+        from scipy import integrate
+
+        closure, end = self._closure, instants[-1]
+        units, characteristic_time, view = (
+            closure.units,
+            closure.characteristic_time,
+            self.python_stepper.state_layout.view,
+        )
+
+        def rate(time: float, state: Array) -> Array:
+            closed = state.copy()  # at postures that are none gamma is not that of the machine
+            q = view(closed).q
+            with suppress(ClosureError):  # of a trial beyond where they close
+                q[:] = closure.solve(q[closure.active])
+            return self.python_stepper.observe(time, closed)[0]
+
+        absolute_tolerances = np.full(len(state), _ABSOLUTE_TOLERANCE_SHARE * self._tolerance)
+        view(absolute_tolerances).q[:] *= units
+        view(absolute_tolerances).v_a[:] *= units[closure.active] / characteristic_time
+        method: Any = getattr(integrate, self._method)
+        solver = method(
+            rate, start_time, state.copy(), end, rtol=self._tolerance, atol=absolute_tolerances
+        )
+        rate(start_time, state)  # the solver's last look may have been beside
+        before = self.python_stepper.transition_margin
+        while solver.status == "running":
+            with np.errstate(all="ignore"):  # where a trial explodes the method gives up by itself
+                message = solver.step()
+            if message is not None:
+                what = f" {self._method} gives up: {message.rstrip('.').lower()}"
+                user_coordinates = self.python_stepper.user_coordinates(solver.y)
+                raise IntegrationHaltError(
+                    float(solver.t), user_coordinates, what, ", try another method"
+                )
+            self._check_passive_velocities(solver.t, solver.y)
+            dense_output, start = solver.dense_output(), float(solver.t_old)
+
+            def trial(part: float, within: Any = dense_output, start: float = start) -> Any:
+                there = within(start + part)
+                rate(start + part, there)
+                return there, self.python_stepper.transition_margin
+
+            rate(solver.t, solver.y)
+            after, until, event_state = (
+                self.python_stepper.transition_margin,
+                float(solver.t),
+                None,
+            )
+            if after < -EVENT_TOLERANCE and self._stick_slip.columns:
+                later, event_state = locate_event(trial, before, until - start, after)
+                until = start + later
+            self._record(instants, until, dense_output, state, rows)
+            if progress is not None:
+                progress(self.next_instant)
+            if event_state is not None:
+                state[:] = event_state
+                self._close_loops(until, state)
+                self._find_modes(until, state)
+                self.next_instant = self.done
+                self.offset = until - instants[self.next_instant]
+                return True
+            before = after
+            if (
+                min(
+                    self.python_stepper.chart_limits[0]
+                    - self._chart.largest_gamma_entry(view(solver.y).q),
+                    1.0,
+                )
+                < 0
+            ):
+                return False
+        return True
+
+    def _check_passive_velocities(self, time: float, state: Array) -> None:
+        """See that no passive joint moves beyond bounds.
+
+        Raises:
+            HaltedError: One does.
+        """
+        closure, at = self._closure, self.python_stepper.state_layout.view(state)
+        speed = np.inf
+        with suppress(ClosureError):
+            rates = closure.gamma(at.q)[closure.passive] @ at.v_a / closure.units[closure.passive]
+            speed = closure.characteristic_time * float(np.abs(rates).max(initial=0.0))
+        if not speed < _MAX_PASSIVE_VELOCITY:
+            characteristic_time = closure.characteristic_time
+            velocity_limit = _MAX_PASSIVE_VELOCITY / characteristic_time
+            fastest = (
+                f"{velocity_limit:.3g} rad/s or "
+                f"{velocity_limit * closure.characteristic_length:.3g} m/s"
+            )
+            what = f" the motion explodes (a passive joint exceeds {fastest})"
+            user_coordinates = self.python_stepper.user_coordinates(state)
+            raise IntegrationHaltError(
+                time, user_coordinates, what, ": look at its forces and gains"
+            )
+
+    def _record(
+        self,
+        instants: Array,
+        end_time: float,
+        dense_output: Callable[[float], Array],
+        state: Array,
+        rows: Array,
+    ) -> None:
+        """Fill the rows of the instants up to one [s], and go on to the last of them."""
+        for k in range(self.done, len(instants)):
+            time = instants[k]
+            if time > end_time:
+                break
+            sample = dense_output(time)
+            self._close_loops(time, sample)
+            state[:] = sample
+            self.next_instant, self.offset = k, 0.0
+            if k < len(rows):
+                rows[k] = [*sample, *self.python_stepper.observe(time, sample)[1]]
+                self.done = k + 1
+
+    def _close_loops(self, time: float, state: Array) -> None:
+        """Close a state's loops.
+
+        Raises:
+            HaltedError: They do not close.
+        """
+        q, closure = self.python_stepper.state_layout.view(state).q, self._closure
+        try:
+            q[:] = closure.solve(q[closure.active], initial_guess=q)
+        except ClosureError as error:
+            raise IntegrationHaltError(
+                time, self.python_stepper.user_coordinates(state), f": {error}"
+            ) from None

@@ -1,0 +1,274 @@
+"""What acts on a machine that is linearized: forces, or a circuit with its valves."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from crane.codegen import Program, Scalar, SymbolicExpression, Tape
+from crane.codegen.differentiation import differentiate
+from crane.codegen.symbolic import subtract_vectors
+from crane.common.samples import Array
+from crane.control import ControllerInputs, ValveDrive, ValveSignals
+from crane.dynamics import Dynamics, JointForces
+from crane.dynamics.force_law_formulas import friction_sign
+from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.machine import Machine
+from crane.recordings.recording import FORCE_UNITS
+from crane.simulation.integration.machine_formulas import controller_settings
+
+_MIN_OPENING = 1e-6  # of a spool's stroke, beyond the dead band
+
+
+class LinearizedDrive:
+    """What acts on the machine, its states and inputs: forces, or a circuit with its valves.
+
+    Attributes:
+        state_units: Names and units of the drive's own states.
+        input_units: Names and units.
+        output_units: Names and units of what else can be an output.
+        initial_states: (k,) states where the machine stands still.
+        initial_inputs: (m,) inputs there.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        dynamics: Dynamics,
+        q: Array,
+        valves: bool,
+        pressures: Mapping[str, tuple[float, float]] | None,
+    ):
+        n = self._mobility = len(machine.active)
+        self.state_units: dict[str, str] = {}
+        self.input_units = {
+            f"{joint}_force": FORCE_UNITS[machine.unit(joint)]
+            for joint, driven in zip(machine.active, machine.is_driven, strict=True)
+            if driven
+        }
+        self.seen: dict[str, str] = {}
+        self.own, self.u = np.zeros(0), np.zeros(len(self.input_units))
+        self.scales, self._vapour_pressure, self._engine_droop = np.zeros(0), 0.0, 0.0
+        self._valve_drive: ValveDrive | None = None
+        self._input_matrix = np.eye(n)[:, machine.is_driven]
+        if valves:
+            control = ValveDrive(machine, ValveSignals(machine, [0.0], {}), pressures)
+            self._valve_drive = control
+            circuit = control.circuit
+            self.state_units = dict(circuit.state_units)
+            self._state_count, self.scales = (
+                circuit.stiff_state_count,
+                circuit.scales[: circuit.stiff_state_count],
+            )
+            engine = circuit.hydraulics.engine
+            self._engine_droop = engine.speed_droop / engine.speed if engine is not None else 0.0
+            self._vapour_pressure = circuit.hydraulics.oil.vapour_pressure
+            self._joint_of_state = {
+                name: joint
+                for joint, first, last in zip(
+                    circuit.joints,
+                    circuit.cylinder_state_starts,
+                    circuit.cylinder_state_ends,
+                    strict=True,
+                )
+                for name in list(self.state_units)[first:last]
+            }
+            self.input_units = {f"voltage_{name}": "V" for name in circuit.spools}
+            self.seen = dict(control.channels) | {
+                f"{joint}_force": FORCE_UNITS[machine.unit(joint)] for joint in circuit.joints
+            }
+            self._active_indices = [machine.active.index(joint) for joint in circuit.joints]
+            self.own = control.start_closed(dynamics, q)[: self._state_count]
+            self.u = control.references(np.zeros(1))[0]
+            self._program = self._build_program(machine)
+
+    def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
+        """(k + m,) which states and signals belong to joints that move, or perhaps to no joint."""
+        assert self._valve_drive is not None
+        joints = self._valve_drive.circuit.joints
+        moving = {x for x, i in zip(joints, self._active_indices, strict=True) if v_a[i]}
+        initial_states = [
+            self._joint_of_state[name] in moving
+            if name in self._joint_of_state
+            else include_shared
+            for name in self.state_units
+        ]
+        spools = self._valve_drive.circuit.hydraulics.spools.values()
+        mask: Any = np.array([*initial_states, *(spool.joint in moving for spool in spools)])
+        return mask
+
+    def load_bearing_mask(self, forces: Array) -> Any:
+        """(k,) which states are pressures of the chambers that bear forces (n,)."""
+        assert self._valve_drive is not None
+        is_load_bearing = np.zeros(len(self.state_units), dtype=bool)
+        for i, first in zip(
+            self._active_indices, self._valve_drive.circuit.cylinder_state_starts, strict=True
+        ):
+            is_load_bearing[first + int(forces[i] < 0)] = True
+        return is_load_bearing
+
+    def opened_valves(self, v_a: Array, share: float) -> tuple[Array, Array, Array, Array]:
+        """States and signals z with valves open by a share of their stroke, and where they may go.
+
+        Returns:
+            z (k + m,); how it depends on pressures and openings (k + m, r); least and most of
+            these (r,), which keep valves open and pumps within their droop.
+        """
+        assert self._valve_drive is not None
+        hydraulics, names = self._valve_drive.circuit.hydraulics, list(self.state_units)
+        supply, k = hydraulics.supply, len(names)
+        z = np.concatenate([self.own, self.u])
+        directions: list[Array] = []
+        bounds: list[tuple[float, float]] = []
+
+        line_pressure_indices: dict[str, int] = {}
+
+        def free(name: str, value: float, least: float, most: float) -> None:
+            z[at := names.index(name)] = value
+            directions.append(np.eye(len(z))[at])
+            bounds.append((least - value, most - value))
+
+        for name, pump in self._valve_drive.circuit.pumps.items():
+            top = pump.pressure - self._vapour_pressure
+            if pump.control == "pressure":
+                free(f"pressure_{name}", top - 0.5 * pump.droop, top - pump.droop, top)
+            elif pump.control == "load-sensing":  # above the loads that are guessed below
+                base = 0.3 * supply.pressure + pump.margin - 0.5 * pump.droop
+                free(f"pressure_{name}", base, base - 0.5 * pump.droop, base + 0.5 * pump.droop)
+                line_pressure_indices[name] = names.index(f"pressure_{name}")
+            else:
+                free(f"pressure_{name}", 0.4 * top, 0.0, np.inf)
+            if f"share_{name}" in names:
+                free(f"share_{name}", 0.5, 0.0, 1.0)
+        for name in hydraulics.lines:
+            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+        for name in hydraulics.accumulators:
+            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            if f"oil_{name}" in names:
+                at = names.index(f"oil_{name}")
+                free(f"oil_{name}", self.own[at], -np.inf, np.inf)
+        if "engine" in names:
+            free("engine", 1.0 + 0.5 * self._engine_droop, 1.0, 1.0 + self._engine_droop)
+        for i, (joint, valve) in enumerate(hydraulics.valves.items()):
+            if not (side := float(np.sign(v_a[self._active_indices[i]]))):
+                continue
+            for at, name in enumerate(names):
+                if name in (f"pressure_{joint}_a", f"pressure_{joint}_b"):
+                    z[at] = max(z[at], 0.3 * supply.pressure)
+                    directions.append(np.eye(len(z))[at])
+                    bounds.append((-z[at], np.inf))
+                    if valve.supply in line_pressure_indices and name.endswith(
+                        "a" if side > 0 else "b"
+                    ):
+                        directions[-1][line_pressure_indices[valve.supply]] = 1.0
+            dead_band, open_position = (
+                valve.dead_band,
+                valve.dead_band + share * (1.0 - valve.dead_band),
+            )
+            direction = np.zeros(len(z))
+            for name, spool in valve.spools.items():  # two open alike
+                opening_ratio = (1.0 - spool.dead_band) / (1.0 - dead_band)
+                at = k + self._valve_drive.circuit.spools.index(name)
+                direction[at] = side * opening_ratio * (spool.full - spool.neutral)
+                spool_position = spool.dead_band + share * (1.0 - spool.dead_band)
+                z[at] = spool.neutral + spool_position * side * (spool.full - spool.neutral)
+                if f"spool_{name}" in names:
+                    at = names.index(f"spool_{name}")
+                    direction[at], z[at] = side * opening_ratio, side * spool_position
+            directions.append(direction)
+            bounds.append((dead_band + _MIN_OPENING - open_position, 1.0 - open_position))
+        lower, upper = np.array(bounds).T
+        return z, np.array(directions).T, lower, upper
+
+    @property
+    def pressure_offsets(self) -> Array:
+        """(k,) what states are to be added for pressures to count from a vacuum."""
+        return np.array(
+            [self._vapour_pressure * name.startswith("pressure_") for name in self.state_units]
+        )
+
+    def _build_program(self, machine: Machine) -> Program:
+        control, n, k, m = (
+            self._valve_drive,
+            self._mobility,
+            self._state_count,
+            len(self.input_units),
+        )
+        assert control is not None
+        tape = Tape()
+        q_a, v_a, states = (
+            tape.load_vector(0, 0, n),
+            tape.load_vector(0, n, n),
+            tape.load_vector(0, 2 * n, k),
+        )
+        settings, initial_inputs = (
+            controller_settings(control, tape, 1, fold_settings=True),
+            tape.load_vector(0, 2 * n + k, m),
+        )
+        integrals: list[Scalar] = [0.0] * len(BALANCE_UNITS)
+        inputs = ControllerInputs(
+            q_a,
+            v_a,
+            [*states, *integrals],
+            settings,
+            initial_inputs,
+            _unavailable_dynamics,
+            _unavailable_dynamics,
+        )
+        tau, rates = control.trace(inputs)
+        output_units = [*control.channel_values(inputs), *(tau[i] for i in self._active_indices)]
+        if friction := control.circuit_friction(inputs):
+            tau = subtract_vectors(tau, self._friction_forces(machine, friction, v_a))
+        values = [*tau, *rates[:k], *output_units]
+        variables = [
+            x for x in (*q_a, *v_a, *states, *initial_inputs) if isinstance(x, SymbolicExpression)
+        ]
+        derivative_values = [entry for row in differentiate(values, variables) for entry in row]
+        formula_key = [
+            x.index if isinstance(x, SymbolicExpression) else float(x)
+            for x in (*values, *derivative_values)
+        ]
+        compiled_closure, key = (
+            machine.closure.compiled_closure,
+            ("linear drive", repr((tape.operations, formula_key))),
+        )
+
+        def build(program: Program) -> None:
+            program.add_formula("formula", 2, {"values": values, "slopes": derivative_values})
+
+        if key not in compiled_closure.programs:
+            compiled_closure.programs[key] = compiled_closure.cached_program(key, build)
+        return compiled_closure.programs[key]
+
+    @staticmethod
+    def _friction_forces(
+        machine: Machine, circuit_friction: Sequence[Scalar], v_a: Sequence[Scalar]
+    ) -> list[Scalar]:
+        """Friction (n,) that seals and brakes add, F_K sign(v), that of joints at rest being 0."""
+        out: list[Scalar] = [0.0] * len(v_a)
+        forces = JointForces(machine)
+        for column, force in zip(forces.circuit_friction_columns, circuit_friction, strict=True):
+            i = machine.active.index(machine.joints[column])
+            sticks = column in forces.sticking
+            out[i] = force * friction_sign(forces.table[column].tolist(), v_a[i], sticks, False)
+        return out
+
+    def evaluate(
+        self, q_a: Array, v_a: Array, states: Array, inputs: Array
+    ) -> tuple[Array, Array]:
+        """Forces (n,), rates (k,) and what is seen, and their derivatives by all arguments."""
+        n = self._mobility
+        if self._valve_drive is None:
+            jacobian = np.zeros((n, 2 * n + len(inputs)))
+            jacobian[:, 2 * n :] = self._input_matrix
+            return self._input_matrix @ inputs, jacobian
+        layout = self._program.formula_outputs("formula")
+        out = np.empty(layout.size)
+        settings = np.ascontiguousarray(self._valve_drive.settings)
+        self._program.call("formula", np.concatenate([q_a, v_a, states, inputs]), settings, out)
+        values, jacobian = out[layout["values"]], out[layout["slopes"]]
+        return values, jacobian.reshape(len(values), -1)
+
+
+def _unavailable_dynamics(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
+    raise AssertionError("signals that are given do not ask for forces")

@@ -1,0 +1,274 @@
+"""x' = A x + B u, y = C x + D u: modes, responses, files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import OutputError
+from crane.common.one_line_repr import OneLineRepr, format_count, shorten_to_line
+from crane.common.optional_libraries import import_optional_library
+from crane.common.samples import Array, as_sample
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+
+_FRAMES_PER_SECOND, _SWING_AMPLITUDE = (
+    50,
+    0.05,
+)  # per second; of a stroke, rad and machine's size, as modes are shown
+_MIN_IMAGINARY_SHARE = (
+    1e-3  # share of a pole that is no imaginary part: the root of rounding, and more
+)
+_DAMPING_ROUNDING = 1e-13  # share of the fastest pole that is no damping: rounding
+_INTEGRATOR_ROUNDING = 1e-7  # share of the fastest pole that is none: rounding of a pole at zero
+
+
+class Mode(NamedTuple):
+    """A pole, or a pair of complex ones.
+
+    Attributes:
+        pole: The eigenvalue, of a pair that with a positive imaginary part [1/s].
+        frequency: |pole| / 2 pi [Hz].
+        damping: -Re(pole) / |pole|; 1 of a real stable one, 0 at zero.
+        shape: (nq,) complex, how all joints move, the largest share of its unit being 1.
+        state: (k,) complex, eigenvector in the states of the model.
+    """
+
+    pole: complex
+    frequency: float
+    damping: float
+    shape: Array
+    state: Array
+
+    @property
+    def is_oscillatory(self) -> bool:
+        """Whether it swings, and is no pair of real poles that rounding took apart."""
+        return self.pole.imag > _MIN_IMAGINARY_SHARE * abs(self.pole)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel(OneLineRepr):
+    """x' = A x + B u, y = C x + D u, deviations from an operating point.
+
+    Attributes:
+        A: (k, k).
+        B: (k, m).
+        C: (p, k).
+        D: (p, m).
+        states: Names of x: active joints, their velocities, pressures and spools of the circuit.
+        inputs: Names of u.
+        outputs: Names of y.
+        units: By name.
+        x: (k,) operating point.
+        u: (m,).
+        y: (p,).
+        rate: (k,) x' there, 0 of an equilibrium.
+        machine: The machine.
+        configuration: (nq,) of all joints.
+        gamma: (nq, n) d posture / d q_A.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    x: Array
+    u: Array
+    y: Array
+    rate: Array
+    machine: Machine
+    configuration: Array
+    gamma: Array
+
+    def _one_line(self) -> str:
+        """Its sizes, and where it rings."""
+        rings = [mode.frequency for mode in self.modes if mode.is_oscillatory]
+        ends = dict.fromkeys(f"{frequency:.3g}" for frequency in rings[:1] + rings[-1:])
+        words = f", rings at {' to '.join(ends)} Hz" if rings else ""
+        return (
+            f"LinearModel of '{self.machine.name}': {format_count(len(self.x), 'state')}, "
+            f"{format_count(len(self.u), 'input')}, {format_count(len(self.y), 'output')}{words}"
+        )
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """From the slowest to the fastest."""
+        from scipy.linalg import eig
+
+        poles, vectors = eig(self.A)
+        fastest = np.abs(poles).max(initial=0.0)
+        units = self.machine.closure.units
+        found = []
+        for pole, vector in zip(poles, vectors.T, strict=True):
+            if pole.imag < 0:
+                continue
+            size = abs(pole)
+            if size < _INTEGRATOR_ROUNDING * fastest:
+                pole, size = 0j, 0.0
+            elif abs(pole.real) < _DAMPING_ROUNDING * fastest:
+                pole = complex(0.0, pole.imag)
+            moved = self.gamma @ vector[: self.gamma.shape[1]]
+            at = np.argmax(np.abs(moved / units))
+            largest = moved[at] / units[at]
+            if abs(largest) > 1e-12 * np.abs(vector).max():
+                moved = moved / largest
+            damping = (0.0 - pole.real) / size if size else 0.0
+            mode = Mode(complex(pole), size / (2 * np.pi), float(damping), moved, vector)
+            found.append(mode)
+        return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
+
+    def response(self, frequencies: ArrayLike) -> Array:
+        """G = C (i w - A)^-1 B + D (f, p, m), complex, at frequencies (f,) [Hz]."""
+        frequencies = np.asarray(frequencies, dtype=np.float64)
+        eye, found = np.eye(len(self.A)), []
+        for frequency in frequencies:
+            resolvent = np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B)
+            found.append(self.C @ resolvent + self.D)
+        out: Array = np.array(found)
+        return out
+
+    def simulate(self, times: ArrayLike, start: ArrayLike, inputs: ArrayLike) -> Array:
+        """Deviations y (N, p) from a start x (k,) under constant inputs u (m,), exactly.
+
+        Args:
+            times: (N,) [s].
+            start: (k,) deviation from the operating point.
+            inputs: (m,) deviation.
+        """
+        from scipy.linalg import expm
+
+        k, m = self.B.shape
+        start, u = as_sample(start, k, "start", self.states), as_sample(inputs, m, "inputs")
+        whole = np.zeros((k + m, k + m))
+        whole[:k, :k], whole[:k, k:] = self.A, self.B
+        first = np.concatenate([start, u])
+        rows = [expm(whole * time) @ first for time in np.asarray(times, dtype=np.float64)]
+        out: Array = np.array([self.C @ row[:k] + self.D @ u for row in rows])
+        return out
+
+    def dominant_state(self, mode: Mode) -> str:
+        """The state that a mode moves most: a joint, or where none moves a pressure or spool."""
+        n = self.gamma.shape[1]
+        units = self.machine.closure.units
+        if np.abs(mode.shape / units).max() > 0.5:
+            return self.machine.joints[int(np.argmax(np.abs(mode.shape / units)))]
+        return self.states[2 * n + int(np.argmax(np.abs(mode.state[2 * n :])))]
+
+    def to_text(self) -> str:
+        """A table of the modes, Markdown."""
+        lines = [
+            f"{self.machine.name} in small motions about "
+            + ", ".join(
+                f"{name} {value:.4g} {self.units[name]}"
+                for name, value in zip(self.machine.active, self.x, strict=False)
+            ),
+            "",
+            "| frequency [Hz] | damping [%] | time constant [s] | moves most |",
+            "| ---: | ---: | ---: | --- |",
+        ]
+        for mode in self.modes:
+            if not mode.frequency:
+                continue
+            lasting = f"{1.0 / abs(mode.pole.real):.3g}" if mode.pole.real else ""
+            frequency = f"{mode.frequency:.4g}" if mode.is_oscillatory else ""
+            damping = f"{100 * mode.damping:.3g}" if mode.is_oscillatory else ""
+            grows = " (grows)" if mode.pole.real > 0 else ""
+            lines.append(
+                f"| {frequency} | {damping} | {lasting}{grows} | {self.dominant_state(mode)} |"
+            )
+        if zeros := sum(mode.frequency == 0 for mode in self.modes):
+            lines += ["", f"{zeros} poles at zero: what stays where it is put"]
+        still = [name for name, way in zip(self.inputs, self.B.T, strict=True) if not way.any()]
+        if still:
+            lines += ["", f"nothing answers {', '.join(still)} there; a velocity opens valves"]
+        return "\n".join(lines)
+
+    def mode_animation(self, seconds: float = 3.0, max_modes: int = 8) -> Recording | None:
+        """What rings, one mode after the other in slow motion, as a recording to look at.
+
+        Args:
+            seconds: Of each mode, in which it swings three times.
+            max_modes: Modes, from the slowest.
+
+        Returns:
+            The recording, whose channel `mode_frequency` says which; None where nothing rings.
+        """
+        machine, n = self.machine, self.gamma.shape[1]
+        oscillatory_modes = [mode for mode in self.modes if mode.is_oscillatory][:max_modes]
+        if not oscillatory_modes:
+            return None
+        phase = np.linspace(0.0, 6.0 * np.pi, int(_FRAMES_PER_SECOND * seconds))
+        columns, span = machine.closure.active, machine.upper - machine.lower
+        max_displacements = np.minimum(np.where(np.isfinite(span), span, np.inf), 2.0)
+        q_a, frequencies = [], []
+        for mode in oscillatory_modes:
+            shape = mode.shape[columns]
+            largest_share = np.abs(shape / machine.closure.units[columns]).max(initial=0.0)
+            largest_range_share = np.abs(shape / max_displacements).max(initial=0.0)
+            if not largest_share:
+                continue
+            size = min(_SWING_AMPLITUDE / largest_share, _SWING_AMPLITUDE / largest_range_share)
+            swing = size * np.real(np.outer(np.exp(1j * phase), shape))
+            swing *= np.sin(phase / 6.0)[:, None]  # from rest to rest, so that modes join
+            q_a.append(np.clip(self.x[:n] + swing, machine.lower, machine.upper))
+            frequencies.append(np.full(len(phase), mode.frequency))
+        time = np.arange(len(q_a) * len(phase)) / _FRAMES_PER_SECOND
+        q = np.vstack(q_a)
+        return Recording(
+            time=time,
+            joints=machine.active,
+            q=q,
+            v=np.gradient(q, time, axis=0),
+            tau=np.zeros_like(q),
+            units={joint: machine.unit(joint) for joint in machine.active},
+            channels={"mode_frequency": np.concatenate(frequencies)},
+            channel_units={"mode_frequency": "Hz"},
+            machine=machine.load_expression,
+            task="modes in slow motion",
+            free=machine.free,
+            machine_name=shorten_to_line(machine.name).strip(),
+        )
+
+    def to_control(self) -> Any:
+        """The same as python-control's `StateSpace`.
+
+        Raises:
+            InputError: python-control is not installed.
+        """
+        control = import_optional_library("control", "to_control")
+        names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
+        lists = {key: list(value) for key, value in names.items()}
+        return control.StateSpace(self.A, self.B, self.C, self.D, **lists)
+
+    def save(self, path: str | Path) -> Path:
+        """Write matrices, names and operating point as .mat (MATLAB, Octave) or .npz.
+
+        Raises:
+            OutputError: Another suffix, or it cannot be written.
+        """
+        path = Path(path)
+        values: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D")}
+        values |= {name: getattr(self, name) for name in ("x", "u", "y", "rate")}
+        named = {name: getattr(self, name) for name in ("states", "inputs", "outputs")}
+        if path.suffix == ".mat":
+            from scipy.io import savemat
+
+            cells = {key: np.array(value, dtype=object) for key, value in named.items()}
+            with replace_file(path) as part:
+                savemat(str(part), values | cells, appendmat=False)
+        elif path.suffix == ".npz":
+            every: dict[str, Any] = values | {key: np.array(x) for key, x in named.items()}
+            with replace_file(path) as part, open(part, "wb") as file:
+                np.savez(file, **every)
+        else:
+            raise OutputError(f"{path}: a linear model is written as .mat or .npz")
+        return path

@@ -1,0 +1,277 @@
+"""From a machine to its linear model."""
+
+import itertools
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array, as_samples
+from crane.description.parameter_changes import unknown_parameter_text
+from crane.dynamics import Dynamics
+from crane.formats import load
+from crane.formats.machine_loading import MachineVariants
+from crane.machine import Machine
+from crane.motion.kinematics import Kinematics
+from crane.simulation.linear.external_force_derivatives import LinearizedExternalForces
+from crane.simulation.linear.linear_drive import LinearizedDrive
+from crane.simulation.linear.linear_model import LinearModel
+from crane.simulation.linear.trim import find_trim
+
+
+def linearize(
+    machine: Machine | str | Path,
+    operating_point: Mapping[str, float] | ArrayLike | None = None,
+    *,
+    velocity: Mapping[str, float] | ArrayLike | None = None,
+    drive: str | None = None,
+    outputs: Sequence[str] | None = None,
+    pressures: Mapping[str, tuple[float, float]] | None = None,
+) -> LinearModel:
+    """A machine in small motion about an operating point: x' = A x + B u, y = C x + D u.
+
+    The operating point is trimmed: forces, or pressures and valve signals, are those at which the
+    velocities stay what they are. Matrices are exact derivatives through the closed loops
+    (`Dynamics.derivatives`), the circuit's by its formulas; those of forces from outside, which
+    act as at time 0, by differences. Friction that sticks is that of small
+    motions which have begun: at rest its viscous part alone, in motion the side that it is on.
+    What the circuit only counts, such as the oil drawn, is no state.
+
+    Args:
+        machine: The machine, or what `crane.load` takes.
+        operating_point: Active coordinates [m], [rad], by joint or (n,); home for those that are
+            not named.
+        velocity: Their velocities [m/s], [rad/s], likewise; at rest if not given.
+        drive: "valves" or "forces"; valves if not given where the machine has any.
+        outputs: Names of joints, `JOINT_velocity` of active ones, `tip_x`, `JOINT_force`, and
+            channels of the circuit such as `pressure_JOINT_a`; if not given, the active joints,
+            the tip, and with valves the chambers' pressures.
+        pressures: Of the chambers A and B [Pa] by joint, of which that of the loaded side is
+            changed to what holds the machine; if not given, the other side is at the tank's
+            pressure, where its valve would begin to let oil in: the model is that of the valve
+            closed.
+
+    Returns:
+        Matrices with the names of states, inputs and outputs, the operating point, and the modes.
+
+    Raises:
+        InputError: Unknown names, a posture beyond the limits, or a drive that is not there.
+        ClosureError: The loops do not close there.
+        SimulationError: The machine cannot be trimmed there.
+    """
+    if not isinstance(machine, Machine):
+        machine = load(machine)
+    if drive not in (None, "valves", "forces"):
+        raise InputError(
+            f"drive '{drive}' is unknown, {suggest_names(('valves', 'forces'), drive)}"
+        )
+    valves = machine.hydraulics is not None if drive is None else drive == "valves"
+    if valves and machine.hydraulics is None:
+        raise InputError(f"'{machine.name}' has no valves, take the drive 'forces'")
+    home = machine.home[machine.closure.active]
+    q_a = machine.check_limits(_values_by_joint(machine, operating_point, home, "at"), "at")
+    v_a = _values_by_joint(machine, velocity, np.zeros(len(home)), "velocity")
+    if machine.coordinates.floating_base_columns and v_a.any():
+        raise InputError("a floating machine is linearized at rest, leave velocities out")
+    dynamics = Dynamics(machine)
+    q = machine.closure.solve(q_a)
+    linearized_drive = LinearizedDrive(machine, dynamics, q, valves, pressures)
+    external = LinearizedExternalForces(machine)
+    external_force = external.active_forces(q_a, v_a)
+    drive_states, u = find_trim(dynamics, linearized_drive, q_a, v_a, external_force)
+    n, k, m = len(q_a), len(drive_states), len(u)
+    values, drive_jacobian = linearized_drive.evaluate(q_a, v_a, drive_states, u)
+    tau = values[:n] + external_force
+    dynamics_derivatives = dynamics.derivatives("forward", q_a, v_a, tau, friction=True)
+    by_tau = dynamics_derivatives["tau_a"]
+    size = 2 * n + k
+    a, b = np.zeros((size, size)), np.zeros((size, m))
+    a[:n, n : 2 * n] = np.eye(n)
+    a[n : 2 * n] = by_tau @ drive_jacobian[:n, :size]
+    a[n : 2 * n, : 2 * n] += by_tau @ external.jacobian(q_a, v_a)
+    a[n : 2 * n, :n] += dynamics_derivatives["q_a"]
+    a[n : 2 * n, n : 2 * n] += dynamics_derivatives["v_a"]
+    a[2 * n :] = drive_jacobian[n : n + k, :size]
+    b[n : 2 * n], b[2 * n :] = by_tau @ drive_jacobian[:n, size:], drive_jacobian[n : n + k, size:]
+    gamma = machine.closure.gamma(q)
+    states = {joint: machine.unit(joint) for joint in machine.active}
+    states |= {f"{joint}_velocity": machine.unit(joint) + "/s" for joint in machine.active}
+    output_rows = _OutputRows(
+        machine, linearized_drive, q, gamma, (q_a, v_a), (values, drive_jacobian)
+    )
+    c, d, y, units = output_rows.select_outputs(outputs)
+    acceleration = dynamics.forward(q_a, v_a, tau, friction=True)
+    return LinearModel(
+        A=a,
+        B=b,
+        C=c,
+        D=d,
+        states=(*states, *linearized_drive.state_units),
+        inputs=tuple(linearized_drive.input_units),
+        outputs=tuple(units),
+        units=states | linearized_drive.state_units | linearized_drive.input_units | units,
+        x=np.concatenate([q_a, v_a, drive_states + linearized_drive.pressure_offsets]),
+        u=u,
+        y=y,
+        rate=np.concatenate([v_a, acceleration, values[n : n + k]]),
+        machine=machine,
+        configuration=q,
+        gamma=gamma,
+    )
+
+
+def linear_models(
+    machine: Machine | str | Path,
+    vary: Mapping[str, ArrayLike],
+    operating_point: Mapping[str, float] | None = None,
+    *,
+    drive: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> list[tuple[dict[str, float], LinearModel]]:
+    """Linear models over postures and numbers of a machine, at rest.
+
+    Args:
+        machine: See `linearize`.
+        vary: Values by name of an active joint, or of a number of the machine as
+            `crane.description.parameters` lists them; all combinations are taken.
+        operating_point: Active coordinates [m], [rad] that are the same in all.
+        drive: See `linearize`.
+        progress: Called with the finished share, 0 to 1.
+
+    Returns:
+        For each combination the values and the model, the last name varying fastest.
+
+    Raises:
+        InputError: See `linearize`; an unknown name.
+    """
+    progress = progress_reporter(progress)
+    if not isinstance(machine, Machine):
+        machine = load(machine)
+    values = {name: np.atleast_1d(np.asarray(x, dtype=np.float64)) for name, x in vary.items()}
+    variants, found = MachineVariants(machine), []
+    numbers = variants.values
+    for name in values:
+        if name not in machine.active and name not in numbers:
+            raise InputError(
+                unknown_parameter_text(variants.spec, [*numbers, *machine.active], name)
+            )
+    combinations = list(itertools.product(*(x.tolist() for x in values.values())))
+    drift_warnings = []
+    for i, row in enumerate(combinations):
+        values_here = dict(zip(values, row, strict=True))
+        changes = {
+            name: value for name, value in values_here.items() if name not in machine.active
+        }
+        joints = {name: value for name, value in values_here.items() if name in machine.active}
+        variant = variants.machine(changes) if changes else machine
+        with warnings.catch_warnings(record=True) as caught_warnings:
+            warnings.simplefilter("always")
+            found.append(
+                (
+                    values_here,
+                    linearize(variant, dict(operating_point or {}) | joints, drive=drive),
+                )
+            )
+        drift_warnings += [str(warning.message) for warning in caught_warnings]
+        if progress is not None:
+            progress((i + 1) / len(combinations))
+    if drift_warnings:
+        text = f"{len(drift_warnings)} of {len(combinations)} are {drift_warnings[0]}, the first"
+        warnings.warn(text, CraneWarning, stacklevel=2)
+    return found
+
+
+class _OutputRows:
+    """Rows of C and D by name.
+
+    Args:
+        machine: The machine.
+        drive: What acts on it.
+        q: (nq,) posture.
+        gamma: (nq, n) dq/dq_A.
+        motion: q_A and v_A.
+        drive_values: What the drive does, see `Drive.at`.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        drive: LinearizedDrive,
+        q: Array,
+        gamma: Array,
+        motion: tuple[Array, Array],
+        drive_values: tuple[Array, Array],
+    ):
+        n, k, m = len(machine.active), len(drive.state_units), len(drive.input_units)
+        self._size = 2 * n + k
+        self._rows: dict[str, tuple[Array, float, str]] = {}
+        width = self._size + m
+        for column, joint in enumerate(machine.joints):
+            row = np.zeros(width)
+            row[:n] = gamma[column]
+            self._rows[joint] = row, float(q[column]), machine.unit(joint)
+        for i, joint in enumerate(machine.active):
+            name, unit = f"{joint}_velocity", machine.unit(joint) + "/s"
+            self._rows[name] = np.eye(width)[n + i], float(motion[1][i]), unit
+        self.default_names = list(machine.active)
+        if machine.tip is not None:
+            kinematics = Kinematics(machine)
+            jacobian, place = (
+                kinematics.jacobian(motion[0]),
+                kinematics.position_at_configuration(q),
+            )
+            for axis, along, value in zip("xyz", jacobian, place, strict=True):
+                row = np.zeros(width)
+                row[:n] = along
+                self._rows[f"tip_{axis}"] = row, float(value), "m"
+                self.default_names.append(f"tip_{axis}")
+        values, slopes = drive_values
+        if drive.state_units:
+            seen = zip(drive.seen.items(), values[n + k :], slopes[n + k :], strict=True)
+            for (name, unit), value, row in seen:
+                self._rows[name] = row, float(value), unit
+            self.default_names += [
+                name for name in drive.state_units if name.startswith("pressure_")
+            ]
+        else:
+            for i, (name, unit) in enumerate(drive.input_units.items()):
+                self._rows[name] = np.eye(width)[self._size + i], 0.0, unit
+
+    def select_outputs(
+        self, names: Sequence[str] | None
+    ) -> tuple[Array, Array, Array, dict[str, str]]:
+        """C, D, y and units of outputs.
+
+        Raises:
+            InputError: An unknown name.
+        """
+        names = self.default_names if names is None else list(names)
+        for name in names:
+            if name not in self._rows:
+                raise InputError(f"output '{name}' is unknown, {suggest_names(self._rows, name)}")
+        rows = np.array([self._rows[name][0] for name in names]).reshape(len(names), -1)
+        y = np.array([self._rows[name][1] for name in names])
+        units = {name: self._rows[name][2] for name in names}
+        return rows[:, : self._size], rows[:, self._size :], y, units
+
+
+def _values_by_joint(
+    machine: Machine, specified: Mapping[str, float] | ArrayLike | None, default: Array, label: str
+) -> Array:
+    """(n,) active coordinates or velocities, by joint or all of them."""
+    if specified is None:
+        return default.copy()
+    if not isinstance(specified, Mapping):
+        return as_samples(specified, len(default), label, machine.active).astype(np.float64)
+    out = default.copy()
+    for joint, value in specified.items():
+        if joint not in machine.active:
+            raise InputError(
+                f"{label}: '{joint}' is no active joint, {suggest_names(machine.active, joint)}"
+            )
+        out[machine.active.index(joint)] = float(value)
+    return out

@@ -1,0 +1,265 @@
+"""What a simulation leaves: a recording with channels."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from crane.codegen import Layout, LayoutView
+from crane.common import scratch_arrays
+from crane.common.errors import CraneError, format_one_line
+from crane.common.one_line_repr import shorten_to_line
+from crane.common.samples import MAX_QUANTITY, Array
+from crane.control import Controller, ValveDrive, ZeroForce, controller_reference
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics.joint_forces import find_stick_slip_columns
+from crane.dynamics.tipping_stability import TippingStability, has_supports
+from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.machine import Machine
+from crane.motion.kinematics import Kinematics
+from crane.motion.trajectory import Trajectory
+from crane.recordings.recording import FORCE_UNITS, Recording
+
+ChannelColumn = tuple[str, Array, str]  # name, values, unit
+
+
+class IntegrationResult(NamedTuple):
+    """What an integration leaves.
+
+    Attributes:
+        time: (N,) [s].
+        array: (N, .) rows at these instants.
+        layout: Of a row, see `crane.simulation.integration.row_layout`.
+        notes: What is to be said of the motion.
+        start_text: How it starts, where that is not what the file says.
+        stop: What ended it before its time, if something did.
+    """
+
+    time: Array
+    array: Array
+    layout: Layout
+    notes: list[str]
+    start_text: str = ""
+    stop: BaseException | None = None
+
+    @property
+    def rows(self) -> LayoutView:
+        """The rows part by part, (N, .) each."""
+        return self.layout.view(self.array)
+
+    def first_instants(self, count: int, stop: BaseException | None) -> "IntegrationResult":
+        """The first instants of it, and what ended it there."""
+        return self._replace(time=self.time[:count], array=self.array[:count], stop=stop)
+
+
+class InterruptedRun(KeyboardInterrupt):
+    """A run that was interrupted.
+
+    Attributes:
+        recording: What there is of it, whose `stop_with_recording` says where it ended.
+    """
+
+    def __init__(self, recording: Recording):
+        super().__init__(f"interrupted at t = {recording.time[-1]:g} s")
+        self.recording = recording
+
+
+def stop_with_recording(
+    machine: Machine, control: Controller, run: IntegrationResult, task: str, end_time: float
+) -> BaseException:
+    """What stopped a run, which has what there is of it as its `recording`.
+
+    Args:
+        machine: The machine.
+        control: What drove it.
+        run: What was integrated.
+        task: Name to put into the recording.
+        end_time: When it should have ended [s].
+    """
+    assert (stop := run.stop) is not None
+    if not len(run.time):
+        return stop
+    largest_values = scratch_arrays.compute_in_blocks(
+        lambda part: np.abs(run.array[part]).max(axis=1, keepdims=True), len(run.time)
+    )
+    # what has exploded is no motion
+    run = run.first_instants(int(np.append(largest_values < MAX_QUANTITY, False).argmin()), stop)
+    if not len(run.time):
+        return stop
+    interrupted = isinstance(stop, KeyboardInterrupt)
+    text = format_one_line(" ".join(str(stop).split())) or type(stop).__name__
+    if interrupted:
+        text = f"at t = {run.time[-1]:g} s of {end_time:g} s: interrupted"
+    elif not text.startswith("at t = "):
+        text = f"at t = {run.time[-1]:g} s: {text}"
+    with suppress(CraneError):  # channels that cannot be computed there hide no error
+        recording = record_run(machine, control, run.time, run.rows, task, text)
+        if interrupted:
+            return InterruptedRun(recording)
+        stop.recording = recording  # type: ignore[attr-defined]
+    return stop
+
+
+def record_run(
+    machine: Machine,
+    control: Controller,
+    time: Array,
+    rows: LayoutView,
+    task: str,
+    stopped: str = "",
+    start_text: str = "",
+) -> Recording:
+    """What the integration left as a recording.
+
+    Args:
+        machine: The machine.
+        control: What drove it.
+        time: (N,) [s].
+        rows: See `integrate`.
+        task: Name to put into it.
+        stopped: When and why it ended before its time.
+        start_text: How it starts, where that is not what the file says.
+    """
+    active = machine.closure.active
+    q_a = scratch_arrays.compute_in_blocks(lambda part: rows.q[part][:, active], len(time))
+    channels: dict[str, Array] = {}
+    units: dict[str, str] = {}
+    for name, values, unit in _channel_columns(machine, control, time, rows):
+        channels[name], units[name] = values, unit
+    return Recording(
+        time=time,
+        joints=machine.active,
+        q=q_a,
+        v=rows.v_a,
+        tau=rows.tau,
+        units={joint: machine.unit(joint) for joint in machine.active},
+        channels=channels,
+        channel_units=units,
+        machine=machine.load_expression,
+        task=task,
+        controller=_controller_name(control),
+        ideal=True,
+        free=machine.free,
+        machine_name=shorten_to_line(machine.name).strip(),
+        stopped=stopped,
+        start=start_text,
+        copy=False,
+    )
+
+
+def _channel_columns(
+    machine: Machine, control: Controller, time: Array, rows: LayoutView
+) -> Iterator[ChannelColumn]:
+    """What is recorded beside the active joints."""
+    for column in machine.closure.passive:
+        joint = machine.joints[column]
+        yield joint, rows.q[:, column], machine.unit(joint)
+    if machine.tip is not None:
+        tip = Kinematics(machine)
+        places = scratch_arrays.compute_in_blocks(
+            lambda part: tip.positions_at_configurations(rows.q[part]), len(time)
+        )
+        yield from _point_columns("tip", places)
+    reference = controller_reference(control, machine)
+    if reference is not None:
+        yield from _reference_columns(machine, reference, time)
+    for i, joint in enumerate(machine.active):
+        yield (
+            f"friction_{joint}",
+            rows.friction[:, i],
+            FORCE_UNITS[machine.unit(joint)],
+        )
+    for column, values in zip(find_stick_slip_columns(machine), rows.rest.T, strict=True):
+        joint = machine.joints[column]
+        yield f"rest_{joint}", values, FORCE_UNITS[machine.unit(joint)]
+    names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
+    for name, part in names.items():
+        yield name, getattr(rows, part)[:, 0], "J"
+    yield from _external_force_columns(machine, rows)
+    yield from _stability_columns(machine, rows)
+    if isinstance(control, ValveDrive):
+        integrals = rows.own[:, -len(BALANCE_UNITS) :]
+        units = [*control.channels, *BALANCE_UNITS.items()]
+        delayed_signals: dict[str, Array] = {}
+        if control.delays.any():  # a log has what was commanded, not what arrives
+            spools = (f"voltage_{name}" for name in control.circuit.spools)
+            commanded = scratch_arrays.compute_in_blocks(
+                lambda part: control.commanded_signals(time[part]), len(time)
+            )
+            delayed_signals = dict(zip(spools, commanded.T, strict=True))
+        for (name, unit), values in zip(units, [*rows.channels.T, *integrals.T], strict=True):
+            yield name, delayed_signals.get(name, values), unit
+
+
+def _external_force_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
+    """What acts from outside, in the world's axes at the origins of frames, and its work."""
+    columns = iter(rows.outside.T)
+    for k, force in enumerate(machine.external_forces):
+        for part, values in zip(WRENCH_COMPONENTS, columns, strict=False):
+            if part.startswith("force") or values.any():
+                yield f"load_{force.name}_{part}", values, "N" if "force" in part else "N m"
+        for (name, unit), values in zip(force.channels, columns, strict=False):
+            yield name, values, unit
+        yield f"work_{force.name}", rows.work[:, 1 + k], "J"
+
+
+def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
+    """What supports carry, and how far it is from tipping."""
+    if not has_supports(machine):
+        return
+    stability = TippingStability(machine)
+    titles = [
+        (f"support_{name}", "N") for name in stability.support_names if stability.is_stationary
+    ]
+    for word in ("stability", "static_stability"):
+        titles += [(f"{word}_{'_'.join(line)}", "N m") for line in stability.line_names]
+        titles += [(word, "")]
+
+    def stand(part: slice) -> Array:
+        q, outside = rows.q[part], rows.outside[part]
+        columns: list[Array] = []
+        if stability.is_stationary:
+            v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[part])
+            ground = stability.ground_wrench(q, v, rows.a[part], outside)
+            columns += [stability.support_forces(q, ground)]
+        else:
+            ground = stability.contact_wrench(q, outside)
+        for wrench in (ground, stability.ground_wrench(q, external_wrenches=outside)):
+            margins = stability.tipping_margins(q, wrench)
+            columns += [margins.moments, margins.smallest_ratio[:, None]]
+        return np.hstack(columns)
+
+    found = scratch_arrays.compute_in_blocks(stand, len(rows.q))
+    for (name, unit), values in zip(titles, found.T, strict=True):
+        yield name, values, unit
+
+
+def _reference_columns(
+    machine: Machine, reference: Trajectory, time: Array
+) -> Iterator[ChannelColumn]:
+    """What a reference asks of the joints, and of the tip where it was given there."""
+    q = scratch_arrays.compute_in_blocks(lambda part: reference.position(time[part]), len(time))
+    v = scratch_arrays.compute_in_blocks(lambda part: reference.velocity(time[part]), len(time))
+    for i in np.flatnonzero(machine.is_driven):
+        joint = machine.active[i]
+        unit = machine.unit(joint)
+        yield f"reference_{joint}", q[:, i], unit
+        yield f"reference_velocity_{joint}", v[:, i], unit + "/s"
+    if reference.tip is not None:
+        wanted = reference.tip.position
+        places = scratch_arrays.compute_in_blocks(lambda part: wanted(time[part]), len(time))
+        yield from _point_columns("reference_tip", places)
+
+
+def _point_columns(name: str, positions: Array) -> Iterator[ChannelColumn]:
+    """Positions (N, 3) [m] by axis."""
+    for axis, values in zip("xyz", positions.T, strict=True):
+        yield f"{name}_{axis}", values, "m"
+
+
+def _controller_name(control: Controller) -> str:
+    """What drives the machine: what its command calls itself, or the name of its class."""
+    if isinstance(control, ValveDrive):
+        return getattr(control.command, "title", type(control.command).__name__)
+    return "" if isinstance(control, ZeroForce) else type(control).__name__

@@ -1,0 +1,410 @@
+"""Measured valve signals put through the model, and what comes out beside what was measured."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.errors import (
+    CraneWarning,
+    InputError,
+    RecordingError,
+    prefix_location,
+    suggest_names,
+)
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array, as_number
+from crane.control import ValveDrive, ValveSignals
+from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
+from crane.machine import Machine
+from crane.recordings.inclination_angles import add_inclination_angles
+from crane.recordings.measured_configurations import determining_joints, joint_motion
+from crane.recordings.measured_recordings import check_pressures, locked_joint_conflicts
+from crane.recordings.missing_measurements import MissingMeasurements
+from crane.recordings.recording import (
+    VELOCITY_SUFFIX,
+    Recording,
+    time_derivative,
+)
+from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
+from crane.recordings.sensor_discrepancy import warn_discrepancies
+from crane.recordings.stroke_check import check_strokes
+from crane.recordings.timeseries import TIME, Table, table_column
+from crane.simulation.simulated_readings import read_simulation, recorded_columns
+from crane.simulation.simulation_run import Progress, simulate
+
+_START_FIT_DURATION, _MAX_REST_DURATION = (
+    0.1,
+    1.0,
+)  # over which the start is fitted, and a rest looked for [s]
+_MIN_FIT_SAMPLES = 5  # samples of that fit
+_LIMIT_TOLERANCE = 0.01  # of a range, beyond a limit, that noise does not explain
+_REST_TOLERANCE = 1e-12  # variation of a channel that is rounding, per its size
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ChannelComparison(OneLineRepr):
+    """One channel, measured and simulated at the measured instants.
+
+    Attributes:
+        name: Of the column.
+        unit: Its unit.
+        measured: (N,).
+        simulated: (N,).
+    """
+
+    name: str
+    unit: str
+    measured: Array
+    simulated: Array
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the difference, in the channel's unit."""
+        return float(np.sqrt(np.mean((self.simulated - self.measured) ** 2)))
+
+    @property
+    def relative_rms(self) -> float:
+        """The same over that of the measured channel about its mean; infinite if that rests."""
+        deviation = float(np.std(self.measured))
+        if deviation < _REST_TOLERANCE * float(np.abs(self.measured).max()):
+            deviation = 0.0
+        return self.rms / deviation if deviation > 0 else (0.0 if self.rms == 0 else np.inf)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(OneLineRepr):
+    """A recording beside the simulation of the same inputs.
+
+    Attributes:
+        time: Instants (N,) [s] from the start.
+        channels: What both hold.
+    """
+
+    time: Array
+    channels: tuple[ChannelComparison, ...]
+
+    def _one_line(self) -> str:
+        """How long, and what is compared."""
+        return (
+            f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
+            + ", ".join(channel.name for channel in self.channels)
+        )
+
+    def to_markdown(self) -> str:
+        """A table with a row per channel."""
+        lines = [
+            "| channel | unit | RMS error | relative to its variation |",
+            "|---|---|---:|---:|",
+        ]
+        lines += [
+            f"| {x.name} | {x.unit} | {x.rms:.4g} | {100 * x.relative_rms:.2f} % |"
+            for x in self.channels
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def replay(
+    machine: Machine,
+    path: str | Path,
+    step: float = 1e-3,
+    progress: Progress | None = None,
+    columns: str | Path | None = None,
+    span: TimeSpan = FULL_TIME_SPAN,
+) -> tuple[Recording, Comparison]:
+    """Simulate a hydraulic machine with measured valve signals.
+
+    The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
+    where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
+    strokes or angles, velocities, pressures (see `crane.recordings.measured_recordings`). The
+    simulation starts from the measured posture and velocity, at rest or fitted over the first
+    tenth of a second, and from the measured pressures; where the file does not tell, from the home
+    posture at rest, and from what holds it.
+
+    Args:
+        machine: The machine.
+        path: A CSV or npz file.
+        step: Of the simulation [s].
+        progress: Called with the finished share, 0 to 1.
+        columns: Which columns of a log are which, if not as the machine's sensors say, see
+            `crane.recordings.logs`.
+        span: From when to when [s], by the file's own clock; the simulation counts from zero.
+
+    Returns:
+        The simulated recording, and its comparison with the file.
+
+    Raises:
+        RecordingError: The file is malformed, or has no signals.
+        InputError: The machine has no valves.
+    """
+    progress = progress_reporter(progress)
+    step = as_number(step, "the step", "s", greater_than=0)
+    table = read_quantities(path, machine, columns, span)
+    try:
+        inputs = replay_inputs(machine, table)
+        drive = inputs.valve_drive(machine)
+    except RecordingError as error:
+        raise RecordingError(prefix_location(str(path), error)) from None
+    time, initial = inputs.time, inputs.initial
+    steps = int(time[-1] / step + 1e-9)
+    if steps < 1:
+        raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
+    label = Path(path).stem
+    recording = simulate(
+        machine, drive, initial, steps * step, step, label=label, progress=progress
+    )
+    try:
+        return recording, compare_channels(machine, table, recording)
+    except RecordingError as error:
+        raise RecordingError(prefix_location(str(path), error)) from None
+
+
+def compare_channels(machine: Machine, table: Table, recording: Recording) -> Comparison:
+    """Channels that a file and a simulation both tell, but for the inputs.
+
+    Args:
+        machine: What was simulated.
+        table: What was measured.
+        recording: What was simulated from the same instant on.
+
+    Raises:
+        RecordingError: A channel of the file is in a unit of something else.
+    """
+    time = table_column(table, TIME)
+    time = time - time[0]
+    inside = time <= recording.time[-1] * (1 + 1e-12)
+    names = recorded_columns(machine, table, recording)
+    channels = [
+        ChannelComparison(
+            name,
+            table.units[name],
+            table_column(table, name)[inside],
+            np.interp(time[inside], recording.time, simulated),
+        )
+        for name, simulated in zip(
+            names, read_simulation(machine, recording, names).T, strict=True
+        )
+    ]
+    return Comparison(time[inside], tuple(channels))
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayInputs:
+    """What a measured machine was driven by, and where it started.
+
+    Attributes:
+        time: (N,) [s] from zero.
+        signals: Of the spools that were moved, (k,) by name [V].
+        supply: (N,) pressure of the supply [Pa], None where it was not measured.
+        tank: Likewise.
+        pressures: Of A and B at the start [Pa] by joint, where they were measured.
+        initial: q_A and v_A at the start, None where nothing tells.
+        signal_times: (k,) times of the signals [s], from before zero where these are known; None
+            for `time`.
+    """
+
+    time: Array
+    signals: dict[str, Array]
+    supply: Array | None
+    tank: Array | None
+    pressures: dict[str, tuple[float, float]]
+    initial: tuple[Array, Array] | None
+    signal_times: Array | None = None
+
+    def valve_drive(self, machine: Machine) -> ValveDrive:
+        """The valves' drive of a machine."""
+        time, line_pressures = self.time, [self.supply, self.tank]
+        if self.signal_times is not None:
+            time = self.signal_times
+            line_pressures = [
+                None if x is None else np.interp(time, self.time, x) for x in line_pressures
+            ]
+        signals = ValveSignals(machine, time, self.signals, *line_pressures)
+        return ValveDrive(machine, signals, self.pressures)
+
+
+def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
+    """What drove a machine, of which a table was measured.
+
+    Raises:
+        RecordingError: The table has no signals, or is malformed.
+        InputError: The machine has no valves.
+    """
+    joints = machine.hydraulics.joints if machine.hydraulics else ()
+    spools = tuple(machine.hydraulics.spools) if machine.hydraulics else ()
+    if not joints:
+        raise InputError(
+            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
+            "the machine file"
+        )
+    time = table_column(table, TIME)
+    time = time - time[0]
+    if len(time) < 2:
+        raise RecordingError("has one sample, give at least two")
+    signals, pressures, missing = {}, {}, MissingMeasurements(machine, table)
+    with missing.collect_errors():
+        signals = _spool_signals(machine, spools, table)
+    check_pressures(machine, table)
+    supply, tank = (
+        table_column(table, name, "Pa") if name in table.units else None
+        for name in (SUPPLY_PRESSURE, TANK_PRESSURE)
+    )
+    with missing.collect_errors():
+        pressures = _initial_pressures(joints, table, time)
+    table_with_angles = add_inclination_angles(machine, table)
+    has_joint_motion = any(joint in table_with_angles.units for joint in machine.joints)
+    if has_joint_motion:
+        with missing.collect_errors():
+            determining_joints(machine, list(table_with_angles.units))
+    missing.raise_collected()
+    if has_joint_motion:
+        check_strokes(machine, table)
+        warn_discrepancies(machine, table)
+    initial = (
+        _initial_motion(machine, table_with_angles, time, list(signals.values()))
+        if has_joint_motion
+        else None
+    )
+    return ReplayInputs(time, signals, supply, tank, pressures, initial)
+
+
+def _spool_signals(machine: Machine, spools: Sequence[str], table: Table) -> dict[str, Array]:
+    """Of the spools that were moved, by name [V]."""
+    signals = {}
+    for name in (name for name in table.units if name.startswith(VALVE_SIGNAL_PREFIX)):
+        spool = name.removeprefix(VALVE_SIGNAL_PREFIX)
+        if spool in machine.locked_joints or spool.removesuffix("_b") in machine.locked_joints:
+            continue  # the valve of a joint that is held moves nothing
+        if spool not in spools:
+            raise RecordingError(f"column '{name}' is of no valve, {suggest_names(spools, spool)}")
+        signals[spool] = table_column(table, name, "V")
+    if not signals:
+        names = ", ".join(f"'{VALVE_SIGNAL_PREFIX}{joint} [V]'" for joint in spools)
+        raise RecordingError(f"no signal of a valve, give at least one of {names}")
+    return signals
+
+
+def _initial_pressures(
+    joints: Sequence[str], table: Table, time: Array
+) -> dict[str, tuple[float, float]]:
+    """Of A and B at the start, by joint [Pa], from all samples near it."""
+    pressures: dict[str, tuple[float, float]] = {}
+    for joint in joints:
+        pair = [f"pressure_{joint}_{side}" for side in "ab"]
+        there = [name for name in pair if name in table.units]
+        if len(there) == 1:
+            missing = pair[pair[0] in there]
+            raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
+        if there:
+            a, b = (_value_at_first_sample(time, table_column(table, name), 0) for name in pair)
+            pressures[joint] = max(a, 0.0), max(b, 0.0)
+    return pressures
+
+
+def _initial_motion(
+    machine: Machine, table: Table, time: Array, signals: list[Array]
+) -> tuple[Array, Array]:
+    """Active coordinates and velocities at the start."""
+    for text in locked_joint_conflicts(machine, _table_columns(table), table.units):
+        raise RecordingError(f"{text}, do not lock it, or lock it where it is")
+    q_a, v_a = joint_motion(machine, table)
+    _warn_of_limits(machine, time, q_a)
+    steady = time <= _steady_duration(time, signals)
+    states = []
+    for i, joint in enumerate(machine.active):
+        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
+        states.append(
+            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
+        )
+    return np.array([x for x, _ in states]), np.array([v for _, v in states])
+
+
+def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
+    """Warn of measured coordinates (N, n) where the simulated machine cannot be."""
+    span = machine.upper - machine.lower
+    excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
+    excess /= np.where(np.isfinite(span), span, 1.0)
+    for i, joint in enumerate(machine.active):
+        k = int(np.argmax(excess[:, i]))
+        if excess[k, i] > _LIMIT_TOLERANCE:
+            limit = machine.lower[i] if q_a[k, i] < machine.lower[i] else machine.upper[i]
+            unit = machine.unit(joint)
+            warnings.warn(
+                f"measured '{joint}' goes to {q_a[k, i]:.6g} {unit} at t = {time[k]:.4g} s, "
+                f"beyond its limit {limit:.6g} {unit}: look at the limits and the sensor's zero",
+                CraneWarning,
+                stacklevel=5,
+            )
+
+
+def _table_columns(table: Table) -> dict[str, Array]:
+    return dict(zip(table.units, table.values.T, strict=True))
+
+
+def _steady_duration(time: Array, signals: list[Array]) -> float:
+    """Until when no valve is moved [s], within bounds."""
+    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
+    min_duration = float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1])
+    return max(min(first, _MAX_REST_DURATION), _START_FIT_DURATION, min_duration)
+
+
+def _start_of_joint(
+    time: Array, x: Array, v: Array | None, is_steady: np.ndarray
+) -> tuple[float, float]:
+    """Coordinate and velocity of a joint at the first sample, from all samples near it.
+
+    At rest, if over the stretch that is steady a straight line rises by no more than three times
+    what is left about it. Else by parabolas, see `_value_at_first_sample`: of velocities (N,)
+    where they were recorded, else of the coordinates.
+    """
+    steady_times, steady_positions = time[is_steady], x[is_steady]
+    if len(x) < _MIN_FIT_SAMPLES:
+        return float(x[0]), float(time_derivative(x, time)[0] if v is None else v[0])
+    line = np.polyfit(steady_times, steady_positions, 1)
+    residual_std = float(np.std(steady_positions - np.polyval(line, steady_times)))
+    if (
+        abs(line[0]) * (steady_times[-1] - steady_times[0]) <= 3 * residual_std
+        or np.ptp(steady_positions) == 0
+    ):
+        return float(steady_positions.mean()), 0.0
+    return _value_at_first_sample(time, x, 0), _value_at_first_sample(
+        time, x, 1
+    ) if v is None else _value_at_first_sample(time, v, 0)
+
+
+def _value_at_first_sample(time: Array, x: Array, order: int) -> float:
+    """Value (order 0) or rate (1) at the first sample, of parabolas over ever longer stretches.
+
+    Longer ones have less noise, as long as they agree with all shorter ones within two standard
+    deviations of both (Lepski 1990).
+    """
+    lowest, highest, estimate = -np.inf, np.inf, 0.0
+    last = max(
+        int(np.searchsorted(time, time[0] + _START_FIT_DURATION, side="right")), _MIN_FIT_SAMPLES
+    )
+    if (
+        order == 0 and len(x) > _MIN_FIT_SAMPLES
+    ):  # the sample itself, its noise by third differences
+        std = float(np.sqrt(np.mean(np.diff(x[:last], 3) ** 2) / 20))
+        estimate, lowest, highest = float(x[0]), x[0] - 2 * std, x[0] + 2 * std
+    count = _MIN_FIT_SAMPLES
+    while count <= last:
+        value, std = _fit_parabola(time[:count], x[:count], order)
+        if value + 2 * std < lowest or value - 2 * std > highest:
+            break
+        lowest, highest = max(lowest, value - 2 * std), min(highest, value + 2 * std)
+        estimate, count = value, count + max(1, count // 2)
+    return estimate
+
+
+def _fit_parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
+    """Value or rate of a parabola at the first instant, and its standard deviation."""
+    A = np.vander(time - time[0], 3)
+    values, *_ = np.linalg.lstsq(A, x, rcond=None)
+    variance = float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)
+    std = np.sqrt(variance * np.diag(np.linalg.pinv(A.T @ A)))
+    return float(values[2 - order]), float(std[2 - order])

@@ -1,0 +1,323 @@
+"""What is to be said of a run: limits passed, energy lost or gained, friction that chatters."""
+
+import numpy as np
+
+from crane.codegen import LayoutView
+from crane.common.samples import MAX_COORDINATE, Array
+from crane.common.scratch_arrays import release_pages
+from crane.description.ground_contact import Contact
+from crane.dynamics.frame_jacobians import FrameJacobians
+from crane.dynamics.joint_forces import JointForces
+from crane.machine import Machine
+from crane.motion.limit_violations import limit_tolerances
+
+_MAX_CONTACT_FORCE_RATIO = (
+    3.0  # weights of the machine, with which a contact may press at the start
+)
+_MAX_NAMED_JOINTS = 3  # joints beyond their limits that are named
+_MAX_RELATIVE_IMBALANCE = 5e-3  # share of the energy that went through
+_MAX_STROKE_EXCESS = 5e-3  # share of a cylinder's stroke, of which no steel gives way
+_MAX_STOP_ENERGY_GAIN = 0.05  # share of what a stop held at most
+_SMOOTHING_RANGE = 3.0  # smoothing velocities, below which friction turns
+_MAX_DISSIPATION_ERROR = 0.2  # of what is taken out over a step
+_MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE = 3, 1e-3  # samples that may, of all
+_BLOCK_SAMPLES = 20000  # samples looked at at once
+
+
+def run_warnings(
+    machine: Machine,
+    time: Array,
+    rows: LayoutView,
+    step: float,
+    has_fixed_steps: bool,
+    is_exact: bool = True,
+) -> list[str]:
+    """What to say of a run.
+
+    The energies are integrated with the motion, so they tell when the step is too long.
+
+    Args:
+        machine: The machine.
+        time: (N,) [s].
+        rows: See `integrate`.
+        step: [s].
+        has_fixed_steps: Whether the method's steps are these, whatever their error.
+        is_exact: Whether the formulation keeps its energy.
+
+    """
+    texts = (
+        passed_limits_text(machine, time, rows.q),
+        passed_strokes_text(machine, time, rows.q),
+        friction_chatter_text(machine, time, rows, step) if has_fixed_steps else "",
+        energy_imbalance_text(rows, step, _energy_imbalance(rows)) if is_exact else "",
+    )
+    return [text for text in texts if text]
+
+
+def find_invalid_motion(
+    machine: Machine, time: Array, rows: LayoutView, step: float, is_exact: bool = True
+) -> tuple[int, str] | None:
+    """From which instant on a run is no motion of the machine, and why; None if it is one.
+
+    A piston has left its cylinder, or an end stop has given back more energy than it took.
+    Arguments as those of `run_warnings`.
+    """
+    departure = find_piston_outside_cylinder(machine, time, rows.q)
+    return departure or (
+        find_stop_energy_gain(machine, time, rows, step, _energy_imbalance(rows))
+        if is_exact
+        else None
+    )
+
+
+def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
+    """What to say of joints that went beyond limits where nothing stops them, else nothing.
+
+    Args:
+        machine: The machine.
+        time: (N,) [s].
+        q: (N, nv) the motion.
+    """
+    lower, upper = machine.coordinates.lower, machine.coordinates.upper
+
+    def beyond(i: int) -> Array:
+        release_pages()
+        return np.asarray(np.maximum(lower[i] - q[:, i], q[:, i] - upper[i]))
+
+    largest_excess = np.array([beyond(i).max() for i in range(len(lower))])
+    with_end_stop = {stop.joint for stop in machine.end_stops}
+    slack = limit_tolerances(machine)
+    passed_columns = [
+        i for i in np.flatnonzero(largest_excess > slack) if machine.joints[i] not in with_end_stop
+    ]
+    if not passed_columns:
+        return ""
+    units = machine.closure.units
+    passed_columns.sort(
+        key=lambda i: -largest_excess[i] / min(upper[i] - lower[i], MAX_COORDINATE * units[i])
+    )
+    words = []
+    for i in passed_columns[:_MAX_NAMED_JOINTS]:
+        joint, first = machine.joints[i], int(np.argmax(beyond(int(i)) > slack[i]))
+        limit = lower[i] if q[first, i] < lower[i] else upper[i]
+        unit = machine.unit(joint)
+        words.append(
+            f"'{joint}' passes its limit {limit:.4g} {unit} at t = {time[first]:.4g} s, by up to "
+            f"{largest_excess[i]:.3g} {unit}"
+        )
+    more = (
+        f" and {len(passed_columns) - _MAX_NAMED_JOINTS} more joints"
+        if len(passed_columns) > _MAX_NAMED_JOINTS
+        else ""
+    )
+    one = len(passed_columns) == 1
+    return (
+        f"{', '.join(words)}{more}: nothing stops {'it' if one else 'them'} there, give "
+        f"{'it an end stop' if one else 'them end stops'}"
+    )
+
+
+def passed_strokes_text(machine: Machine, time: Array, q: Array) -> str:
+    """What to say of cylinders whose stops give way as no steel does, else nothing.
+
+    Arguments as those of `passed_limits_text`.
+    """
+    cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
+    with_end_stop = {stop.joint for stop in machine.end_stops}
+    words = []
+    for joint in cylinders:
+        release_pages()
+        i = machine.column(joint)
+        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+        depth = np.maximum(lower - q[:, i], q[:, i] - upper)
+        deepest, max_depth = int(depth.argmax()), _MAX_STROKE_EXCESS * (upper - lower)
+        if joint in with_end_stop and depth[deepest] > max_depth:
+            words.append(
+                f"the piston of '{joint}' is {depth[deepest]:.3g} m beyond its stroke at "
+                f"t = {time[deepest]:.4g} s"
+            )
+    if not words:
+        return ""
+    return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
+
+
+def find_piston_outside_cylinder(
+    machine: Machine, time: Array, q: Array
+) -> tuple[int, str] | None:
+    """When a piston is beyond all room of its chambers, hoses among it, and what to say of it.
+
+    Arguments as those of `passed_limits_text`.
+    """
+    cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
+    for joint, cylinder in cylinders.items():
+        if cylinder.motor:
+            continue
+        release_pages()
+        i = machine.column(joint)
+        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+        lowest, highest = (
+            lower - cylinder.hose_a / cylinder.area_a,
+            upper + cylinder.hose_b / cylinder.area_b,
+        )
+        if (is_outside := (q[:, i] <= lowest) | (q[:, i] >= highest)).any():
+            first = int(np.argmax(is_outside))
+            chamber = "A" if q[first, i] <= lowest else "B"
+            return first, (
+                f"at t = {time[first]:.4g} s the piston of '{joint}' has left its cylinder, whose "
+                f"chamber {chamber} has no room: give '{joint}' an end stop (end_stops)"
+            )
+    return None
+
+
+def buried_contact_text(machine: Machine, q: Array) -> str:
+    """What to say of a contact deep in the ground at a posture (nq,), else nothing."""
+    contacts = [force for force in machine.external_forces if isinstance(force, Contact)]
+    if not contacts:
+        return ""
+    weight = 9.81 * sum(inertia.mass for inertia in machine.model.inertias)
+    frames = FrameJacobians(machine)
+    frames.set_configuration(q)
+    for contact in contacts:
+        height = float(
+            contact.ground.distance_and_normal(
+                frames.frame_pose(contact.frame).translation.tolist()
+            )[0]
+        )  # type: ignore[arg-type]
+        depth = contact.radius - height
+        if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
+            return (
+                f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight "
+                f"presses it in by {weight / contact.stiffness:.2g} m: start higher"
+            )
+    return ""
+
+
+def _energy_imbalance(rows: LayoutView) -> Array:
+    """(N,) work less change of energy less dissipation [J]: what a run has lost by its steps."""
+    stored = rows.kinetic[:, 0] + rows.potential[:, 0]
+    imbalance_over_time: Array = rows.work.sum(axis=1) - rows.lost[:, 0] - stored + stored[0]
+    return imbalance_over_time
+
+
+def _energy_throughput(rows: LayoutView) -> float:
+    """The energy that went through [J]."""
+    parts = rows.work, rows.lost, rows.kinetic, rows.potential
+    return float(max(np.ptp(part) for part in parts))
+
+
+def find_stop_energy_gain(
+    machine: Machine, time: Array, rows: LayoutView, step: float, energy_imbalance: Array
+) -> tuple[int, str] | None:
+    """When a stop was met that gave back more energy than it took, and what to say of it."""
+    min_gain = _MAX_RELATIVE_IMBALANCE * _energy_throughput(rows)
+    if not np.ptp(energy_imbalance) > min_gain:
+        return None
+    for stop in machine.end_stops:
+        i = machine.column(stop.joint)
+        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+        depth = np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper)
+        edges = np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
+        for first, behind in edges.reshape(-1, 2).tolist():
+            before, after = max(first - 1, 0), min(behind, len(energy_imbalance) - 1)
+            stored_energy = 0.5 * stop.stiffness * float(depth[first:behind].max()) ** 2
+            energy_gain = float(energy_imbalance[before] - energy_imbalance[after])
+            if energy_gain > max(_MAX_STOP_ENERGY_GAIN * stored_energy, min_gain):
+                return first, (
+                    f"at t = {time[first]:.4g} s the end stop of '{stop.joint}' gives back "
+                    f"{energy_gain:.2g} J more than it takes, so the step of {step:g} s is too "
+                    f"long "
+                    "for it: shorten it, or let method DOP853 choose it"
+                )
+    return None
+
+
+def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step: float) -> str:
+    """What to say of smoothed friction that steps did not follow, else nothing.
+
+    Where a step of a fixed length is too long for a slope that turns within it, friction changes
+    its sign from stage to stage: what it took out over the step is not what its power at both
+    ends says.
+    """
+    laws = machine.friction.items()
+    smoothings = {
+        machine.column(x): f.smoothing for x, f in laws if f.smoothing and f.breakaway_force
+    }
+    columns = list(smoothings)
+    if not columns:
+        return ""
+    dissipated_energy = rows.lost[:, 0]
+    dissipated_per_step, energy_tolerance = (
+        np.diff(dissipated_energy),
+        1e-6 * float(np.diff(dissipated_energy).max()),
+    )
+    friction = np.einsum("ni,ni->n", rows.friction, rows.v_a)
+    suspect_steps = np.flatnonzero(
+        _energies_differ(dissipated_per_step, _midpoint_means(friction) * step, energy_tolerance)
+    )
+    forces, max_slow_velocities = (
+        JointForces(machine),
+        _SMOOTHING_RANGE * np.array(list(smoothings.values())),
+    )
+    count, names, first = 0, set(), len(time)
+    for start in range(
+        0, len(suspect_steps), _BLOCK_SAMPLES
+    ):  # with dampers and stops, and where they turn
+        block = suspect_steps[start : start + _BLOCK_SAMPLES]
+        power, is_turning = (
+            np.zeros((2, len(block))),
+            np.zeros((len(block), len(columns)), dtype=bool),
+        )
+        for end, at in enumerate((block, block + 1)):
+            q = rows.q[at]
+            v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[at])
+            braking = forces.passive_forces(q, 0.0 * v) - forces.passive_forces(q, v)
+            power[end] = friction[at] + np.einsum("ni,ni->n", v, braking)
+            is_turning |= np.abs(v[:, columns]) < max_slow_velocities
+        is_inconsistent = _energies_differ(
+            dissipated_per_step[block], 0.5 * step * power.sum(axis=0), energy_tolerance
+        )
+        is_inconsistent &= is_turning.any(axis=1)
+        if is_inconsistent.any():
+            count += int(is_inconsistent.sum())
+            first = min(first, int(block[is_inconsistent.argmax()]))
+            names |= {columns[i] for i in np.flatnonzero(is_turning[is_inconsistent].any(axis=0))}
+    if count <= max(_MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE * len(time)):
+        return ""
+    joints = [f"'{machine.joints[i]}'" for i in sorted(names)]
+    more = (
+        f" and {len(joints) - _MAX_NAMED_JOINTS} more joints"
+        if len(joints) > _MAX_NAMED_JOINTS
+        else ""
+    )
+    return (
+        f"friction of {', '.join(joints[:_MAX_NAMED_JOINTS])}{more} chatters in {count} of "
+        f"{len(time)} "
+        f"samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not follow its "
+        "smoothing, leave that out, so that it sticks, or shorten the step"
+    )
+
+
+def _midpoint_means(values: Array) -> Array:
+    """(N - 1,) of each two neighbours."""
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:
+    """Where energies (N,) [J] are not the same."""
+    gap = np.abs(one - other)
+    return (gap > _MAX_DISSIPATION_ERROR * np.maximum(np.abs(one), np.abs(other))) & (
+        gap > tolerance
+    )
+
+
+def energy_imbalance_text(rows: LayoutView, step: float, energy_imbalance: Array) -> str:
+    """What to say if a simulation does not keep its energy, else nothing."""
+    gap = float(np.abs(energy_imbalance).max())
+    throughput = _energy_throughput(rows)
+    rounding = 1e-12 * float(max(np.abs(rows.kinetic).max(), np.abs(rows.potential).max()))
+    if gap <= _MAX_RELATIVE_IMBALANCE * throughput + rounding:
+        return ""
+    return (
+        f"work, energy and dissipation differ by {gap:.2g} J of {throughput:.2g} J, so the "
+        f"step of {step:g} s is too long: shorten it, or let method DOP853 choose it"
+    )

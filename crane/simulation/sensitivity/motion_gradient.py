@@ -1,0 +1,240 @@
+"""How a number that is made of a whole motion depends on all numbers of a machine."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.codegen import LayoutView
+from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array
+from crane.control import Controller, ValveCommand
+from crane.description.sensors import VELOCITY_SUFFIX
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+from crane.simulation.sensitivity.adjoint_integration import AdjointIntegrator
+from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
+from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
+from crane.simulation.sensitivity.simulation_constants import SimulationConstants
+from crane.simulation.simulated_readings import read_simulation
+from crane.simulation.simulation_run import Force, Progress
+
+Functional = Callable[[Array, Array], tuple[ArrayLike, ArrayLike]]
+"""Times (N + 1,), outputs (N + 1, k) -> J, dJ/dy (N + 1, k); of several, with an axis first."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gradient(OneLineRepr):
+    """A motion, a number J made of it, and the derivatives of J by numbers of the machine.
+
+    Attributes:
+        recording: The motion.
+        outputs: Names (k,) of what is observed.
+        output_values: (N + 1, k) these, SI units.
+        parameters: Names (p,) of the numbers.
+        values: (p,) of these.
+        functional_value: J; (K,) of several.
+        derivatives: (p,) dJ/dp, SI units; (K, p) of several.
+    """
+
+    recording: Recording
+    outputs: tuple[str, ...]
+    output_values: Array
+    parameters: tuple[str, ...]
+    values: Array
+    functional_value: Array
+    derivatives: Array
+
+    def _one_line(self) -> str:
+        """Of what, by how much."""
+        return f"Gradient of {', '.join(self.outputs)} by {len(self.parameters)} numbers"
+
+    def derivative(self, parameter: str) -> Array:
+        """DJ / d number; (K,) of several.
+
+        Raises:
+            InputError: There is no such number.
+        """
+        if parameter not in self.parameters:
+            raise InputError(
+                f"'{parameter}' is not among them, {suggest_names(self.parameters, parameter)}"
+            )
+        found: Array = self.derivatives[..., self.parameters.index(parameter)]
+        return found
+
+    def to_text(self, max_rows: int = 20) -> str:
+        """A table, Markdown: what matters most, by what a hundredth of each number does to J."""
+        slopes, total = np.atleast_2d(self.derivatives), np.atleast_1d(self.functional_value)
+        effects = np.abs(slopes * 0.01 * self.values)
+        order = np.argsort(-effects.max(axis=0), kind="stable")[:max_rows].tolist()
+        heads = (
+            ["J"] if self.functional_value.ndim == 0 else [f"J{i + 1}" for i in range(len(total))]
+        )
+        lines = [f"| number | value | {' | '.join(f'1 % does to {head}' for head in heads)} |"]
+        lines += ["| --- | ---: |" + " ---: |" * len(heads)]
+        for i in order:
+            cells = " | ".join(f"{x:.3g}" for x in 0.01 * self.values[i] * slopes[:, i])
+            lines.append(f"| {self.parameters[i]} | {self.values[i]:.6g} | {cells} |")
+        said = ", ".join(f"{head} = {x:.6g}" for head, x in zip(heads, total, strict=True))
+        return "\n".join([*lines, "", f"{said}; {len(order)} of {len(self.parameters)} numbers."])
+
+
+def gradient(
+    machine: Machine | str | Path,
+    controller: Controller | ValveCommand | Force | None = None,
+    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    duration: float | None = None,
+    step: float = 1e-3,
+    *,
+    functional: Functional | ArrayLike,
+    parameters: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    method: str | None = None,
+    tolerance: float | None = None,
+    progress: Progress | None = None,
+) -> Gradient:
+    """Simulate a machine, with the exact derivatives of a sum over its motion by many numbers.
+
+    Of J = sum over instants of w_i . y_i, or of any J(y) with dJ/dy_i = w_i, with the slopes that
+    `sensitivities` gives as S,
+
+        dJ/dp = sum_i w_i . (dy_i/dp),
+
+    without these: a way back along the motion gathers what all numbers of the simulation do to J,
+    at a cost that does not grow with how many are asked for; see
+    `crane.simulation.sensitivity.adjoint_integration`. What a number of the machine does to those
+    of the simulation is found beforehand, for each by itself.
+
+    Args:
+        machine: The machine, or what `crane.load` takes.
+        controller: See `sensitivities`.
+        initial: See `simulate`.
+        duration: See `simulate`.
+        step: See `simulate`.
+        functional: J: weights w (N + 1, k) of the outputs at N + 1 instants; or a function of
+            their times (N + 1,) and of the outputs (N + 1, k) that gives J and w. Several at once
+            have an axis more, (K,) and (K, N + 1, k).
+        parameters: Numbers, see `sensitivities`; all of the machine that change something if not
+            given.
+        outputs: See `sensitivities`.
+        method: See `simulate`.
+        tolerance: See `simulate`.
+        progress: See `simulate`.
+
+    Raises:
+        InputError: As `sensitivities`, or weights of another shape.
+        SimulationError: As `sensitivities`.
+    """
+    progress = progress_reporter(progress)
+    problem = SensitivityProblem.from_arguments(
+        machine, controller, initial, duration, step, outputs, method, tolerance
+    )
+    directions = problem.directions
+    parameters = None if parameters is None else list(dict.fromkeys(parameters))
+    for name in parameters or ():
+        directions.parameter_value(name)
+    track = SimulatedMotion(problem.simulation, progress)
+    directions_by_name = (
+        directions.all_derivatives(track.time)
+        if parameters is None
+        else directions.derivatives(parameters, track.time)
+    )
+    for name in [x for x, direction in directions_by_name.items() if direction.references.any()]:
+        if parameters is not None:
+            raise InputError(
+                f"'{name}' changes when signals arrive, which a gradient takes as they are: ask "
+                "`sensitivities` for it"
+            )
+        del directions_by_name[name]
+    if not directions_by_name:
+        raise InputError("no number is named that changes anything, give `by`")
+    sizes = {name: directions.typical_change(name) for name in directions_by_name}
+    changes = _largest_changes(directions_by_name, sizes)
+    integrator = AdjointIntegrator(
+        track, problem.outputs, directions.nominal_constants(track.time), changes
+    )
+    parts = track.layout.view(track.rows[::2])
+    recording = problem.record_motion(track.time[::2], parts)
+    observed = _output_values(track.chart.machine, recording, parts, problem.outputs)
+    total, weights = _functional_and_weights(functional, recording.time, observed)
+    gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
+    # references are the controller's, which none of these changes
+    derivatives = sum(
+        (
+            getattr(gradients, part)
+            @ np.array([getattr(x, part) for x in directions_by_name.values()]).T
+            for part in SimulationConstants._fields
+            if part != "references"
+        ),
+        np.zeros(()),
+    )
+    for note in track.notes:
+        warnings.warn(note, CraneWarning, stacklevel=2)
+    return Gradient(
+        recording,
+        problem.outputs,
+        observed,
+        tuple(directions_by_name),
+        np.array([directions.parameter_value(name) for name in directions_by_name]),
+        total,
+        derivatives.reshape(*total.shape, -1),
+    )
+
+
+def _largest_changes(
+    directions: Mapping[str, SimulationConstants], sizes: Mapping[str, float]
+) -> SimulationConstants:
+    """By how much numbers of a simulation change that do, see `AdjointIntegrator`."""
+    total: list[Array] = []
+    for name, direction in directions.items():
+        still = direction._replace(references=np.zeros(direction.references.shape[-1]))
+        rows = [sizes[name] * np.abs(part) for part in still]
+        total = [*map(np.maximum, total, rows)] if total else rows
+    return SimulationConstants(*total)
+
+
+def _functional_and_weights(
+    functional: Functional | ArrayLike, time: Array, output_values: Array
+) -> tuple[Array, Array]:
+    """J and dJ/dy (N + 1, k), or several.
+
+    Raises:
+        InputError: They are of another shape, or not finite.
+    """
+    if callable(functional):
+        total, weights = (np.asarray(x, dtype=np.float64) for x in functional(time, output_values))
+    else:
+        weights = np.asarray(functional, dtype=np.float64)
+        if weights.shape[-2:] == output_values.shape:
+            total = np.asarray(np.tensordot(weights, output_values, 2))
+        else:
+            total = np.zeros(weights.shape[:-2])
+    if weights.shape != (*total.shape, *output_values.shape) or total.ndim > 1:
+        count, k = output_values.shape
+        raise InputError(
+            f"weights of outputs have the shape {weights.shape}, give ({count}, {k}): {count} "
+            f"instants, {k} outputs"
+        )
+    if not (np.isfinite(weights).all() and np.isfinite(total).all()):
+        raise InputError("weights of outputs are not finite, look at the function")
+    return total, weights
+
+
+def _output_values(
+    machine: Machine, recording: Recording, parts: LayoutView, outputs: Sequence[str]
+) -> Array:
+    """Outputs (N + 1, k), those of passive joints' velocities among them."""
+    columns, found = recording.columns(), []
+    for name in outputs:
+        joint = name.removesuffix(VELOCITY_SUFFIX)
+        if name not in columns and joint in machine.joints:
+            rows = machine.closure.gamma(parts.q)[:, machine.joints.index(joint)]
+            found.append(np.einsum("ni,ni->n", rows, parts.v_a))
+        else:
+            found.append(read_simulation(machine, recording, [name])[:, 0])
+    return np.column_stack(found)

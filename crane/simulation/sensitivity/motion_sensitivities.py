@@ -1,0 +1,199 @@
+"""How a simulated motion depends on numbers of the machine and on its start."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.control import Controller, ValveCommand
+from crane.description.sensors import (
+    FORCE_SUFFIX,
+    FORCE_UNITS,
+    INCLINATION_PREFIX,
+    VELOCITY_SUFFIX,
+    VELOCITY_UNITS,
+)
+from crane.machine import Machine
+from crane.recordings import timeseries
+from crane.recordings.recording import Recording
+from crane.recordings.timeseries import Table
+from crane.simulation.sensitivity.parameter_directions import START_PREFIX
+from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
+from crane.simulation.sensitivity.simulation_constants import SimulationConstants
+from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
+from crane.simulation.simulation_run import Force, Progress
+
+ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivities(OneLineRepr):
+    """A motion, and its derivatives by numbers.
+
+    Attributes:
+        recording: The motion.
+        outputs: Names (k,) of what is observed.
+        parameters: Names (p,) of the numbers.
+        values: (p,) of these.
+        derivatives: (N, k, p) derivatives of the outputs, SI units.
+    """
+
+    recording: Recording
+    outputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    values: Array
+    derivatives: Array
+
+    def _one_line(self) -> str:
+        """Of what, by what."""
+        return f"Sensitivities of {', '.join(self.outputs)} by {', '.join(self.parameters)}"
+
+    def derivative(self, output: str, parameter: str) -> Array:
+        """(N,) d output / d number over time.
+
+        Raises:
+            InputError: There is no such output or number.
+        """
+        for name, names in ((output, self.outputs), (parameter, self.parameters)):
+            if name not in names:
+                raise InputError(f"'{name}' is not among them, {suggest_names(names, name)}")
+        found: Array = self.derivatives[
+            :, self.outputs.index(output), self.parameters.index(parameter)
+        ]
+        return found
+
+    @property
+    def typical_changes(self) -> Array:
+        """(p,) small changes of the numbers: a hundredth, or a thousandth [SI] of starts and 0."""
+        is_parameter = [not name.startswith(START_PREFIX) for name in self.parameters]
+        steps: Array = np.where(
+            is_parameter & (self.values != 0), 0.01 * np.abs(self.values), 1e-3
+        )
+        return steps
+
+    def unit(self, output: str) -> str:
+        """SI unit of an output."""
+        units = self.recording.units | self.recording.channel_units
+        if output in units:
+            return units[output]
+        if output.startswith(INCLINATION_PREFIX):
+            return "rad/s" if output.endswith(VELOCITY_SUFFIX) else "rad"
+        for end, kinds in ((VELOCITY_SUFFIX, VELOCITY_UNITS), (FORCE_SUFFIX, FORCE_UNITS)):
+            if (joint := output.removesuffix(end)) != output and joint in units:
+                return kinds[units[joint]]
+        return ""
+
+    def to_text(self) -> str:
+        """A table, Markdown: what a small change of each number does to each output."""
+        effects = self.derivatives * self.typical_changes
+        units = [
+            display_unit(self.unit(output), float(np.abs(effects[:, k]).max()))
+            for k, output in enumerate(self.outputs)
+        ]
+        head = [f"{x} [{unit}]" for x, (unit, _) in zip(self.outputs, units, strict=True)]
+        lines = [f"| number | value | more by | {' | '.join(head)} |"]
+        lines += ["| --- | ---: | ---: |" + " ---: |" * len(head)]
+        for i, (name, value) in enumerate(zip(self.parameters, self.values, strict=True)):
+            sizes = np.sqrt(np.mean(effects[:, :, i] ** 2, axis=0))
+            shown = [scale * x for x, (_, scale) in zip(sizes, units, strict=True)]
+            cells = [f"{x:.3g}" if x > ZERO_TOLERANCE else "0" for x in shown]
+            lines.append(
+                f"| {name} | {value:.6g} | {self.typical_changes[i]:.3g} | {' | '.join(cells)} |"
+            )
+        return "\n".join([*lines, "", "Root mean square of the change over the motion."])
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write all derivatives over time, a column "OUTPUT by NUMBER" each.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        names = [f"{output} by {name}" for output in self.outputs for name in self.parameters]
+        values = np.column_stack(
+            [self.recording.time, self.derivatives.reshape(len(self.derivatives), -1)]
+        )
+        units = {"time": "s"} | dict.fromkeys(names, "")
+        timeseries.write_table(path, Table(units, values, {"machine": self.recording.machine}))
+
+
+def sensitivities(
+    machine: Machine | str | Path,
+    controller: Controller | ValveCommand | Force | None = None,
+    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    duration: float | None = None,
+    step: float = 1e-3,
+    *,
+    parameters: Sequence[str],
+    outputs: Sequence[str] | None = None,
+    method: str | None = None,
+    tolerance: float | None = None,
+    progress: Progress | None = None,
+) -> Sensitivities:
+    """Simulate a machine, with the exact derivatives of its motion by numbers.
+
+    With the minimal state s = (q_A, v_A, controller), s' = r(s, t, p), and S = ds/dp,
+
+        S' = dr/ds S + dr/dp,    S(0) = ds(0)/dp,
+
+    between the instants at which a joint starts or stops, at which S jumps by (r - r_+) dt/dp; dr
+    is differentiated operation by operation through the closed loops. The equations are solved
+    along the states of the simulation, by Lobatto's method IIIC, extrapolated to order 5, over its
+    recorded steps, which are taken in up to 4,096 parts where something jumps.
+
+    Args:
+        machine: The machine, or what `crane.load` takes.
+        controller: See `simulate`; it stays the same where the machine changes, as do starting
+            coordinates.
+        initial: See `simulate`.
+        duration: See `simulate`.
+        step: See `simulate`.
+        parameters: Numbers of the machine as `crane.description.parameters` lists them, such as
+            "payload.mass" or "oil.bulk_modulus", and `start.JOINT`, `start.JOINT_velocity`
+            of active joints.
+        outputs: Names of joints, `JOINT_velocity`, `JOINT_force` of active ones, channels of the
+            circuit such as `pressure_JOINT_a`, "kinetic", "potential", `tip_x`,
+            `inclination_LINK` and `inclination_LINK_velocity`. If not given, the active joints,
+            and with valves the chambers' pressures.
+        method: See `simulate`.
+        tolerance: See `simulate`.
+        progress: See `simulate`.
+
+    Raises:
+        InputError: Unknown names, a machine that floats, or one without formulas.
+        SimulationError: The motion comes to a dead centre; else as `simulate`.
+    """
+    progress = progress_reporter(progress)
+    if not parameters:
+        raise InputError("no number is named, give `by` such as ['payload.mass']")
+    problem = SensitivityProblem.from_arguments(
+        machine, controller, initial, duration, step, outputs, method, tolerance
+    )
+    directions = problem.directions
+    values = np.array([directions.parameter_value(name) for name in parameters])
+    sizes = np.array([directions.typical_change(name) for name in parameters])
+
+    def setup(times: Array) -> tuple[SimulationConstants, SimulationConstants]:
+        every = directions.derivatives(list(dict.fromkeys(parameters)), times)
+        parts = zip(*(every[name] for name in parameters), strict=True)
+        return directions.nominal_constants(times), SimulationConstants(*map(np.array, parts))
+
+    solution = integrate_sensitivities(
+        problem.simulation, problem.outputs, setup, sizes, progress=progress
+    )
+    for note in solution.notes:
+        warnings.warn(note, CraneWarning, stacklevel=2)
+    return Sensitivities(
+        problem.record_motion(solution.time, solution.parts),
+        problem.outputs,
+        tuple(parameters),
+        values,
+        solution.derivatives,
+    )

@@ -1,0 +1,344 @@
+"""The rate of a simulated machine as formulas of its state and of all its numbers."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
+from crane.closure.spatial_vectors import Vector
+from crane.codegen import FormulaTooLongError, Program, Scalar, SymbolicExpression, Tape
+from crane.codegen.differentiation import directional_derivative
+from crane.codegen.symbolic import (
+    add_vectors,
+    apply_function,
+    dot,
+    matvec,
+    subtract_vectors,
+    transpose,
+)
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.control import TracedController, ValveDrive
+from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
+from crane.dynamics.external_forces import reference_counts as counts_of
+from crane.machine import Machine
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.machine_formulas import (
+    MachineFormulas,
+    controller_formula_key,
+    machine_program,
+    reference_count,
+    trace_machine,
+)  # fmt: skip
+from crane.simulation.integration.state_layouts import state_layout
+from crane.simulation.sensitivity.simulation_constants import FRAME_SIZE, SimulationConstants
+
+_AT_REST_SUFFIX = "_rest"
+
+
+@dataclass(frozen=True)
+class DifferentiatedFormulas:
+    """What is differentiated, on one tape.
+
+    Attributes:
+        tape: The tape; its arguments are geometry, numbers, settings, frames, references, state.
+        machine: The machine at the state.
+        rate: (m,) of the minimal state.
+        outputs: What is observed, with a factor of its derivative each.
+        transition_margin: See `StickSlipAccelerations.transition_margin`.
+    """
+
+    tape: Tape
+    machine: MachineFormulas
+    rate: list[Scalar]
+    outputs: list[tuple[Scalar, Scalar]]
+    transition_margin: Scalar
+
+    @property
+    def all_values(self) -> list[Scalar]:
+        """Rate, outputs, margin, that derivatives are taken of."""
+        return [*self.rate, *(value for value, _ in self.outputs), self.transition_margin]
+
+
+class RateProgram:
+    """A machine's rate in machine code, and derivatives that a kind of it adds.
+
+    A kind writes `_add_derivatives`, which adds its formulas and routines to what is at rest or
+    not.
+
+    Args:
+        chart: The machine, in its own coordinates.
+        control: Its controller.
+        controller_state_count: Number of all the controller's states.
+        stiff_state_count: Number of those that act back, the first.
+        outputs: What is observed: names, see `sensitivities`.
+        variable_constants: Which numbers change in some direction.
+
+    Attributes:
+        state_size: Length of the minimal state.
+        outputs: What is observed.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+        InputError: An output that is not there.
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        control: TracedController,
+        controller_state_count: int,
+        stiff_state_count: int,
+        outputs: Sequence[str],
+        variable_constants: SimulationConstants,
+    ):
+        self._chart, self._control, self.outputs = chart, control, tuple(outputs)
+        self._stiff_state_count, self._variable_constants = stiff_state_count, variable_constants
+        machine = chart.machine
+        self._compiled_closure, self._mobility = (
+            machine.closure.compiled_closure,
+            len(machine.active),
+        )
+        self._state_layout, self.state_size = (
+            state_layout(machine, controller_state_count),
+            2 * self._mobility + stiff_state_count,
+        )
+        self._controller_columns = reference_count(control)
+        self._reference_columns = self._controller_columns + sum(
+            counts_of(machine.external_forces)
+        )
+        self._frames = observed_frames(machine, outputs)
+        self._folded_constants = (
+            np.where(
+                variable_constants.geometry != 0, np.nan, self._compiled_closure.geometry.constants
+            ),
+            np.where(
+                variable_constants.dynamics_constants != 0, np.nan, chart.dynamics.constant_pattern
+            ),
+        )
+        # what a circuit has not is 0 among its settings, and no part of the formulas
+        self._folded_settings = np.where(
+            variable_constants.settings != 0, np.nan, control.settings
+        )
+        form = controller_formula_key(
+            control, self._controller_columns, chart, controller_state_count, True
+        )
+        key = (
+            type(self).__name__,
+            form,
+            controller_state_count,
+            stiff_state_count,
+            *chart.formula_key,
+            self.outputs,
+            *self._frames,
+            *map(folding_pattern, (*self._folded_constants, self._folded_settings)),
+            *(
+                np.asarray(part != 0).tobytes()
+                for part in (
+                    variable_constants.geometry,
+                    variable_constants.dynamics_constants,
+                    variable_constants.settings,
+                    variable_constants.references,
+                    variable_constants.frames,
+                )
+            ),
+        )
+        if key not in self._compiled_closure.programs:
+            self._compiled_closure.programs[key] = machine_program(
+                machine, control, self._compiled_closure, key, self._build
+            )
+        self._program = self._compiled_closure.programs[key]
+
+    def evaluate_rate(
+        self, constants: SimulationConstants, state: Array, has_joints_at_rest: bool
+    ) -> Array:
+        """The rate (m,) of the minimal state.
+
+        Args:
+            constants: The simulation's numbers, with what sticks (see `Dynamics.set_stick_slip_modes`) and
+                one row of references.
+            state: As it is integrated.
+            has_joints_at_rest: Whether some joint is at rest.
+        """
+        out = np.empty(self.state_size)
+        self._program.call(
+            "rate" + _AT_REST_SUFFIX * has_joints_at_rest,
+            constants.geometry,
+            constants.dynamics_constants,
+            constants.settings,
+            constants.frames,
+            constants.references,
+            state,
+            out,
+        )
+        return out
+
+    def _call(self, routine: str, has_joints_at_rest: bool, *arguments: "int | Array") -> None:
+        self._program.call(routine + _AT_REST_SUFFIX * has_joints_at_rest, *arguments)
+
+    def _add_derivatives(
+        self, program: Program, suffix: str, formulas: DifferentiatedFormulas
+    ) -> None:
+        raise NotImplementedError
+
+    def _build(self, program: Program) -> None:
+        for added, rest in (("", False), (_AT_REST_SUFFIX, True)):
+            if rest and not self._chart.stick_slip.columns:
+                continue
+            rated = self._trace_formulas(rest)
+            self._add_derivatives(program, added, rated)
+            program.add_formula("rate" + added, 6, rated.rate)
+
+    def _trace_formulas(self, with_joints_at_rest: bool) -> DifferentiatedFormulas:
+        tape = Tape()
+        references = tape.load_vector(4, 0, self._reference_columns)
+        force_references = references[self._controller_columns :]
+        machine = trace_machine(
+            self._chart, tape, self._state_layout, 5, force_references, self._folded_constants
+        )
+        settings = FormulaConstants(tape, 2, self._folded_settings).vector(
+            0, len(self._folded_settings)
+        )
+        inputs = machine.controller_inputs(settings, references[: self._controller_columns])
+        tau, controller_rate = self._control.trace(inputs)
+        channels = (
+            self._control.channel_values(inputs) if isinstance(self._control, ValveDrive) else []
+        )
+        machine = machine.with_circuit_friction(self._control, inputs)
+        accelerations, dynamics_formulas = (
+            machine.accelerations(tau, with_joints_at_rest),
+            machine.dynamics_formulas,
+        )
+        active = self._chart.machine.closure.active
+        rate = [
+            *(dynamics_formulas.coordinate_derivatives[i] for i in active),
+            *accelerations.a_a,
+            *controller_rate[: self._stiff_state_count],
+        ]
+        observed = [
+            self._trace_output(name, machine, tape, tau, channels) for name in self.outputs
+        ]
+        return DifferentiatedFormulas(
+            tape, machine, rate, observed, accelerations.transition_margin
+        )
+
+    def _trace_output(
+        self,
+        name: str,
+        machine: MachineFormulas,
+        tape: Tape,
+        tau: Sequence[Scalar],
+        channel_formulas: Sequence[Scalar],
+    ) -> tuple[Scalar, Scalar]:
+        """What is observed and a factor of its derivative; names as in `sensitivities`."""
+        user_machine, control, sweep = (
+            self._chart.machine,
+            self._control,
+            machine.dynamics_formulas,
+        )
+        columns = {joint: i for i, joint in enumerate(user_machine.joints)}
+        if name in columns:
+            return sweep.q[columns[name]], 1.0
+        joint = name.removesuffix(VELOCITY_SUFFIX)
+        if joint in columns:
+            return sweep.rates[columns[joint] + 1], 1.0
+        joint = name.removesuffix(FORCE_SUFFIX)
+        if joint in user_machine.active:
+            return tau[user_machine.active.index(joint)], 1.0
+        if isinstance(control, ValveDrive):
+            channels = [channel for channel, _ in control.channels]
+            if name in channels:
+                return channel_formulas[channels.index(name)], 1.0
+        if name in ("kinetic", "potential"):
+            return getattr(sweep, name), 1.0
+        links = [link for link, _ in self._frames]
+        if (
+            not name.startswith((INCLINATION_PREFIX, "tip_"))
+            or observed_frame(user_machine, name) not in links
+        ):
+            raise InputError(
+                f"'{name}' is no output of '{user_machine.name}': take joints, forces, channels"
+            )
+        place = links.index(observed_frame(user_machine, name))
+        body = self._frames[place][1]
+        numbers = tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
+        return _frame_output(name, machine, body, numbers)
+
+
+@contextmanager
+def report_long_formulas(machine: Machine) -> Iterator[None]:
+    """Say in one line that formulas are too long.
+
+    Raises:
+        InputError: They are.
+    """
+    try:
+        yield
+    except FormulaTooLongError:
+        raise InputError(
+            f"the formulas of '{machine.name}' are too long to differentiate: lock joints"
+        ) from None
+
+
+def _frame_output(
+    name: str, machine: MachineFormulas, body: int, frame_constants: Vector
+) -> tuple[Scalar, Scalar]:
+    """Position of the tip, or inclination of a link's x axis and its rate."""
+    dynamics_formulas = machine.dynamics_formulas
+    kinematics = dynamics_formulas.posture
+    if not name.startswith(INCLINATION_PREFIX):
+        place = add_vectors(
+            kinematics.origin[body], matvec(kinematics.rotation[body], frame_constants[:3])
+        )
+        back = transpose(kinematics.rotation[0])
+        return matvec(back, subtract_vectors(place, kinematics.origin[0]))[
+            "xyz".index(name[-1])
+        ], 1.0
+    axis = matvec(kinematics.rotation[body], frame_constants[3:])
+    height = dot(axis, [row[2] for row in kinematics.rotation[0]])
+    flat = apply_function("sqrt", 1.0 - height * height)
+    if not name.endswith(VELOCITY_SUFFIX):
+        return height, 1.0 / flat
+    ways = dict(
+        zip(
+            map(operation_index, dynamics_formulas.q),
+            dynamics_formulas.coordinate_derivatives,
+            strict=True,
+        )
+    )
+    return directional_derivative([height], ways)[0] / flat, 1.0
+
+
+def observed_frame(machine: Machine, name: str) -> str:
+    """The link whose place or inclination is observed."""
+    inclined = name.startswith(INCLINATION_PREFIX)
+    return (
+        name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
+        if inclined
+        else str(machine.tip)
+    )
+
+
+def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str, int]]:
+    """Links whose place or inclination is observed, and their bodies in the geometry.
+
+    Raises:
+        InputError: An output that is not there.
+    """
+    found: dict[str, int] = {}
+    tips = {f"tip_{axis}" for axis in "xyz"} if machine.tip is not None else set()
+    for name in outputs:
+        if name in tips or name.startswith(INCLINATION_PREFIX):
+            link = observed_frame(machine, name)
+            frame = machine.model.frames[machine.frame(link)]
+            joint = int(frame.parentJoint)
+            found[link] = machine.coordinates.body_of_joint[joint]
+    return list(found.items())
+
+
+def operation_index(argument: Scalar) -> int:
+    """Of a number that was loaded."""
+    assert isinstance(argument, SymbolicExpression)
+    return argument.index

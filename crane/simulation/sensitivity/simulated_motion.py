@@ -1,0 +1,372 @@
+"""A recorded motion, and where along it the variational equations are looked at."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from crane.closure.constraint_structure import Indices
+from crane.common.errors import InputError, SimulationError
+from crane.common.samples import Array
+from crane.control import TracedController, ValveDrive
+from crane.dynamics import Dynamics
+from crane.dynamics.external_forces import state_count
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.state_layouts import row_layout
+from crane.simulation.integration.stick_slip_modes import StickSlipTransition
+from crane.simulation.sensitivity.forward_derivatives import ForwardDerivatives
+from crane.simulation.sensitivity.simulation_constants import SimulationConstants
+from crane.simulation.simulation_run import integrate, integrator_factory
+
+_STEPS_PER_SEGMENT = 400  # steps at once
+REFINEMENT_FACTOR, MAX_REFINEMENTS = 16, 3  # parts of a step that is too rough, how often
+_TIME_TOLERANCE = 1e-9  # of a step, between times that are one
+_MAX_CHECKED_SAMPLES = 500  # postures that are asked for a dead centre
+_EVENT_DIFFERENCE_STEP = 1e-6  # of a step, over which references change at an event
+
+
+class SimulationProblem(NamedTuple):
+    """A simulation to be.
+
+    Attributes:
+        dynamics: The machine.
+        control: Its controller.
+        initial: q_A and v_A at first.
+        step_count: How many.
+        step: [s] between instants.
+        method: See `simulate`.
+        tolerance: See `simulate`.
+    """
+
+    dynamics: Dynamics
+    control: TracedController
+    initial: tuple[Array, Array]
+    step_count: int
+    step: float
+    method: str | None = None
+    tolerance: float | None = None
+
+
+class MotionNodes(NamedTuple):
+    """Where a stretch of n steps is looked at: their ends and their middles.
+
+    Attributes:
+        times: (2 n + 1,) [s].
+        states: (2 n + 1, .).
+        previous_indices: (2 n + 1,) which of the recorded instants and middles is the last one.
+        interpolation_shares: (2 n + 1,) of the way to the next one.
+    """
+
+    times: Array
+    states: Array
+    previous_indices: Indices
+    interpolation_shares: Array
+
+    @property
+    def step_sizes(self) -> Array:
+        """(n,) of the steps [s]."""
+        lengths: Array = self.times[2::2] - self.times[:-2:2]
+        return lengths
+
+    def interpolate(self, values: Array) -> Array:
+        """Values (..., 2 n + 1, c) at the nodes of those (..., 2 N + 1, c) that are recorded."""
+        behind = np.minimum(self.previous_indices + 1, values.shape[-2] - 1)
+        share, one = self.interpolation_shares[:, None], values[..., self.previous_indices, :]
+        return np.ascontiguousarray((1.0 - share) * one + share * values[..., behind, :])
+
+
+class RecordedSegment(NamedTuple):
+    """Recorded steps between two instants; none from an instant to itself, where things switch.
+
+    What is observed at an instant is so in the last of the stretches that have it.
+
+    Attributes:
+        mode: Behind which of the switches.
+        first_instant: Instant.
+        last_instant: Instant.
+    """
+
+    mode: int
+    first_instant: int
+    last_instant: int
+
+
+class ResimulatedSegment(NamedTuple):
+    """A part of a step, which is simulated anew.
+
+    Attributes:
+        mode: Behind which of the switches.
+        state: At the beginning.
+        start_time: [s].
+        end_time: [s].
+        end_state: State at the end.
+    """
+
+    mode: int
+    state: Array
+    start_time: float
+    end_time: float
+    end_state: Array
+
+
+class TransitionJump(NamedTuple):
+    """An instant at which joints start or stop.
+
+    Attributes:
+        mode: Behind which of the switches, before it.
+        transition: What happens.
+    """
+
+    mode: int
+    transition: StickSlipTransition
+
+
+class SimulatedMotion:
+    """A motion simulated with the middles of its steps, which are nodes like their ends.
+
+    Args:
+        motion: What is simulated.
+        progress: See `simulate`.
+
+    Attributes:
+        chart: The machine.
+        control: Its controller.
+        controller_state_count: Number of the controller's states.
+        stiff_state_count: Number of those that act back, the first.
+        time: (2 N + 1,) of instants and the middles between them [s].
+        rows: (2 N + 1, .) there, see `integrate`.
+        layout: Of a row.
+        notes: What is to be said of the motion.
+        largest_states: (m,) of the minimal state, at least what a machine moves by; 1 of what
+            stays 0.
+        transitions: What started and stopped, the start first.
+        has_joints_at_rest: Whether some joint is at rest.
+
+    Raises:
+        InputError: A machine that has no formulas, or floats.
+        SimulationError: It comes to a dead centre; else as `simulate`.
+    """
+
+    def __init__(self, motion: SimulationProblem, progress: Callable[[float], None] | None):
+        dynamics, control, count, step = (
+            motion.dynamics,
+            motion.control,
+            motion.step_count,
+            motion.step,
+        )
+        machine, self.chart, self.control = (
+            dynamics.machine,
+            Chart.from_dynamics(dynamics),
+            control,
+        )
+        compiled = dynamics.backend == "compiled" and machine.has_traceable_forces
+        if not compiled or not isinstance(control, TracedController):
+            raise InputError(
+                f"'{machine.name}' with its controller has no formulas to differentiate: lock "
+                "joints, or write the controller as a Law, and loads as ExternalForce"
+            )
+        if machine.coordinates.floating_base_columns:
+            raise InputError(f"'{machine.name}' floats, sensitivities are of machines that stand")
+        if state_count(machine.external_forces):
+            raise InputError(
+                f"'{machine.name}' has contacts that give way along the ground, sensitivities "
+                "are of those without lateral stiffness"
+            )
+        self.chart.stick_slip.transitions = []
+        made = (dynamics, control, motion.initial, 2 * count, 0.5 * step, motion.method)
+        run = integrate(*made, progress, motion.tolerance, self.chart)
+        if run.stop is not None:
+            raise run.stop
+        time, parts, self.notes = run.time, run.rows, run.notes
+        self.time, self.controller_state_count, self._step, self.has_joints_at_rest = (
+            time,
+            parts.own.shape[1],
+            step,
+            False,
+        )
+        _check_dead_centres(self.chart, time, parts.q)
+        self.stiff_state_count = (
+            control.circuit.stiff_state_count
+            if isinstance(control, ValveDrive)
+            else self.controller_state_count
+        )
+        self.layout = row_layout(machine, control, self.controller_state_count)
+        self.rows = np.hstack([getattr(parts, name) for name in self.layout.parts])
+        self._states = self.rows[:, : self.layout.start_index("tau")]
+        make = integrator_factory(
+            dynamics, control, self.controller_state_count, motion.method, motion.tolerance
+        )
+        self._integrator = make(self.chart)
+        self.switches: list[StickSlipTransition] = self.chart.stick_slip.transitions
+        self.chart.stick_slip.transitions = None  # parts that are simulated anew are no news
+        seen, closure = self.chart.user_columns, machine.closure
+        minimal = np.hstack([parts.q[:, seen], parts.v_a, parts.own[:, : self.stiff_state_count]])
+        units = np.concatenate(
+            [closure.units[seen], closure.units[seen] / closure.characteristic_time]
+        )
+        self.largest_states: Array = np.abs(minimal).max(axis=0)
+        self.largest_states[self.largest_states == 0.0] = 1.0
+        self.largest_states[: len(units)] = np.maximum(self.largest_states[: len(units)], units)
+
+    def segments(self) -> list[RecordedSegment | ResimulatedSegment | TransitionJump]:
+        """What the motion consists of, in its order."""
+        segments_found: list[RecordedSegment | ResimulatedSegment | TransitionJump] = []
+        count, transition_index, first = len(self.time) // 2, 0, 0
+        transitions = self.switches[1:]
+        while first < count:
+            last = min(first + _STEPS_PER_SEGMENT, count)
+            if transition_index < len(transitions):
+                at = int(
+                    (transitions[transition_index].time - self.time[0]) / self._step
+                    + _TIME_TOLERANCE
+                )
+                last = min(last, at)
+            if last > first:
+                segments_found.append(RecordedSegment(transition_index, first, last))
+                first = last
+                continue
+            segments_found.append(RecordedSegment(transition_index, first, first))
+            begins, ends = self.time[2 * first], self.time[2 * first + 2]
+            state = self._states[2 * first]
+            while (
+                transition_index < len(transitions)
+                and transitions[transition_index].time < ends - _TIME_TOLERANCE * self._step
+            ):
+                switch = transitions[transition_index]
+                if switch.time - begins > _TIME_TOLERANCE * self._step:
+                    segments_found.append(
+                        ResimulatedSegment(
+                            transition_index, state, begins, switch.time, switch.state
+                        )
+                    )
+                    begins = switch.time
+                segments_found.append(TransitionJump(transition_index, switch))
+                transition_index, state = transition_index + 1, switch.state
+            segments_found.append(
+                ResimulatedSegment(
+                    transition_index, state, begins, ends, self._states[2 * first + 2]
+                )
+            )
+            first += 1
+        return [*segments_found, RecordedSegment(transition_index, count, count)]
+
+    def adopt_mode(self, mode: int) -> None:
+        """Joints do what they do behind one of the switches, the start being the first."""
+        sticking = self.chart.stick_slip
+        if self.switches:
+            switch = self.switches[mode]
+            sticking.slip_signs[:], sticking.is_held[:] = switch.slip_signs, switch.is_held
+            sticking.is_moving = switch.is_moving
+            sticking.apply_to(self.chart.dynamics)
+            self.has_joints_at_rest = bool(switch.is_held.any())
+
+    def recorded_nodes(self, segment: RecordedSegment) -> MotionNodes:
+        """The nodes of recorded steps."""
+        which = np.arange(2 * segment.first_instant, 2 * segment.last_instant + 1)
+        return MotionNodes(self.time[which], self._states[which], which, np.zeros(len(which)))
+
+    def resimulated_nodes(
+        self, state: Array, start_time: float, end_time: float, end_state: Array
+    ) -> MotionNodes:
+        """Nodes of `REFINEMENT_FACTOR` steps between two times [s], from one state to another."""
+        times = np.linspace(start_time, end_time, 2 * REFINEMENT_FACTOR + 1)
+        state, sticking = state.copy(), self.chart.stick_slip
+        saved_modes = sticking.slip_signs.copy(), sticking.is_held.copy(), sticking.is_moving
+        rows = np.empty(
+            (2 * REFINEMENT_FACTOR, len(self._integrator.final_row(start_time, state)))
+        )
+        self._integrator.offset = 0.0
+        if self._integrator.run(times[:-1], state, times[1] - times[0], rows) < len(rows):
+            raise SimulationError(
+                f"at t = {start_time:.4g} s the motion jumps and cannot be followed, shorten "
+                f"the step"
+            )
+        sticking.slip_signs[:], sticking.is_held[:], sticking.is_moving = saved_modes
+        sticking.apply_to(self.chart.dynamics)
+        return MotionNodes(
+            times,
+            np.vstack([rows[:, : len(state)], end_state]),
+            *self._interpolation_positions(times),
+        )
+
+    def nodes_within_step(self, nodes: MotionNodes, step: int) -> MotionNodes:
+        """Nodes within one step of others."""
+        begin, end = 2 * step, 2 * step + 2
+        times, states = nodes.times, nodes.states
+        return self.resimulated_nodes(states[begin], times[begin], times[end], states[end])
+
+    def nodes_at_transition(self, transition: StickSlipTransition) -> MotionNodes:
+        """Three nodes around a switch, at its state."""
+        times = transition.time + _EVENT_DIFFERENCE_STEP * self._step * np.array([-1.0, 0.0, 1.0])
+        return MotionNodes(
+            times, np.tile(transition.state, (3, 1)), *self._interpolation_positions(times)
+        )
+
+    def _interpolation_positions(self, times: Array) -> tuple[Indices, Array]:
+        before = np.clip(np.searchsorted(self.time, times) - 1, 0, len(self.time) - 2)
+        share = (times - self.time[before]) / (self.time[before + 1] - self.time[before])
+        return before, share
+
+    def constants_at(
+        self, constants: SimulationConstants, nodes: MotionNodes
+    ) -> SimulationConstants:
+        """The simulation's numbers at some nodes, with what sticks."""
+        references = nodes.interpolate(constants.references)
+        return constants._replace(
+            dynamics_constants=self.chart.dynamics.numbers, references=references
+        )
+
+    def sensitivity_jump(
+        self, tangent: ForwardDerivatives, constants: SimulationConstants, jump: TransitionJump
+    ) -> tuple[Array, Array]:
+        """How S jumps where joints start or stop; what they do behind is adopted.
+
+        With g = 0 what tells when, r the rate before and r_+ behind,
+
+            S_+ = S + (r - r_+) dt/dp,    (g_s r + g_t) dt/dp = -(g_s S + g_p).
+
+        Returns:
+            g_s (m,), and (r - r_+) / (g_s r + g_t) (m,), 0 where nothing paces g.
+        """
+        nodes, m = self.nodes_at_transition(jump.transition), tangent.state_size
+        event_constants = self.constants_at(constants, nodes)
+        rows = event_constants.references
+        reference_rate = (rows[2] - rows[0]) / (nodes.times[2] - nodes.times[0])
+        zero_directions = SimulationConstants(
+            *(np.zeros((1, part.shape[-1])) for part in constants)
+        )
+        time_direction = zero_directions._replace(references=np.tile(reference_rate, (1, 3, 1)))
+        margin_derivatives = tangent.directional_derivatives(
+            event_constants, nodes.states, time_direction, self.has_joints_at_rest
+        )[1][1, -1]
+        rate_before = self._rate_at_node(tangent, constants, nodes)
+        margin_rate = float(margin_derivatives[:m] @ rate_before + margin_derivatives[m])
+        self.adopt_mode(jump.mode + 1)
+        if not margin_rate:
+            return margin_derivatives[:m], np.zeros(m)
+        return margin_derivatives[:m], (
+            rate_before - self._rate_at_node(tangent, constants, nodes)
+        ) / margin_rate
+
+    def _rate_at_node(
+        self, derivatives: ForwardDerivatives, constants: SimulationConstants, nodes: MotionNodes
+    ) -> Array:
+        """The rate (m,) at the middle one of three nodes."""
+        node_constants = self.constants_at(constants, nodes)
+        row = np.ascontiguousarray(node_constants.references[1])
+        return derivatives.evaluate_rate(
+            node_constants._replace(references=row),
+            nodes.states[1].copy(),
+            self.has_joints_at_rest,
+        )
+
+
+def _check_dead_centres(chart: Chart, time: Array, q: Array) -> None:
+    """Raise where active coordinates do not describe a motion (N, nq)."""
+    stride = max(1, len(q) // _MAX_CHECKED_SAMPLES)
+    for at, posture in zip(time[::stride], q[::stride], strict=True):
+        if chart.largest_gamma_entry(posture) > chart.chart_limits[0]:
+            raise SimulationError(
+                f"at t = {at:.4g} s the active coordinates come near a dead centre, where nothing "
+                "depends on them smoothly: drive other joints, or end before"
+            )

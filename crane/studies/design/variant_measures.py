@@ -1,0 +1,462 @@
+"""What can be measured of a variant, and how it changes with the numbers that vary."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from crane.common.errors import CraneError, InputError, suggest_names
+from crane.common.samples import Array
+from crane.dynamics import Dynamics
+from crane.dynamics.statics import StaticsEvaluator
+from crane.formats.machine_loading import MachineVariants
+from crane.machine import Machine
+from crane.motion.workspaces.workspace_section import up_direction
+from crane.ratings import capacity, torques
+from crane.ratings.configuration_search import ConfigurationSearch
+from crane.ratings.rating_rules import Rule
+from crane.studies.design.dual_numbers import DUAL_FUNCTIONS, DualNumber, constant
+from crane.studies.design.measure_expressions import MeasureExpression
+from crane.studies.design.user_measures import MeasureFunction, evaluate_user_measure
+from crane.studies.measures import (
+    combine_task_measures,
+    measure_strokes,
+    measure_task,
+    stroke_measures,
+    task_measures,
+)
+
+_DIFFERENCE_STEP = 1e-4  # of a number's range, of differences
+_START_COUNT = 6  # of the search for an extreme of the tip
+_ARGUMENT_COUNTS = {"load": (2, 3), "nearest": (3, 3), "net_torque": (1, 1), "number": (1, 1)}
+_FUNCTION_UNITS = {"load": "kg", "nearest": "m", "net_torque": "N m", "number": ""}
+PLAIN_MEASURES = {
+    "highest": "m", "lowest": "m", "mass": "kg", "gross_torque": "N m", "slewing_torque": "N m",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """What measures are taken with.
+
+    Attributes:
+        frame: Where loads hang; the tip if None.
+        rule: Of `load` and `net_torque`.
+        tasks: Of peak_JOINT and its like.
+        user_measures: Functions of a user's own.
+    """
+
+    frame: str | None = None
+    rule: str | Rule = "none"
+    tasks: tuple[str, ...] = ()
+    user_measures: Mapping[str, MeasureFunction] = field(default_factory=dict)
+
+
+class VariantEvaluation:
+    """A variant: its measures, and their slopes by the numbers that vary.
+
+    Slopes of `load`, reach, highest, lowest, `nearest` and mass are exact, through the closed
+    loops; those of all else central differences of variants beside it.
+
+    Args:
+        variants: Of the machine.
+        parameter_names: Numbers that vary, in order.
+        values: (k,) theirs.
+        ranges: (k,) their ranges, to measure steps by.
+        options: What measures are taken with.
+        load_positions: All arguments of `load` that will be asked for, to be computed together.
+
+    Raises:
+        CraneError: No machine can be made with them.
+    """
+
+    def __init__(
+        self,
+        variants: MachineVariants,
+        parameter_names: Sequence[str],
+        values: Array,
+        ranges: Array,
+        options: MeasureOptions,
+        load_positions: Sequence[tuple[float, ...]] = (),
+    ):
+        self._variants, self._parameter_names, self._values = (
+            variants,
+            list(parameter_names),
+            values,
+        )
+        self._ranges, self._options, self._load_positions = ranges, options, list(load_positions)
+        self.machine = variants.machine(dict(zip(parameter_names, values.tolist(), strict=True)))
+        self._measure_cache: dict[tuple[Any, ...], float] = {}
+        self._loads: dict[tuple[bool, tuple[float, ...]], DualNumber] = {}
+
+    def evaluate(self, expression: MeasureExpression) -> float:
+        """Of an expression."""
+        return float(expression(self._evaluate_name, self._evaluate_call))
+
+    def evaluate_dual(self, expression: MeasureExpression) -> DualNumber:
+        """Of an expression, with its slopes."""
+        count = len(self._parameter_names)
+
+        def dual_of_name(name: str) -> DualNumber:
+            return self._dual_measure(name, ())
+
+        def dual_of_call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
+            if name in DUAL_FUNCTIONS:
+                return DUAL_FUNCTIONS[name](*arguments)
+            plain_arguments = [x.value if isinstance(x, DualNumber) else x for x in arguments]
+            return self._dual_measure(name, tuple(plain_arguments))
+
+        result = expression(dual_of_name, dual_of_call, lambda x: constant(x, count))
+        return result if isinstance(result, DualNumber) else constant(float(result), count)
+
+    def _evaluate_name(self, name: str) -> float:
+        return self._measure(name, ())
+
+    def _evaluate_call(self, name: str, arguments: tuple[Any, ...]) -> float:
+        if name in DUAL_FUNCTIONS:
+            dual_arguments = [constant(x, 0) for x in arguments]
+            return DUAL_FUNCTIONS[name](*dual_arguments).value
+        return self._measure(name, arguments)
+
+    def _dual_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        """A measure with its slopes."""
+        if name == "load":
+            return self._rated_load(arguments)
+        if name in ("reach", "highest", "lowest", "nearest"):
+            value, q = self._extreme(name, arguments)
+            return DualNumber(value, self._extreme_derivatives(name, arguments, q))
+        if name == "mass":
+            static_derivatives = (
+                self._statics.parameter_derivatives(
+                    self._home_configuration, self._parameter_names
+                )
+                if self._parameter_names
+                else None
+            )
+            derivatives = (
+                np.zeros(0) if static_derivatives is None else static_derivatives.total_mass[0]
+            )
+            return DualNumber(self._measure(name, ()), derivatives)
+        if name == "number" or (name in self._variants.values and not arguments):
+            parameter = str(arguments[0]) if name == "number" else name
+            derivatives = np.array([float(parameter == other) for other in self._parameter_names])
+            return DualNumber(self._measure(name, arguments), derivatives)
+        return DualNumber(self._measure(name, arguments), self._differences(name, arguments))
+
+    def _differences(self, name: str, arguments: tuple[Any, ...]) -> Array:
+        """Central differences of a measure, one-sided where one side cannot be made."""
+        nominal = self._measure(name, arguments)
+        out = np.zeros(len(self._parameter_names))
+        for i, step in enumerate(_DIFFERENCE_STEP * self._ranges):
+            signed_values = []
+            for sign in (1.0, -1.0):
+                try:
+                    signed_values.append(
+                        (sign, self._perturbed(i, sign * step)._measure(name, arguments))
+                    )
+                except CraneError:
+                    signed_values.append((0.0, nominal))
+            (upper_sign, upper_value), (lower_sign, lower_value) = signed_values
+            if upper_sign == lower_sign:
+                raise InputError(
+                    f"'{name}' cannot be followed as '{self._parameter_names[i]}' varies"
+                )
+            out[i] = (upper_value - lower_value) / ((upper_sign - lower_sign) * step)
+        return out
+
+    def _perturbed(self, parameter_index: int, step: float) -> "VariantEvaluation":
+        key = parameter_index, step
+        if key not in self._neighbours:
+            values = self._values.copy()
+            values[parameter_index] += step
+            self._neighbours[key] = VariantEvaluation(
+                self._variants,
+                self._parameter_names,
+                values,
+                self._ranges,
+                self._options,
+                self._load_positions,
+            )
+        return self._neighbours[key]
+
+    @cached_property
+    def _neighbours(self) -> dict[tuple[int, float], "VariantEvaluation"]:
+        return {}
+
+    def _measure(self, name: str, arguments: tuple[Any, ...]) -> float:
+        key = name, *arguments
+        if key not in self._measure_cache:
+            self._measure_cache[key] = float(self._compute_measure(name, arguments))
+        return self._measure_cache[key]
+
+    def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> float:
+        machine = self.machine
+        if name == "load":
+            return self._rated_load(arguments, False).value
+        if name in ("reach", "highest", "lowest", "nearest"):
+            return self._extreme(name, arguments)[0]
+        if name == "net_torque":
+            return torques(
+                machine, self._options.frame, radius=arguments[0], rule=self._options.rule
+            ).net_torque
+        if name in ("gross_torque", "slewing_torque"):
+            torque_values = torques(
+                machine, self._options.frame, rule=self._options.rule, radius=self._median_radius
+            )
+            return (
+                torque_values.gross_torque
+                if name == "gross_torque"
+                else torque_values.slewing_torque
+            )
+        if name == "mass":
+            return float(self._statics.evaluate(self._home_configuration).total_mass[0])
+        if name == "number":
+            return self._parameter_value(str(arguments[0]))
+        if name in self._options.user_measures:
+            return evaluate_user_measure(name, self._options.user_measures[name], machine)
+        if name in self._task_measures:
+            return self._task_values[name]
+        if name in stroke_measures(machine):
+            if name not in self._stroke_values:
+                raise InputError(f"'{name}' has no value: no posture closes")
+            return self._stroke_values[name]
+        return self._parameter_value(name)
+
+    def _parameter_value(self, name: str) -> float:
+        if name in self._parameter_names:
+            return float(self._values[self._parameter_names.index(name)])
+        if name in self._variants.values:
+            return float(self._variants.values[name])
+        raise InputError(
+            f"measure '{name}' is unknown, "
+            f"{suggest_names(available_measures(self.machine, self._options.user_measures), name)}"
+        )
+
+    @cached_property
+    def _statics(self) -> StaticsEvaluator:
+        return StaticsEvaluator(self.machine, self._options.frame)
+
+    @cached_property
+    def _configuration_search(self) -> ConfigurationSearch:
+        return ConfigurationSearch(self._statics)
+
+    @property
+    def _home_configuration(self) -> Array:
+        return self.machine.home[None]
+
+    @cached_property
+    def _median_radius(self) -> float:
+        return float(np.median(self._configuration_search.section_positions[:, 0]))
+
+    @cached_property
+    def _task_measures(self) -> dict[str, str]:
+        return task_measures(self.machine)
+
+    @cached_property
+    def _task_values(self) -> dict[str, float]:
+        if not self._options.tasks:
+            raise InputError(f"'{self.machine.name}' has no task to measure it with")
+        dynamics = Dynamics(self.machine)
+        return combine_task_measures(
+            [measure_task(self.machine, dynamics, x) for x in self._options.tasks]
+        )
+
+    @cached_property
+    def _stroke_values(self) -> dict[str, float]:
+        return measure_strokes(self.machine)
+
+    def _rated_load(
+        self, position: tuple[float, ...], with_derivatives: bool = True
+    ) -> DualNumber:
+        """The rated load at a place, 0 where it is out of reach; with its slopes if asked for."""
+        if (with_derivatives, position) not in self._loads:
+            all_positions = [
+                position,
+                *(x for x in self._load_positions if (with_derivatives, x) not in self._loads),
+            ]
+            slews = sorted({x[2] for x in all_positions if len(x) == 3})
+            for slew in [None, *slews]:
+                positions = [x for x in all_positions if (x[2] if len(x) == 3 else None) == slew]
+                if positions:
+                    self._compute_loads(positions, slew, with_derivatives)
+        return self._loads[with_derivatives, position]
+
+    def _compute_loads(
+        self, positions: Sequence[tuple[float, ...]], slew: float | None, with_derivatives: bool
+    ) -> None:
+        radii, heights = (sorted({x[i] for x in positions}) for i in (0, 1))
+        zero = constant(0.0, len(self._parameter_names))
+        try:
+            chart = capacity(
+                self.machine, self._options.frame, rule=self._options.rule, radii=radii,
+                heights=heights, slews=None if slew is None else [np.deg2rad(slew)],
+            )  # fmt: skip
+        except InputError as error:
+            if "reaches none" not in str(error):
+                raise
+            self._loads |= {(with_derivatives, place): zero for place in positions}
+            return
+        chart_derivatives = chart.derivatives(self._parameter_names) if with_derivatives else None
+        for position in positions:
+            a, b = radii.index(position[0]), heights.index(position[1])
+            loads = np.nan_to_num(chart.loads[:, b, a], nan=0.0)
+            s = int(loads.argmin())
+            if not np.isfinite(loads[s]):
+                raise InputError(f"nothing ends the load at {position}, ask for another place")
+            load_derivatives = zero.derivatives
+            if chart_derivatives is not None and loads[s] > 0:
+                load_derivatives = chart_derivatives[s, b, a]
+                if np.isnan(load_derivatives).any():  # where a pin ends it
+                    load_derivatives = self._differences("load", position)
+            self._loads[with_derivatives, position] = DualNumber(float(loads[s]), load_derivatives)
+
+    def _extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
+        """Largest reach or height, lowest depth, or distance to a point, and its posture."""
+        key = name, *arguments
+        if key not in self._extremes:
+            self._extremes[key] = self._find_extreme(name, arguments)
+        return self._extremes[key]
+
+    @cached_property
+    def _extremes(self) -> dict[tuple[Any, ...], tuple[float, Array]]:
+        return {}
+
+    def _extreme_objective(
+        self, name: str, arguments: tuple[Any, ...], tip: Array
+    ) -> tuple[Array, Array]:
+        """What is the least at the extreme, (N,), and its slopes by the tip (N, 3)."""
+        if name == "nearest":
+            offset = tip - np.array(arguments, dtype=float)
+            length = np.linalg.norm(offset, axis=1)
+            return length, offset / np.maximum(length, 1e-300)[:, None]
+        up = up_direction(self.machine)
+        height = tip @ up
+        if name in ("highest", "lowest"):
+            sign = -1.0 if name == "highest" else 1.0
+            return sign * height, np.broadcast_to(sign * up, tip.shape)
+        horizontal = tip - height[:, None] * up
+        length = np.linalg.norm(horizontal, axis=1)
+        return -length, -horizontal / np.maximum(length, 1e-300)[:, None]
+
+    def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
+        """From the best of the postures all over the strokes, by their exact slopes."""
+        search, closure = self._configuration_search, self.machine.closure
+        strokes = search.moving
+        columns = closure.active[strokes]
+        lower, stroke_lengths = search.low[strokes], (search.high - search.low)[strokes]
+        values = self._extreme_objective(
+            name, arguments, search.statics.evaluate(search.configurations).tip_positions
+        )[0]
+        order = np.argsort(values, kind="stable")
+        lowest_cost, best_configuration = np.inf, search.configurations[order[0]]
+        for start_index in order[:: max(1, len(order) // 50)][:_START_COUNT].tolist():
+            start = search.configurations[start_index]
+            last_closed = [start]
+
+            def cost(x: Array, last: list[Array] = last_closed) -> tuple[float, Array]:
+                q = last[0].copy()
+                q[columns] = lower + x * stroke_lengths
+                closed_configurations, is_closed = search.statics.close_loops(q[None])
+                if not is_closed[0]:
+                    return 1e6, np.zeros(len(x))
+                last[0] = closed_configurations[0]
+                statics = search.statics.evaluate(closed_configurations)
+                value, gradient = self._extreme_objective(name, arguments, statics.tip_positions)
+                return float(value[0]), (
+                    gradient[0] @ statics.tip_jacobian[0][:, strokes]
+                ) * stroke_lengths
+
+            result = minimize(
+                cost, (start[columns] - lower) / stroke_lengths, jac=True, method="L-BFGS-B",
+                bounds=[(0.0, 1.0)] * len(strokes), options={"ftol": 1e-15, "gtol": 1e-10},
+            )  # fmt: skip
+            cost(result.x)
+            if result.fun < lowest_cost:
+                lowest_cost, best_configuration = float(result.fun), last_closed[0]
+        sign = -1.0 if name in ("reach", "highest") else 1.0
+        return sign * lowest_cost, best_configuration
+
+    def _extreme_derivatives(self, name: str, arguments: tuple[Any, ...], q: Array) -> Array:
+        """By the envelope theorem: those at the posture of the extreme, held."""
+        if not self._parameter_names:
+            return np.zeros(0)
+        tip_derivatives = self._statics.parameter_derivatives(
+            q[None], self._parameter_names
+        ).tip_positions[0]
+        _, gradient = self._extreme_objective(
+            name, arguments, self._statics.evaluate(q[None]).tip_positions
+        )
+        sign = -1.0 if name in ("reach", "highest") else 1.0
+        return np.asarray(sign * gradient[0] @ tip_derivatives)
+
+
+def available_measures(
+    machine: Machine, user_measures: Mapping[str, MeasureFunction]
+) -> dict[str, str]:
+    """All measures and functions of a machine, and their units."""
+    return {
+        **task_measures(machine), **stroke_measures(machine), **PLAIN_MEASURES, **_FUNCTION_UNITS,
+        **dict.fromkeys(user_measures, ""),
+    }  # fmt: skip
+
+
+def check_unique_names(
+    user_measures: Mapping[str, MeasureFunction], known_measures: Mapping[str, str]
+) -> None:
+    """Refuse functions of a user's own that are called like a measure.
+
+    Raises:
+        InputError: One is.
+    """
+    for name in user_measures:
+        if (
+            name in known_measures
+            or name in PLAIN_MEASURES
+            or name in _ARGUMENT_COUNTS
+            or name in DUAL_FUNCTIONS
+        ):
+            raise InputError(f"a measure '{name}' is there already, call your own otherwise")
+
+
+def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float, ...]]:
+    """All arguments of `load` that are plain numbers."""
+    positions: list[tuple[float, ...]] = []
+
+    def check_name(name: str) -> float:
+        if name in _ARGUMENT_COUNTS or name in DUAL_FUNCTIONS:
+            raise InputError(f"'{name}' is a function, write {name}(...)")
+        return 1.0
+
+    def collect_load(name: str, arguments: tuple[Any, ...]) -> float:
+        _check_call(name, arguments)
+        if name == "load" and all(isinstance(x, float) for x in arguments):
+            positions.append(arguments)
+        return 1.0
+
+    for expression in expressions:
+        expression(check_name, collect_load)
+    return list(dict.fromkeys(positions))
+
+
+def _check_call(name: str, arguments: tuple[Any, ...]) -> None:
+    """Refuse functions that are not there, or with other arguments."""
+    if name not in DUAL_FUNCTIONS and name not in _ARGUMENT_COUNTS:
+        raise InputError(
+            f"function '{name}' is unknown, "
+            f"{suggest_names([*_ARGUMENT_COUNTS, *DUAL_FUNCTIONS], name)}"
+        )
+    text_arguments = [x for x in arguments if isinstance(x, str)]
+    if text_arguments and name != "number":
+        raise InputError(f"'{name}' takes numbers, not '{text_arguments[0]}'")
+    if name in DUAL_FUNCTIONS:
+        if not arguments or (len(arguments) > 1 and name not in ("min", "max")):
+            count = "arguments" if name in ("min", "max") else "one argument"
+            raise InputError(f"'{name}' takes {count}, not {len(arguments)}")
+        return
+    min_count, max_count = _ARGUMENT_COUNTS[name]
+    if not min_count <= len(arguments) <= max_count:
+        count = f"{min_count}" if min_count == max_count else f"{min_count} or {max_count}"
+        raise InputError(f"'{name}' takes {count} arguments, not {len(arguments)}")

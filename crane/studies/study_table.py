@@ -1,0 +1,143 @@
+"""The table that a study results in."""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import InputError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array
+
+_MAXIMIZED_MEASURES = ("reach", "range", "highest")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Study(OneLineRepr):
+    """Measures of V variants of a machine.
+
+    Attributes:
+        machine_reference: What `crane.load` takes.
+        parameters: Names of the parameters that vary.
+        measures: Names of the measures, those over all tasks.
+        tasks: Names of the tasks.
+        units: Unit of every column but the last, empty for a share.
+        columns: By name (V,): parameters, measures, and where there are several tasks "MEASURE
+            TASK" for each of them. NaN where a variant could not be measured. SI units.
+        failure_reasons: Why a variant could not be measured, or "".
+        grid_shape: Numbers of values of the parameters, whose last one varies fastest; () if
+            drawn.
+        resolution_notes: How fine measures are that are not exact.
+    """
+
+    machine_reference: str
+    parameters: tuple[str, ...]
+    measures: tuple[str, ...]
+    tasks: tuple[str, ...]
+    units: Mapping[str, str]
+    columns: Mapping[str, Array]
+    failure_reasons: tuple[str, ...]
+    grid_shape: tuple[int, ...]
+    resolution_notes: tuple[str, ...] = ()
+
+    def _one_line(self) -> str:
+        """What varies, and what is measured."""
+        failed = sum(map(bool, self.failure_reasons))
+        return (
+            f"Study of {self.machine_reference}: {len(self)} variants of "
+            f"{', '.join(self.parameters)}, "
+            f"{failed} not measured; {', '.join(self.measures)}"
+        )
+
+    @property
+    def rows(self) -> list[dict[str, float | str]]:
+        """One dictionary per variant, with its "reason"."""
+        return [
+            {**{name: float(values[i]) for name, values in self.columns.items()}, "reason": reason}
+            for i, reason in enumerate(self.failure_reasons)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.failure_reasons)
+
+    def rank(self, measure: str) -> list[int]:
+        """Variants from best to worst, without those that could not be measured.
+
+        The least is best, of reach, range, highest and upper strokes the largest; of expressions
+        the least comes first.
+
+        Raises:
+            InputError: There is no such measure.
+        """
+        if measure not in self.columns or measure in self.parameters:
+            names = [name for name in self.columns if name not in self.parameters]
+            raise InputError(
+                f"measure '{measure}' is not in the study, {suggest_names(names, measure)}"
+            )
+        values = self.columns[measure]
+        is_maximized = measure in _MAXIMIZED_MEASURES or (
+            measure.isidentifier() and measure.startswith("upper_")
+        )
+        keys = -values if is_maximized else values
+        measured_indices = [i for i in range(len(self)) if np.isfinite(values[i])]
+        return sorted(measured_indices, key=lambda i: keys[i])
+
+    def best_row(self, measure: str) -> dict[str, float | str]:
+        """The best row, see `rank`.
+
+        Raises:
+            InputError: There is no such measure, or no variant has it.
+        """
+        ranking = self.rank(measure)
+        if not ranking:
+            raise InputError(f"no variant has '{measure}', the first: {self.failure_reasons[0]}")
+        return self.rows[ranking[0]]
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the table: a column each with its unit, the reason last, empty cells for NaN.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        header = [f"{name} [{self.units[name] or '1'}]" for name in self.columns]
+        with replace_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+            file.write(f"# machine: {self.machine_reference}\n")
+            file.writelines(f"# note: {note}\n" for note in self.resolution_notes)
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow([*header, "reason"])
+            for row in self.rows:
+                writer.writerow(["" if value != value else value for value in row.values()])
+
+    def to_text(self, max_rows: int = 10) -> str:
+        """The best rows by the first measure, for reading; the best one is marked.
+
+        Of an expression the least comes first, unmarked: nobody knows which is best.
+        """
+        shown_columns = [*self.parameters, *self.measures[:5]]
+        titles = [
+            f"{name} [{unit}]" if (unit := self.units[name]) else name for name in shown_columns
+        ]
+        ranking, has_preferred_direction = (
+            self.rank(self.measures[0]),
+            self.measures[0].isidentifier(),
+        )
+        lines = [titles]
+        for i in ranking[:max_rows]:
+            lines.append([f"{self.columns[name][i]:.6g}" for name in shown_columns])
+        widths = [max(len(line[k]) for line in lines) for k in range(len(shown_columns))]
+        text = [
+            ("* " if row == 1 and has_preferred_direction else "  ")
+            + "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True))
+            for row, line in enumerate(lines)
+        ]
+        failed = [reason for reason in self.failure_reasons if reason]
+        summary = (
+            f"{len(self)} variants, {'best' if has_preferred_direction else 'least'} "
+            f"{self.measures[0]} first"
+        )
+        if failed:
+            summary += f"; {len(failed)} cannot be measured, the first: {failed[0]}"
+        return "\n".join([*(text if ranking else []), summary, *self.resolution_notes])

@@ -1,0 +1,351 @@
+"""Design studies: the same measures of many variants, here or on a cluster."""
+
+import itertools
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import (
+    CraneError,
+    CraneWarning,
+    InputError,
+    prefix_location,
+    suggest_names,
+)
+from crane.common.progress import progress_reporter
+from crane.common.samples import Array, as_count, as_samples, as_seed
+from crane.description.parameter_units import parameter_unit
+from crane.dynamics import Dynamics
+from crane.formats import load
+from crane.formats.machine_loading import MachineVariants
+from crane.machine import Machine
+from crane.ratings.rating_rules import Rule, find_rule
+from crane.studies.design.measure_expressions import MeasureExpression, parse_requirement
+from crane.studies.design.user_measures import (
+    MeasureFunction,
+    load_user_measures,
+    transferable_measures,
+)
+from crane.studies.design.variant_measures import (
+    PLAIN_MEASURES,
+    MeasureOptions,
+    VariantEvaluation,
+    check_unique_names,
+    load_positions,
+)
+from crane.studies.measures import (
+    combine_task_measures,
+    measure_strokes,
+    measure_task,
+    resolution_notes,
+    stroke_measures,
+    task_measures,
+)
+from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
+from crane.studies.study_table import Study
+
+_MAX_VARIANTS = 100_000  # variants
+_REQUIREMENT_TOLERANCE = 1e-9  # by which a requirement may fail
+# Parameters that inverse dynamics does not know, by their first word.
+_NON_MECHANICAL_PREFIXES = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
+Progress = Callable[[float], None]
+
+# One machine per set of formulas: as long as it lives, variants share its machine code.
+_CODE_OWNERS: dict[int, Machine] = {}
+
+
+class StudyJob(NamedTuple):
+    """What a variant is computed from, wherever that happens.
+
+    Attributes:
+        machine: What `load` takes.
+        changes: Of its parameters.
+        locked_joints: Joints that are fixed.
+        tasks: To measure it with.
+        with_strokes: Whether to measure its strokes.
+        expressions: Of measures, see `crane.studies.design`.
+        requirements: What has to hold.
+        user_measures: A Python file of a user's own measures, or these.
+        frame: Where loads hang.
+        rule: By which they are rated.
+        expression_tasks: Tasks that expressions are measured with.
+    """
+
+    machine: str
+    changes: dict[str, float]
+    locked_joints: dict[str, float]
+    tasks: tuple[str, ...]
+    with_strokes: bool
+    expressions: tuple[str, ...] = ()
+    requirements: tuple[str, ...] = ()
+    user_measures: str | Mapping[str, MeasureFunction] | None = None
+    frame: str | None = None
+    rule: str | Rule = "none"
+    expression_tasks: tuple[str, ...] = ()
+
+
+def study(
+    machine: Machine | str | Path,
+    vary: Mapping[str, ArrayLike],
+    tasks: Sequence[str] | None = None,
+    measures: Sequence[str] | None = None,
+    *,
+    require: Sequence[str] = (),
+    user_measures: str | Path | Mapping[str, MeasureFunction] | None = None,
+    frame: str | None = None,
+    rule: str | Rule = "none",
+    draws: int | None = None,
+    seed: int = 0,
+    processes: int = 1,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Study:
+    """Measure variants of a machine: the grid of all values, or random draws.
+
+    Measures, see `crane.studies.measures`: peak_JOINT, rms_JOINT, energy and work of the active
+    joints over the tasks; reach, range, lower_JOINT and upper_JOINT of the strokes; and any
+    expression that `crane.design` takes, such as "load(4, 0) / mass". Tasks of levers are
+    simulated with their circuit. Every variant is loaded afresh, so its row does not depend on
+    where it is computed, or after what.
+
+    Args:
+        machine: What `crane.load` takes, or what it gave.
+        vary: By name of a parameter, see `crane.description.parameters`: values, of which all
+            combinations are taken, or with `draws` the two ends of a range.
+        tasks: Of the machine; all if not given.
+        measures: Which ones; all if not given.
+        require: "A >= B", "A <= B" or "A == B" of such expressions; variants that fail are not
+            measured, and say by how much.
+        user_measures: Functions of a machine by name that expressions know, or a Python file of
+            them.
+        frame: Where loads hang, of expressions; the tip if not given.
+        rule: By which they are rated.
+        draws: Number of variants drawn uniformly from the ranges.
+        seed: Of the draws.
+        processes: How many to compute with, at most eight per core; more than one need a main
+            module that may be imported (`if __name__ == "__main__":`).
+        scheduler: Address of a Dask scheduler whose workers compute instead.
+        progress: Called with the finished share, 0 to 1.
+
+    Raises:
+        InputError: Unknown names, values that do not go together, no variant can be measured, or a
+            machine that was changed after it was loaded.
+    """
+    progress = progress_reporter(progress)
+    check_process_count(processes)
+    seed = as_seed(seed)
+    base_machine, name = machine_from_files(machine)
+    values, grid_shape = _variant_values(vary, draws, seed)
+    tasks = _unique_names("task", base_machine.tasks, tasks)
+    has_lever_tasks = any(base_machine.tasks[task].space == "joystick" for task in tasks)
+    task_measure_units = task_measures(base_machine) if tasks else {}
+    available = task_measure_units | stroke_measures(base_machine)
+    user_functions = load_user_measures(user_measures)
+    check_unique_names(user_functions, available)
+    expressions = tuple(x for x in measures or () if _is_expression(x, available, user_functions))
+    for text in require:
+        parse_requirement(text)
+    named_measures = [x for x in measures or () if x not in expressions]
+    selected_measures = _unique_names(
+        "measure", available, named_measures or (None if not expressions else ())
+    )
+    units = _parameter_units(
+        base_machine, vary, has_lever_tasks or bool(expressions) or bool(require)
+    )
+    expression_tasks = tasks
+    if not set(selected_measures) & set(task_measure_units):
+        tasks = ()
+    jobs = [
+        StudyJob(
+            name,
+            {**base_machine.parameter_changes, **dict(zip(vary, row.tolist(), strict=True))},
+            dict(base_machine.locked_joints),
+            tasks,
+            not set(selected_measures) <= set(task_measure_units),
+            expressions,
+            tuple(require),
+            transferable_measures(user_measures),
+            frame,
+            find_rule(rule),
+            expression_tasks,
+        )
+        for row in values
+    ]
+    rows: dict[int, tuple[dict[str, float], str]] = {}
+    for index, row in compute_jobs(measure_variant, jobs, processes, scheduler):
+        rows[index] = row
+        if progress is not None:
+            progress(len(rows) / len(jobs))
+    columns = dict(zip(vary, values.T, strict=True))
+    measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
+    available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
+    for measure in measures:
+        names = [measure]
+        if measure in task_measure_units and len(tasks) > 1:
+            names += [f"{measure} {task}" for task in tasks]
+        for column in names:
+            columns[column] = np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
+            units[column] = available[measure]
+    reasons = tuple(rows[i][1] for i in range(len(jobs)))
+    if all(reasons):
+        raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
+    return Study(
+        name,
+        tuple(vary),
+        measures,
+        tasks,
+        units,
+        columns,
+        reasons,
+        grid_shape,
+        resolution_notes(base_machine, measures),
+    )
+
+
+def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
+    """Columns of one variant, and why some are missing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)  # told of the machine itself
+        try:
+            machine = load(study_job.machine, study_job.changes, study_job.locked_joints)
+        except CraneError as error:
+            return {}, str(error)
+        return _measure(machine, study_job)
+
+
+def _measure(machine: Machine, study_job: StudyJob) -> tuple[dict[str, float], str]:
+    measures: dict[str, float] = {}
+    reasons = []
+    if machine.closure.is_compiled:
+        _CODE_OWNERS.setdefault(id(machine.closure.compiled_closure.programs), machine)
+    dynamics, task_results = Dynamics(machine), []
+    if study_job.expressions or study_job.requirements:
+        try:
+            measures |= _evaluate_expressions(machine, study_job)
+        except CraneError as error:
+            return {}, str(error)
+    for task in study_job.tasks:
+        try:
+            task_results.append(measure_task(machine, dynamics, task))
+            measures |= {f"{name} {task}": value for name, value in task_results[-1][1].items()}
+        except CraneError as error:
+            reasons.append(prefix_location(f"task '{task}'", error))
+    if task_results and len(task_results) == len(study_job.tasks):
+        measures |= combine_task_measures(task_results)
+    if study_job.with_strokes:
+        measures |= measure_strokes(machine)
+    return measures, "; ".join(reasons)
+
+
+def _is_expression(
+    text: str, available: Mapping[str, str], functions: Mapping[str, MeasureFunction]
+) -> bool:
+    """Whether a measure is an expression and no name of the study's own.
+
+    Raises:
+        InputError: It is neither.
+    """
+    if text in available:
+        return False
+    if text.isidentifier() and text not in functions and text not in PLAIN_MEASURES:
+        names = [*available, *PLAIN_MEASURES, *functions]
+        raise InputError(f"measure '{text}' is unknown, {suggest_names(names, text)}")
+    load_positions([MeasureExpression(text)])
+    return True
+
+
+def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, float]:
+    """Values of a variant's expressions.
+
+    Raises:
+        CraneError: One has no value, or a requirement fails.
+    """
+    expressions = [
+        *map(MeasureExpression, study_job.expressions),
+        *(parse_requirement(x)[0] for x in study_job.requirements),
+    ]
+    options = MeasureOptions(
+        study_job.frame,
+        study_job.rule,
+        study_job.expression_tasks,
+        load_user_measures(study_job.user_measures),
+    )
+    no_values = np.zeros(0)
+    evaluation = VariantEvaluation(
+        MachineVariants(machine), (), no_values, no_values, options, load_positions(expressions)
+    )
+    values = [evaluation.evaluate(x) for x in expressions]
+    for text, value in zip(
+        study_job.requirements, values[len(study_job.expressions) :], strict=True
+    ):
+        shortfall = abs(value) if parse_requirement(text)[1] else -value
+        if shortfall > _REQUIREMENT_TOLERANCE * max(1.0, abs(value)):
+            raise InputError(f"requires {text}: lacks {shortfall:.4g}")
+    return dict(zip(study_job.expressions, values, strict=False))
+
+
+def _variant_values(
+    vary: Mapping[str, ArrayLike], draws: int | None, seed: int
+) -> tuple[Array, tuple[int, ...]]:
+    """Values (V, parameters), and the shape of the grid."""
+    if not vary:
+        raise InputError("nothing varies, name a parameter and its values")
+    axes = []
+    for name, parameter_values in vary.items():
+        axis = np.atleast_1d(parameter_values)
+        axes.append(as_samples(axis, len(axis), f"what '{name}' is varied over"))
+        if axis.ndim > 1 or not len(axis):
+            raise InputError(f"parameter '{name}' has no list of values, give one")
+    count = math.prod(len(axis) for axis in axes) if draws is None else draws
+    count = as_count(count, "the number of variants", 1, _MAX_VARIANTS)
+    if draws is None:
+        return np.array(list(itertools.product(*axes))), tuple(len(axis) for axis in axes)
+    for name, axis in zip(vary, axes, strict=True):
+        if len(axis) != 2 or not axis[0] < axis[1]:
+            raise InputError(f"'{name}' is drawn between two values, give the lower and the upper")
+    lower, upper = np.array(axes).T
+    return np.random.default_rng(seed).uniform(lower, upper, (count, len(axes))), ()
+
+
+def _unique_names(
+    label: str, available: Mapping[str, object], requested: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Names without doubles, all if none are given."""
+    for name in requested or ():
+        if name not in available:
+            raise InputError(f"{label} '{name}' is unknown, {suggest_names(available, name)}")
+    return tuple(dict.fromkeys(available if requested is None else requested))
+
+
+def _parameter_units(machine: Machine, vary: Mapping[str, object], with_circuit: bool) -> dict:
+    """Units by parameter; refuses those that do not exist or change nothing.
+
+    Args:
+        machine: The machine.
+        vary: By name.
+        with_circuit: Whether something is measured that circuits and controllers change.
+    """
+    names = MachineVariants(machine).values
+    units = {}
+    for parameter in vary:
+        if parameter not in names:
+            raise InputError(
+                f"parameter '{parameter}' is unknown, {suggest_names(names, parameter)}"
+            )
+        prefix, *remaining_names = parameter.split(".")
+        if (
+            not with_circuit
+            and prefix in _NON_MECHANICAL_PREFIXES
+            and remaining_names[-1] not in ("lower", "upper")
+        ):
+            raise InputError(
+                f"'{parameter}' changes nothing: the forces are those of the reference motion, "
+                "without controller and hydraulics; take a task of levers, or a load"
+            )
+        units[parameter] = parameter_unit(machine.tree, parameter)
+    return units

@@ -1,0 +1,275 @@
+"""What a live view knows: one posture, closed at every move, and its numbers."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from crane.common.errors import ClosureError, InputError, SingularConfigurationError, suggest_names
+from crane.common.samples import Array, as_number
+from crane.dynamics import Dynamics
+from crane.machine import Machine, Payload
+from crane.motion.kinematics import Kinematics
+from crane.recordings.recording_summary import DISPLAY_UNITS
+
+_MAX_STEP_SHARE = 1 / 128  # of a move, at most
+_MIN_STEP_SHARE = 1e-11  # of a move, at which it gives up
+_STEPS_PER_CALL = 32  # steps that are tried before their length is thought over
+_MAX_CONDITION_NUMBER = (
+    1e4  # condition number above which a posture counts as on the branch's edge
+)
+_UNLIMITED_ANGLE_RANGE, _UNLIMITED_STROKE_RANGE = (
+    np.pi,
+    1.0,
+)  # how far a slider goes to both sides of home without limits [rad], [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Readout:
+    """A closed posture and its numbers.
+
+    Attributes:
+        configuration: (nq,) coordinates [m], [rad].
+        q_a: (n,) the active ones.
+        tip: (3,) position of the tip [m], None without one.
+        gravity: (n,) active forces that hold the weight, the payload's too [N], [N m].
+        largest_gain: Entry of gamma with the largest magnitude among the passive joints
+            [m/m], [rad/m], [m/rad], [rad/rad]; 0 without any.
+        gain_joints: The passive and the active joint it belongs to, empty without any.
+        condition_number: Condition number of J_P, the passive columns of the loops' Jacobian in SI
+            units; 1 without loops. It grows without bound at the branch's edge.
+        weakest_loop: The loop that holds the passive joints least, empty without loops.
+        residual: Largest loop equation [m], [rad].
+        refusal: Why the last move went only this far; empty where it went all the way.
+    """
+
+    configuration: Array
+    q_a: Array
+    tip: Array | None
+    gravity: Array
+    largest_gain: float
+    gain_joints: tuple[str, ...]
+    condition_number: float
+    weakest_loop: str
+    residual: float
+    refusal: str = ""
+
+
+class Session:
+    """A machine that is moved joint by joint.
+
+    Args:
+        machine: The machine.
+
+    Attributes:
+        machine: The machine without payload.
+        lower: (n,) where sliders begin [m], [rad].
+        upper: (n,) where they end.
+        readout: Where it is.
+        payload_mass: Mass at the tip [kg].
+        max_payload: Largest payload that a slider offers [kg]: half of the moving mass, or a
+            little more, as a round number.
+    """
+
+    def __init__(self, machine: Machine):
+        self.machine = machine
+        self.payload_mass = 0.0
+        self._dynamics = Dynamics(machine, backend="pinocchio")
+        self._kinematics = None if machine.tip is None else Kinematics(machine)
+        home = machine.home[machine.closure.active]
+        default_ranges = np.array(
+            [
+                _UNLIMITED_ANGLE_RANGE if machine.unit(x) == "rad" else _UNLIMITED_STROKE_RANGE
+                for x in machine.active
+            ]
+        )
+        self.lower = np.where(np.isfinite(machine.lower), machine.lower, home - default_ranges)
+        self.upper = np.where(np.isfinite(machine.upper), machine.upper, home + default_ranges)
+        mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
+        self.max_payload = round_up_to_nice(mass / 2)
+        self.posture = self._compute_readout(machine.home)
+
+    def move(self, joint: str, value: float) -> Readout:
+        """Move one active joint, the others held.
+
+        Where the loops cannot be closed, the machine goes as far towards the value as they can,
+        and the posture says why it stopped.
+
+        Args:
+            joint: An active joint.
+            value: Its coordinate within its slider's range [m], [rad].
+
+        Raises:
+            InputError: Unknown joint, or a value that is not finite or out of range.
+        """
+        active = self.machine.active
+        if joint not in active:
+            raise InputError(f"'{joint}' is no active joint, {suggest_names(active, joint)}")
+        index = active.index(joint)
+        unit = self.machine.unit(joint)
+        value = as_number(value, f"the value of {joint}", unit)
+        lower, upper = self.lower[index], self.upper[index]
+        tolerance = 1e-9 * (upper - lower)
+        if not lower - tolerance <= value <= upper + tolerance:
+            raise InputError(
+                f"{joint} = {value:.6g} {unit} is outside of {lower:.6g} to {upper:.6g}, "
+                "choose a value within"
+            )
+        target = self.posture.q_a.copy()
+        target[index] = value
+        path = self._path_configurations(target)
+        if path is None:
+            return self.set_active_coordinates(target)
+        for q in reversed(path):
+            try:
+                readout = self._compute_readout(q)
+            except SingularConfigurationError:
+                continue
+            if readout.condition_number < _MAX_CONDITION_NUMBER:
+                break
+        else:
+            readout = self._compute_readout(self.posture.configuration)
+        if readout.q_a[index] != value:
+            shown_unit, scale = DISPLAY_UNITS[unit]
+            readout = replace(
+                readout,
+                refusal=f"{joint} stops at {scale * readout.q_a[index]:.4g} {shown_unit}: beyond "
+                "it "
+                f"loop '{readout.weakest_loop}' leaves its assembly branch or cannot be closed",
+            )
+        self.posture = readout
+        return readout
+
+    def set_active_coordinates(self, q_a: ArrayLike) -> Readout:
+        """Put all active joints (n,) where they are told, wherever they were before.
+
+        The machine stays where it is if the loops cannot be closed there.
+        """
+        try:
+            q = self.machine.closure.solve(q_a, initial_guess=self.posture.configuration)
+            self.posture = self._compute_readout(q)
+        except ClosureError as error:
+            self.posture = replace(self.posture, refusal=str(error))
+        return self.posture
+
+    def go_home(self) -> Readout:
+        """Go to the home posture."""
+        self.posture = self._compute_readout(self.machine.home)
+        return self.posture
+
+    def set_payload(self, mass: float) -> Readout:
+        """Hang a mass [kg] at the tip, in place of what hung there before.
+
+        Raises:
+            InputError: The machine has no tip, or the mass is negative or not finite.
+        """
+        if self.machine.tip is None:
+            raise InputError(f"machine '{self.machine.name}' has no tip to hang a load on")
+        loaded = self.machine.with_payload(Payload(self.machine.tip, mass))
+        self._dynamics = Dynamics(loaded, backend="pinocchio")
+        self.payload_mass = float(mass)
+        self.posture = replace(
+            self._compute_readout(self.posture.configuration), refusal=self.posture.refusal
+        )
+        return self.posture
+
+    def link_poses(self, links: list[str]) -> Array:
+        """(len(links), 4, 4) poses of links in the world."""
+        model = self.machine.model
+        data = model.createData()
+        pinocchio_configuration = self.machine.coordinates.configuration(
+            self.posture.configuration
+        )
+        pin.framesForwardKinematics(model, data, pinocchio_configuration)
+        frames = [self.machine.frame(link) for link in links]
+        return np.array([data.oMf[i].homogeneous for i in frames]).reshape(-1, 4, 4)
+
+    def tip_positions(self, q: Array) -> Array:
+        """(N, 3) positions of the tip [m] at closed postures (N, nq); (0, 3) without one."""
+        if self._kinematics is None:
+            return np.empty((0, 3))
+        return self._kinematics.positions_at_configurations(q)
+
+    def _path_configurations(self, target: Array) -> list[Array] | None:
+        """Postures on the straight way to a target (n,), up to where it leaves the branch.
+
+        Small steps, so that it never jumps to where a longer step would find the branch again,
+        and smaller ones towards its edge and away from it.
+        None where there is no machine code to take them.
+        """
+        closure = self.machine.closure
+        if not closure.is_compiled:
+            return None
+        cursor, start = closure.compiled_closure.new_cursor(), self.posture.q_a
+        path: list[Array] = []
+        completed_share, step = 0.0, _MAX_STEP_SHARE
+        if not closure.compiled_closure.start_cursor_at(cursor, self.posture.configuration):
+            return path
+        while completed_share < 1.0 and step > _MIN_STEP_SHARE:
+            shares = np.unique(
+                np.minimum(completed_share + step * np.arange(1, _STEPS_PER_CALL + 1), 1.0)
+            )
+            targets = start + shares[:, None] * (target - start)
+            targets[shares == 1.0] = target
+            out = np.empty((len(targets), len(self.machine.joints)))
+            count = closure.compiled_closure.follow_targets(cursor, targets, out)
+            path += list(out[:count])
+            completed_share = float(shares[count - 1]) if count else completed_share
+            step = min(4 * step, _MAX_STEP_SHARE) if count == len(targets) else step / 8
+        return path
+
+    def _compute_readout(self, q: Array) -> Readout:
+        """A closed posture (nq,) with its numbers.
+
+        Raises:
+            BranchEdgeError: The passive joints are not determined there.
+        """
+        machine, closure = self.machine, self.machine.closure
+        gamma = closure.gamma(q)
+        gains = np.abs(gamma[closure.passive])
+        gain, gain_of = 0.0, tuple[str, ...]()
+        if gains.any():
+            row, column = np.unravel_index(int(gains.argmax()), gains.shape)
+            gain = float(gamma[closure.passive[row], column])
+            gain_of = (machine.joints[closure.passive[row]], machine.active[column])
+        condition, weakest = self._loop_condition(q)
+        q_a = np.array(q[closure.active])
+        zero_velocity = np.zeros(len(q_a))
+        return Readout(
+            configuration=np.array(q),
+            q_a=q_a,
+            tip=None
+            if self._kinematics is None
+            else self._kinematics.position_at_configuration(q),
+            gravity=self._dynamics.evaluate_closed("gravity", q, zero_velocity, zero_velocity),
+            largest_gain=gain,
+            gain_joints=gain_of,
+            condition_number=condition,
+            weakest_loop=weakest,
+            residual=float(closure.residual(q)),
+        )
+
+    def _loop_condition(self, q: Array) -> tuple[float, str]:
+        """Condition number of J_P, and the loop that a force of least effect belongs to.
+
+        In shares of the machine's size, so that metres and radians compare.
+        """
+        closure = self.machine.closure
+        equations, rows = closure.equations, closure.structure.independent_rows
+        if not len(rows):
+            return 1.0, ""
+        left_singular_vectors, singular_values, _ = np.linalg.svd(
+            equations.evaluate_scaled(q)[1][rows][:, closure.passive]
+        )
+        shares = np.bincount(equations.loop_of_row[rows], left_singular_vectors[:, -1] ** 2)
+        condition = singular_values[0] / singular_values[-1] if singular_values[-1] > 0 else np.inf
+        return float(condition), equations.names[int(shares.argmax())]
+
+
+def round_up_to_nice(value: float) -> float:
+    """The next of 1, 2 or 5 times a power of ten that is not below a positive value."""
+    power_of_ten = 10.0 ** np.floor(np.log10(value))
+    return float(
+        next(x for x in (1, 2, 5, 10) if x * power_of_ten >= value * (1 - 1e-9)) * power_of_ten
+    )

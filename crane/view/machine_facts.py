@@ -1,0 +1,187 @@
+"""What a machine consists of, as facts and tables: for the terminal and for notebooks alike."""
+
+from collections.abc import Iterator, Mapping
+from math import inf, isfinite, isinf
+from pathlib import Path
+from typing import NamedTuple
+
+from crane.common.units import format_quantity
+from crane.description.sensors import Sensor
+from crane.dynamics import Dynamics
+from crane.dynamics.frame_distances import FrameDistances
+from crane.machine import Machine
+from crane.recordings.recording import FORCE_UNITS
+
+
+class MachineFact(NamedTuple):
+    """One fact, and the rows of its table where it has one.
+
+    Attributes:
+        name: What it is about.
+        text: What is to be said.
+        heading: Of the columns, "" where a cell says by itself what it is.
+        rows: Cells, as many as there are columns; empty ones say nothing.
+    """
+
+    name: str
+    text: str
+    heading: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+
+
+def machine_facts(machine: Machine) -> Iterator[MachineFact]:
+    """Files, joints, loops, drives, circuit, sensors and tasks of a machine."""
+    if machine.source:
+        yield MachineFact("source", machine.source)
+    yield MachineFact("file", str(machine.path))
+    yield _chain_fact(machine)
+    yield _joint_fact(machine)
+    yield from _loop_facts(machine)
+    yield from _drive_facts(machine)
+    yield MachineFact("tip", machine.tip or "none")
+    yield from _circuit_fact(machine)
+    yield from _sensor_facts(machine)
+    for task in machine.tasks.values():
+        prefix = "at most " * bool(task.phases)
+        yield MachineFact("task", f"{task.name}, {prefix}{task.duration:g} s: {task.description}")
+
+
+def _chain_fact(machine: Machine) -> MachineFact:
+    """The sub-chains, by their files where they have some of their own."""
+    folder, chains = machine.path.parent, machine.chains
+    rows = tuple((x.name, _relative_path(x.urdf, folder), x.parent or "") for x in chains)
+    return MachineFact("chains", ", ".join(x.name for x in chains), ("", "", "on"), rows)
+
+
+def _relative_path(file: Path, folder: Path) -> str:
+    return str(file.relative_to(folder) if file.is_relative_to(folder) else file)
+
+
+def _joint_fact(machine: Machine) -> MachineFact:
+    """All joints: those that are driven first."""
+    free_text = f" and {len(machine.free)} free" if machine.free else ""
+    mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
+    columns = [*machine.closure.active, *machine.closure.passive]
+    return MachineFact(
+        "joints",
+        f"{len(machine.joints)}, of which {len(machine.driven_joints)} active{free_text}; "
+        f"moving mass {format_quantity(mass, 'kg', 4)}",
+        ("", "", "home", "effort", ""),
+        tuple(_joint_row(machine, int(i)) for i in columns),
+    )
+
+
+def _joint_row(machine: Machine, joint_index: int) -> tuple[str, ...]:
+    """A joint: its limits, its home, the most that drives it, and whether something does."""
+    joint = machine.joints[joint_index]
+    unit, effort = machine.unit(joint), machine.model.effortLimit[joint_index]
+    driven = joint in machine.active
+    max_effort = (
+        format_quantity(effort, FORCE_UNITS[unit], 4)
+        if driven and isfinite(effort) and effort
+        else ""
+    )
+    role = "passive" if not driven else "free" if joint in machine.free else "driven"
+    lower, upper = machine.coordinates.lower[joint_index], machine.coordinates.upper[joint_index]
+    return (
+        joint,
+        _format_limits(lower, upper, unit),
+        f"{machine.home[joint_index]:.5g} {unit}",
+        max_effort,
+        role,
+    )
+
+
+def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
+    closure = machine.closure
+    loops, structure = closure.equations.loops, closure.structure
+    yield MachineFact(
+        "loops",
+        f"{len(loops)}: {len(structure.independent_rows)} independent equations, "
+        f"{len(structure.redundant_rows)} redundant",
+        ("", "", ""),
+        tuple((x.name, x.type, f"{x.predecessor} to {x.successor}") for x in loops),
+    )
+    for coupling in closure.equations.couplings:
+        terms = _format_sum(coupling.factors)
+        yield MachineFact("coupling", f"{coupling.name}, {terms} = {coupling.offset:g}")
+    if structure.blocks:
+        order = [
+            "+".join(machine.joints[closure.passive[i]] for i in columns)
+            for _, columns in structure.blocks
+        ]
+        yield MachineFact("solved as", ", then ".join(order))
+
+
+def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
+    closure = machine.closure
+    elements = [item for item in machine.force_elements if item.between is not None]
+    lengths, _ = FrameDistances(
+        machine, [item.between for item in elements if item.between]
+    ).evaluate(machine.home)
+    for element, length in zip(elements, lengths, strict=True):
+        first_frame, second_frame = element.between or ("", "")
+        yield MachineFact(
+            "between",
+            f"{first_frame} and {second_frame}: {element.kind}, ends {length:.5g} m apart at home",
+        )
+    for motor in machine.explicit_drives:
+        yield MachineFact("drive", f"{motor.name}, along {_format_sum(motor.factors)}")
+    if closure.equations.loops:
+        condition_number = float(closure.condition_number(machine.home))
+        better_selections = [
+            c
+            for c in closure.proposed_active_joints
+            if condition_number > 10 and c.condition_number < condition_number / 2
+        ]
+        hint = f"; better with {better_selections[0]}" if better_selections else ""
+        # of free ones too, which nothing drives
+        yield MachineFact(
+            "independent", f"coordinates: condition {condition_number:.3g} at home{hint}"
+        )
+    if any(inertia.mass for inertia in list(machine.model.inertias)[1:]):
+        backend = Dynamics(machine).backend_of("forward")
+        reason = "" if backend == "compiled" else ", too large for machine code"
+        yield MachineFact("computed", f"{backend}{reason}")
+
+
+def _circuit_fact(machine: Machine) -> Iterator[MachineFact]:
+    if machine.hydraulics is None:
+        return
+    supply, rows = machine.hydraulics.supply, []
+    flow = f", {6e4 * supply.flow:.4g} l/min at most" if supply.flow else ""
+    for joint, cylinder in machine.hydraulics.cylinders.items():
+        valve = machine.hydraulics.valves[joint]
+        kind = "sharing" if valve.sharing else "compensated" if valve.margin else "orifice"
+        spool_text = " of two spools" if valve.spool_b else ""
+        unit, size = ("cm2", 1e4) if machine.unit(joint) == "m" else ("cm3/rad", 1e6)
+        areas = f"{size * cylinder.area_a:.4g} and {size * cylinder.area_b:.4g} {unit}"
+        rows.append((joint, f"{kind} valve{spool_text}", areas))
+    text = f"{1e-5 * supply.pressure:.4g} bar{flow}"
+    yield MachineFact("hydraulics", text, ("", "", ""), tuple(rows))
+
+
+def _sensor_facts(machine: Machine) -> Iterator[MachineFact]:
+    ideal_values = Sensor().parameters()
+    for name, sensor in machine.sensors.items():
+        differing_values = [
+            f"{quantity_name} {x:g}"
+            for quantity_name, x in sensor.parameters().items()
+            if x != ideal_values[quantity_name]
+        ]
+        column_text = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
+        text = ", ".join([x for x in column_text if x] + differing_values) or "ideal"
+        yield MachineFact("sensor", f"{name}: {text}")
+
+
+def _format_sum(factors: Mapping[str, float]) -> str:
+    return " + ".join(f"{factor:g} {joint}" for joint, factor in factors.items())
+
+
+def _format_limits(lower: float, upper: float, unit: str) -> str:
+    """A range in words, which may have no end."""
+    if (lower, upper) == (-inf, inf):
+        return "unlimited"
+    if isinf(lower):
+        return f"at most {upper:.5g} {unit}"
+    return f"at least {lower:.5g} {unit}" if isinf(upper) else f"{lower:.5g} to {upper:.5g} {unit}"

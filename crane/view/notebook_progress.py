@@ -1,0 +1,69 @@
+"""Cells of a notebook that take long say what goes on: one line with a bar, gone in the end."""
+
+from types import FrameType
+from typing import Any
+
+from crane.common.progress import PROGRESS, MainThreadMonitor, current_activity
+
+
+def show_cell_progress(shell: Any) -> None:
+    """From this cell of a notebook on, tell what goes on in those that take long.
+
+    Args:
+        shell: IPython's, of a kernel.
+    """
+    bar = _CellProgressBar()
+    shell.events.register("pre_run_cell", lambda *_: bar.start())
+    shell.events.register("post_run_cell", lambda *_: bar.stop())
+    PROGRESS.is_enabled = True
+    bar.start()
+
+
+class _CellProgressBar:
+    """The line of a cell."""
+
+    def __init__(self) -> None:
+        self._monitor: MainThreadMonitor | None = None
+        self._display_handle: Any = None
+
+    def start(self) -> None:
+        """A cell begins."""
+        self.stop()
+        self._monitor = MainThreadMonitor(self._show_progress)
+        self._monitor.start()
+
+    def stop(self) -> None:
+        """It is over: no line stays."""
+        if self._monitor is not None:
+            self._monitor.stop()
+        if self._display_handle is not None:
+            self._display_handle.update(_HtmlLine(""))
+        self._monitor = self._display_handle = None
+        PROGRESS.reset()
+
+    def _show_progress(self, frame: FrameType | None, seconds: float) -> None:
+        if not (activity := current_activity(frame)):
+            return  # of what is not the package's nothing is known
+        share = PROGRESS.finished_share(frame)
+        value = "" if share is None else f' value="{share:.3f}"'
+        share_text = "" if share is None else f"{share:.0%}, "
+        line = _HtmlLine(f"<progress{value}></progress> {activity}, {share_text}{seconds:.0f} s")
+        if self._display_handle is None:
+            from IPython.display import display
+
+            self._display_handle = display(line, display_id=True)
+        else:
+            self._display_handle.update(line)
+
+
+class _HtmlLine:
+    """A line of HTML."""
+
+    def __init__(self, html: str):
+        self._html = html
+
+    def __repr__(self) -> str:
+        return ""
+
+    def _repr_html_(self) -> str:
+        return self._html

@@ -1,0 +1,188 @@
+"""Rated loads as one page to point at: load, causes, posture, strokes and pressures of a place."""
+
+import json
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import OutputError
+from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.ratings import Capacity
+from crane.ratings.capacity_report import capacity_facts, slew_labels
+from crane.ratings.drive_force_limits import drive_force_limits
+from crane.view.page.report_page import PAGE_SUFFIXES
+from crane.view.plots.capacity_figure import (
+    capacity_heading,
+    drawing_extent,
+    factor_colours,
+    home_outlines,
+    load_contours,
+)
+from crane.view.sketch.machine_outline import MachineOutline, machine_outline
+
+_MAX_CELLS = 1500  # per slew angle, at most
+_OUTLINE_RESOLUTION = 4000.0  # of the extent, to which outlines are rounded
+_SIGNIFICANT_DIGITS, _LOAD_DIGITS = 5, 7
+
+
+def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
+    """Write rated loads as one HTML file that needs no network.
+
+    Args:
+        chart: What to show; of more than 1500 places per slew angle every second, third ...
+        path: The file to write; replaced if it exists.
+
+    Returns:
+        The path.
+
+    Raises:
+        OutputError: The file's suffix is not .html or .htm, or it cannot be written.
+    """
+    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
+        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    assets = files("crane.view.page") / "assets"
+    style, script, template = (
+        (assets / f"capacity.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html")
+    )
+    data = json.dumps(capacity_page_data(chart), separators=(",", ":"), allow_nan=False)
+    text = Template(template).substitute(
+        title=escape(capacity_heading(chart)),
+        style=style,
+        script=script,
+        data=data.replace("</", "<\\/"),
+    )
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def capacity_page_data(chart: Capacity) -> dict[str, Any]:
+    """What the page shows, as JSON has it; lengths of outlines in `unit` metres."""
+    lower, upper = drawing_extent(chart)
+    unit = float((upper - lower).max()) / _OUTLINE_RESOLUTION
+    machine, pressures = chart.machine, chart.pressures()
+    limits = {
+        drive.joint: drive.chamber_pressures
+        for drive in drive_force_limits(machine, chart.raising_joints)
+    }
+    drives = [
+        {
+            "joint": joint,
+            "unit": _reading_unit(machine.unit(joint))[0],
+            "limits": [_rounded_or_none(1e-5 * x) for x in limits.get(joint, ())],
+        }
+        for joint in machine.active
+    ]
+    shapes: dict[str, int] = {}
+    standing_outlines = [
+        _round_points(home_outline.stationary_hull, unit) for home_outline in home_outlines(chart)
+    ]
+    return {
+        "facts": capacity_facts(chart),
+        "names": chart.section.coordinate_names,
+        "slews": slew_labels(chart),
+        "low": lower.tolist(),
+        "high": upper.tolist(),
+        "unit": unit,
+        "step": [_cell_stride(chart) * _smallest_spacing(x) for x in (chart.radii, chart.heights)],
+        "causes": [str(cause) for cause in chart.limiting_factors],
+        "tints": factor_colours(chart),
+        "drives": drives,
+        "standing": standing_outlines,
+        "cells": [_cell_rows(chart, k, pressures, unit, shapes) for k in range(len(chart.slews))],
+        "contours": [_contour_rows(chart, k, unit) for k in range(len(chart.slews))],
+        "shapes": [json.loads(shape) for shape in shapes],
+    }
+
+
+def _cell_rows(
+    chart: Capacity, k: int, pressures: dict[str, Array], unit: float, shapes: dict[str, int]
+) -> list[list[Any]]:
+    """Of each place at a slew angle what the page tells of it.
+
+    Radius, height, load, cause, loads by cause, strokes, pressures by joint, and the number of
+    its outline.
+    """
+    machine, active = chart.machine, chart.machine.closure.active
+    stride = _cell_stride(chart)
+    b, a = np.nonzero(~np.isnan(chart.loads[k])[::stride, ::stride])
+    b, a = b * stride, a * stride
+    scales = np.array([_reading_unit(machine.unit(joint))[1] for joint in machine.active])
+    q = machine.closure.solve(np.ascontiguousarray(chart.q_a[k, b, a]))
+    out = []
+    for configuration, i, j in zip(q, b, a, strict=True):
+        configuration_outline = machine_outline(machine, chart.frame, chart.section, configuration)
+        shape_index = shapes.setdefault(
+            json.dumps(_outline_shape(configuration_outline, unit)), len(shapes)
+        )
+        pressure_rows = [
+            [_rounded_or_none(1e-5 * x) for x in pressures[joint][k, i, j]]
+            if joint in pressures
+            else []
+            for joint in machine.active
+        ]
+        out.append(
+            [
+                _rounded_or_none(chart.radii[j]),
+                _rounded_or_none(chart.heights[i]),
+                _rounded_or_none(chart.loads[k, i, j], _LOAD_DIGITS),
+                int(chart.limiting_factor_index[k, i, j]),
+                [_rounded_or_none(x, _LOAD_DIGITS) for x in chart.values_by_factor[k, i, j]],
+                [_round_to_tenths(x) for x in scales * configuration[active]],
+                pressure_rows,
+                shape_index,
+            ]
+        )
+    return out
+
+
+def _cell_stride(chart: Capacity) -> int:
+    """Of how many places along an axis one is shown."""
+    max_count = int((~np.isnan(chart.loads)).sum(axis=(1, 2)).max())
+    return max(int(np.ceil(np.sqrt(max_count / _MAX_CELLS))), 1)
+
+
+def _contour_rows(chart: Capacity, k: int, unit: float) -> list[list[Any]]:
+    """Of each contour that is there its load in words and its lines."""
+    contour_lines = load_contours(chart, k)
+    name, scale = display_unit("kg", max((level for level, _ in contour_lines), default=0.0))
+    return [
+        [f"{scale * level:g} {name}", [_round_points(line, unit) for line in lines]]
+        for level, lines in contour_lines
+        if lines
+    ]
+
+
+def _outline_shape(outline: MachineOutline, unit: float) -> list[Any]:
+    return [[_round_points(body, unit) for body in outline.bodies],
+            [_round_points(cylinder, unit) for cylinder in outline.cylinders]]  # fmt: skip
+
+
+def _round_points(points: Array, unit: float) -> list[int]:
+    """x, y, x, y ... in units."""
+    return [int(x) for x in np.rint(points / unit).ravel()]
+
+
+def _reading_unit(unit: str) -> tuple[str, float]:
+    """Degrees and millimetres."""
+    return display_unit(unit, 0.0)
+
+
+def _smallest_spacing(values: Array) -> float:
+    return float(np.diff(values).min()) if len(values) > 1 else 0.0
+
+
+def _round_to_tenths(value: float) -> float:
+    """Strokes and angles to 0.1 mm or deg, without rounding noise at their limits."""
+    return round(float(value), 1) + 0.0  # no -0.0
+
+
+def _rounded_or_none(value: float, digits: int = _SIGNIFICANT_DIGITS) -> float | None:
+    """A number with few digits, None where there is none."""
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else None

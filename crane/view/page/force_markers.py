@@ -1,0 +1,164 @@
+"""What a page draws on the machine: forces of its drives and loads, springs between its bodies."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.description.specification import ForceElement, GasSpring
+from crane.dynamics.frame_distances import FrameDistances
+from crane.machine import Machine
+from crane.view.page.machine_visuals import largest_body_extent
+from crane.view.page.packed_arrays import pack_base64
+from crane.view.page.page_motion import frame_data
+
+if TYPE_CHECKING:
+    from crane.recordings.recording import Recording
+
+_FULL_ARROW_PERCENTILE = (
+    99.5  # percentile of the forces that has a full arrow: a single spike does not count
+)
+_MIN_WEIGHT_SHARE = (
+    1e-6  # share of the machine's weight that is rounding noise, as a force or torque
+)
+_SAMPLED_CONFIGURATIONS = 300  # postures that tell how short a strut gets
+
+
+def actuator_markers(
+    machine: Machine, recording: "Recording", rows: np.ndarray
+) -> list[dict[str, Any]]:
+    """Where the driven joints act and how strongly, in shares of what has a full arrow."""
+    model = machine.model
+    loop_links = [loop.successor for loop in machine.closure.equations.loops]
+    loop_links += [loop.predecessor for loop in machine.closure.equations.loops]
+    loop_frames = [frame_data(machine, end) for end in loop_links]
+    forces = {x: recording.tau[:, recording.joints.index(x)] for x in machine.driven_joints}
+    zero_threshold = _MIN_WEIGHT_SHARE * 9.81 * sum(inertia.mass for inertia in model.inertias)
+    full_arrow = full_arrow_forces(
+        machine,
+        {
+            x: float(np.percentile(np.abs(force), _FULL_ARROW_PERCENTILE))
+            for x, force in forces.items()
+        },
+    )
+    markers = []
+    for joint, force in forces.items():
+        index, shown_force = model.getJointId(joint) - 1, force[rows]
+        is_prismatic = machine.unit(joint) == "m"
+        pin_frames = (
+            [frame for frame in loop_frames if frame["joint"] == index] if is_prismatic else []
+        )
+        share = (
+            np.where(np.abs(shown_force) > zero_threshold, shown_force, 0.0) / full_arrow[joint]
+        )
+        markers.append(
+            {
+                "joint": index,
+                "at": pin_frames[0]["placement"][12:15] if pin_frames else [0.0, 0.0, 0.0],
+                "name": joint,
+                "share": pack_base64(share, "f4"),
+            }
+        )
+    return markers
+
+
+def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, float]:
+    """The force or torque of each driven joint that has a full arrow [N or N m].
+
+    In proportion to their limits (`effort`) where all have one, so that arrows tell how hard each
+    works for what it can. Else to forces, torques by the longest body as their lever. The joint
+    that is largest by that has a full arrow at its peak.
+
+    Args:
+        machine: The machine.
+        peaks: Largest force or torque of each joint.
+    """
+    limits = [machine.model.effortLimit[machine.column(joint)] for joint in peaks]
+    if all(0 < limit < np.inf for limit in limits):
+        reference_forces = dict(zip(peaks, map(float, limits), strict=True))
+    else:
+        body_length = largest_body_extent(machine)
+        reference_forces = {
+            joint: 1.0 if machine.unit(joint) == "m" else body_length for joint in peaks
+        }
+    largest_ratio = (
+        max((peak / reference_forces[joint] for joint, peak in peaks.items()), default=0.0) or 1.0
+    )
+    return {
+        joint: largest_ratio * reference_force
+        for joint, reference_force in reference_forces.items()
+    }
+
+
+def load_markers(
+    machine: Machine, recording: "Recording", rows: np.ndarray
+) -> list[dict[str, Any]]:
+    """Where forces from outside act and how strongly, in shares of the largest."""
+    known_forces = [
+        *machine.external_forces,
+        *(x for task in machine.tasks.values() for x in task.loads),
+    ]
+    frames = {link: link for link in machine.tree.links} | {x.name: x.frame for x in known_forces}
+    channels, forces = recording.channels, {}
+    for column in channels:
+        name = column.removeprefix("load_").removesuffix("_force_x")
+        if column == f"load_{name}_force_x" and name in frames:
+            axes = (channels.get(f"load_{name}_force_{axis}") for axis in "xyz")
+            forces[name] = [np.zeros(len(recording.time)) if x is None else x for x in axes]
+    for name in machine.supports:
+        if f"support_{name}" in channels and name not in forces:
+            forces[name] = [np.zeros(len(recording.time))] * 2 + [channels[f"support_{name}"]]
+    if not forces:
+        return []
+    sizes = [np.linalg.norm(force, axis=0) for force in forces.values()]
+    full_arrow = float(np.percentile(np.maximum.reduce(sizes), _FULL_ARROW_PERCENTILE)) or 1.0
+    return [
+        {
+            "name": name, "place": frame_data(machine, frames[name]), "full": full_arrow,
+            "share": [pack_base64((x / full_arrow)[rows], "f4") for x in force],
+        }
+        for name, force in forces.items()
+    ]  # fmt: skip
+
+
+def spring_markers(machine: Machine, q: Array) -> list[dict[str, Any]]:
+    """What acts between two frames of a machine: where, what it looks like, and its lengths.
+
+    A coil where there is a spring, a strut where there is a damper or gas, else a line.
+
+    Args:
+        machine: The machine.
+        q: (N, nq) postures that are shown.
+    """
+    element_pairs = [
+        (element, element.between)
+        for element in machine.force_elements
+        if element.between is not None
+    ]
+    if not element_pairs:
+        return []
+    lengths = FrameDistances(machine, [pair for _, pair in element_pairs])
+    sampled_configurations = q[
+        np.unique(np.linspace(0, len(q) - 1, _SAMPLED_CONFIGURATIONS).astype(int))
+    ]
+    sampled_lengths, home_lengths = (
+        lengths.evaluate(sampled_configurations)[0],
+        lengths.evaluate(machine.home)[0],
+    )
+    markers = []
+    for i, (item, pair) in enumerate(element_pairs):
+        has_coil = isinstance(item, ForceElement) and item.stiffness > 0
+        has_strut = (
+            isinstance(item, GasSpring) or isinstance(item, ForceElement) and item.damping > 0
+        )
+        markers.append(
+            {
+                "name": f"{item.kind} {pair[0]}-{pair[1]}",
+                "ends": [frame_data(machine, link) for link in pair],
+                "parts": [x for x, is_ in (("coil", has_coil), ("strut", has_strut)) if is_]
+                or ["line"],
+                "length": float(home_lengths[i]),
+                "least": float(sampled_lengths[:, i].min()),
+            }
+        )
+    return markers

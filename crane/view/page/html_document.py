@@ -1,0 +1,90 @@
+"""Self-contained pages of text, tables and pictures, that need no network."""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import OutputError
+from crane.view.page.report_page import PAGE_SUFFIXES
+
+_CSS = """
+:root { color: #26292e; background: #fff; font: 15px/1.5 system-ui, "Segoe UI", sans-serif; }
+body { max-width: 74rem; margin: 0 auto; padding: 1.5rem clamp(.8rem, 3vw, 2rem) 4rem; }
+h1 { font-size: 1.6rem; line-height: 1.25; margin: .5rem 0 1.2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.15rem; margin: 2.6rem 0 .6rem; padding-top: .9rem; border-top: 1px solid #ddd; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .3rem; }
+p { max-width: 46rem; margin: .4rem 0 .8rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.4rem; margin: 0; }
+dt { color: #646a73; } dd { margin: 0; overflow-wrap: anywhere; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .87rem; }
+th { text-align: left; font-weight: 600; border-bottom: 1.5px solid #9aa0a8; color: #444a52; }
+th, td { padding: .22rem .9rem .22rem 0; vertical-align: top; white-space: nowrap; }
+td { border-bottom: 1px solid #eceef0; }
+th.n, td.n { text-align: right; }
+th:first-child, td:first-child { position: sticky; left: 0; background: #fff; }
+td.words { white-space: normal; min-width: 20rem; overflow-wrap: anywhere; }
+tr.weak td { color: #8a9099; }
+summary { cursor: pointer; } code { font-size: .93em; }
+.figures { display: grid; gap: 1rem 1.5rem;
+           grid-template-columns: repeat(auto-fit, minmax(min(100%, 27rem), 1fr)); }
+pre { overflow-x: auto; background: #f5f6f7; padding: .7rem .9rem; font-size: .85rem; }
+img { width: 100%; height: auto; display: block; }
+.matrix { margin-top: 1.5rem; min-width: 36rem; max-width: 56rem; }
+"""
+
+
+def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path:
+    """Write a page.
+
+    Args:
+        path: The file to write; replaced if it exists.
+        heading: What it is called.
+        parts: Its HTML.
+
+    Returns:
+        The path.
+
+    Raises:
+        OutputError: The file's suffix is not .html or .htm, or it cannot be written.
+    """
+    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
+        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    heading = escape(heading)
+    text = (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{heading}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
+        f"<h1>{heading}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
+    )
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def definition_list(rows: Iterable[tuple[str, str]]) -> str:
+    """Names with what they are; what is nothing is left out."""
+    items = (f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in rows if text)
+    return f"<dl>{''.join(items)}</dl>"
+
+
+def html_table(
+    headings: Sequence[str], rows: Iterable[Sequence[str]], classes: Iterable[str] = ()
+) -> str:
+    """Cells are HTML; those of columns whose head ends in * are text, the others numbers."""
+    cell_attributes = ["" if name.endswith("*") else ' class="n"' for name in headings]
+    heading_cells = "".join(
+        f"<th{k}>{name.rstrip('*')}</th>"
+        for k, name in zip(cell_attributes, headings, strict=True)
+    )
+    row_classes = iter(classes)
+    body = []
+    for row in rows:
+        row_class = next(row_classes, "")
+        cells = "".join(
+            cell if cell.startswith("<td") else f"<td{k}>{cell}</td>"
+            for k, cell in zip(cell_attributes, row, strict=True)
+        )
+        body.append(f'<tr class="{row_class}">{cells}</tr>' if row_class else f"<tr>{cells}</tr>")
+    return f'<div class="scroll"><table><tr>{heading_cells}</tr>{"".join(body)}</table></div>'

@@ -1,0 +1,323 @@
+"""A recording's columns as a page plots them: grouped, in units to read, thinned out.
+
+A column of few samples is kept as it is. Of more, the page has the lowest and highest value in
+each of many spans of time, so that no peak is lost, and the samples at the frames, which are the
+values at the cursor.
+"""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.common.scratch_arrays import compute_in_blocks, release_pages
+from crane.common.units import display_unit
+from crane.machine import Machine
+from crane.recordings.recording import (
+    FORCE_UNITS,
+    REFERENCE_PREFIX,
+    VELOCITY_SUFFIX,
+    VELOCITY_UNITS,
+)
+from crane.view.page.packed_arrays import pack_base64
+
+if TYPE_CHECKING:
+    from crane.recordings.recording import Recording
+
+MIN_SPANS = 4000  # of time, in a short recording
+SPANS_PER_SECOND = 15.0  # in a long one
+MAX_SPANS = 1_100_000  # in all columns of a page
+INITIALLY_SHOWN = 8  # lines that a plot shows at first
+
+ANGLES, STROKES, ERRORS = "Angles", "Strokes", "Errors"
+TORQUES, FORCES = "Torques", "Forces"
+# Groups in the order of the page; those of the first tuple are open at first.
+OPEN_GROUPS = (
+    STROKES, FORCES, "Pressures", ANGLES, TORQUES, ERRORS, "Stroke velocities",
+    "Angular velocities",
+)  # fmt: skip
+CLOSED_GROUPS = (
+    "Valve voltages", "Spools", "Flows", "Tip", "Passive angles", "Passive strokes",
+    "Passive velocities", "Friction", "Energies", "Powers", "Volumes", "Signals", "Other",
+)  # fmt: skip
+_GROUP_BY_UNIT = {
+    "Pa": "Pressures", "V": "Valve voltages", "m3/s": "Flows", "J": "Energies", "W": "Powers",
+    "m3": "Volumes", "": "Signals",
+}  # fmt: skip
+_PREFIXES = ("pressure_", "voltage_", "spool_", "flow_", "friction_")
+_ERROR_PREFIX = "error_"  # of a joint to its reference
+
+
+@dataclass(frozen=True, eq=False)
+class PageColumn:
+    """One column of a recording, in SI units.
+
+    Attributes:
+        name: As in the recording's file.
+        group: Title of the group it is plotted in.
+        label: What the plot calls it.
+        unit: Its unit.
+        values: (N,).
+        reference: (N,) what it should be; None if not recorded.
+        limits: Limits of a coordinate.
+    """
+
+    name: str
+    group: str
+    label: str
+    unit: str
+    values: Array
+    reference: Array | None = None
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ThinningGrid:
+    """How the samples of one recording are thinned out.
+
+    Attributes:
+        time: (N,) of the samples [s].
+        frame_rows: Samples that are frames.
+        span_starts: First sample of each span; None where every sample is kept.
+    """
+
+    time: Array
+    frame_rows: np.ndarray
+    span_starts: np.ndarray | None
+
+    @classmethod
+    def from_recording(
+        cls, recording: "Recording", frame_rows: np.ndarray, page_share: float = 1.0
+    ) -> "ThinningGrid":
+        """Spans for a recording that takes a share of the page."""
+        time, columns = recording.time, 1 + 3 * len(recording.joints) + len(recording.channels)
+        wanted_spans = max(MIN_SPANS, int(SPANS_PER_SECOND * (time[-1] - time[0])))
+        count = max(min(wanted_spans, int(page_share * MAX_SPANS / columns)), 500)
+        if len(time) <= 2 * count:
+            return cls(time, frame_rows, None)
+        return cls(time, frame_rows, np.arange(count) * len(time) // count)
+
+    def time_axis(self) -> dict[str, Any]:
+        """Times of what `thin_out` keeps, and where the frames are among them."""
+        if self.span_starts is None:
+            return {
+                "time": pack_base64(self.time, "f8"),
+                "rows": pack_base64(self.frame_rows, "u4"),
+            }
+        span_ends = np.append(self.span_starts[1:], len(self.time)) - 1
+        return {
+            "time": pack_base64((self.time[self.span_starts] + self.time[span_ends]) / 2, "f8"),
+            "rows": "",
+        }
+
+    def thin_out(self, values: Array) -> dict[str, str]:
+        """Values (N,) thinned out: lowest and highest of each span, samples at the frames."""
+        if self.span_starts is None:
+            return {"low": pack_base64(values, "f4"), "high": "", "frames": ""}
+        return {
+            "low": pack_base64(np.minimum.reduceat(values, self.span_starts), "f4"),
+            "high": pack_base64(np.maximum.reduceat(values, self.span_starts), "f4"),
+            "frames": pack_base64(values[self.frame_rows], "f4"),
+        }
+
+
+def _column_series(column: PageColumn, grid: ThinningGrid, scale: float) -> dict[str, Any]:
+    """The values of a column, of its reference and its limits."""
+    series_data: dict[str, Any] = {"series": grid.thin_out(scale * column.values)}
+    if column.reference is not None:
+        series_data["reference"] = grid.thin_out(scale * column.reference)
+    if column.limits is not None:
+        series_data["limits"] = [scale * x if np.isfinite(x) else None for x in column.limits]
+    return series_data
+
+
+def plot_groups(
+    machine: Machine,
+    recording: "Recording",
+    grid: ThinningGrid,
+    second_recording: "tuple[Recording, ThinningGrid] | None" = None,
+) -> list[dict[str, Any]]:
+    """Everything that a page plots, by group.
+
+    Args:
+        machine: The machine.
+        recording: What it did.
+        grid: How its samples are thinned out.
+        second_recording: A second recording, with its grid: its columns of the same names are
+            second lines.
+    """
+    columns_by_group: dict[tuple[str, str], list[PageColumn]] = {}
+    for column in page_columns(machine, recording):
+        columns_by_group.setdefault((column.group, column.unit), []).append(column)
+    second_columns = (
+        {}
+        if second_recording is None
+        else {x.name: x for x in page_columns(machine, second_recording[0])}
+    )
+    order = [*OPEN_GROUPS, *CLOSED_GROUPS]
+    group_data = []
+    for title, unit in sorted(columns_by_group, key=lambda key: order.index(key[0])):
+        group_columns = columns_by_group[title, unit]
+        peak = max(_peak_magnitude(column.values) for column in group_columns)
+        shown_unit, scale = display_unit(unit, peak)
+        line_data = []
+        for index, (column, hue, shade) in enumerate(_with_colours(machine, group_columns)):
+            release_pages()
+            line = {
+                "name": column.name,
+                "label": column.label,
+                "hue": hue,
+                "shade": shade,
+                "shown": index < INITIALLY_SHOWN,
+                **_column_series(column, grid, scale),
+            }
+            second_column = second_columns.get(column.name)
+            if (
+                second_recording is not None
+                and second_column is not None
+                and second_column.unit == unit
+            ):
+                line["other"] = second_recording[1].thin_out(scale * second_column.values)
+            line_data.append(line)
+        is_moving = len(recording.time) == 1 or any(
+            _varies(column.values) for column in group_columns
+        )
+        release_pages()
+        group_data.append(
+            {
+                "title": title,
+                "unit": shown_unit,
+                "open": is_moving and title in OPEN_GROUPS,
+                "lines": line_data,
+            }
+        )
+    return group_data
+
+
+def page_columns(machine: Machine, recording: "Recording") -> Iterator[PageColumn]:
+    """All columns but time, each in its group; references with what they are references of.
+
+    Beside them what follows from them: errors, references less coordinates, and the sum of
+    kinetic and potential energy.
+    """
+    channels = recording.channels
+    used_references = set()
+
+    def reference(name: str) -> Array | None:
+        used_references.add(REFERENCE_PREFIX + name)
+        return channels.get(REFERENCE_PREFIX + name)
+
+    for i, joint in enumerate(recording.joints):
+        unit = recording.units[joint]
+        is_angle, is_passive = unit == "rad", joint not in machine.active
+        column = machine.column(joint)
+        lower, upper = (
+            float(limits[column])
+            for limits in (machine.coordinates.lower, machine.coordinates.upper)
+        )
+        group_titles = (
+            [ANGLES, "Angular velocities", TORQUES]
+            if is_angle
+            else [STROKES, "Stroke velocities", FORCES]
+        )
+        if is_passive:
+            group_titles = [
+                "Passive angles" if is_angle else "Passive strokes",
+                "Passive velocities",
+                "Other",
+            ]
+        yield PageColumn(
+            joint,
+            group_titles[0],
+            joint,
+            unit,
+            recording.q[:, i],
+            reference(joint),
+            (lower, upper),
+        )
+        velocity_unit = VELOCITY_UNITS[unit]
+        reference_velocity = reference(f"velocity_{joint}")
+        yield PageColumn(
+            joint + VELOCITY_SUFFIX,
+            group_titles[1],
+            joint,
+            velocity_unit,
+            recording.v[:, i],
+            reference_velocity,
+        )
+        if REFERENCE_PREFIX + joint in channels:
+            yield PageColumn(_ERROR_PREFIX + joint, ERRORS, joint, unit, recording.error(joint))
+        if joint in recording.free:
+            continue
+        yield PageColumn(
+            f"{joint}_force", group_titles[2], joint, FORCE_UNITS[unit], recording.tau[:, i]
+        )
+    for name, values in channels.items():
+        if name.startswith(REFERENCE_PREFIX):
+            continue
+        unit = recording.channel_units[name]
+        if not unit and name in machine.joints:
+            unit = machine.unit(name)
+        group, label = _group_and_label(machine, name, unit)
+        yield PageColumn(name, group, label, unit, values, reference(name))
+        if name == "potential" and unit == recording.channel_units.get("kinetic") == "J":
+            energy_name = "kinetic + potential"
+            yield PageColumn(
+                energy_name, group, energy_name, unit, _sum_blockwise(channels["kinetic"], values)
+            )
+    for name, values in channels.items():
+        if name.startswith(REFERENCE_PREFIX) and name not in used_references:
+            yield PageColumn(name, "Other", name, recording.channel_units[name], values)
+
+
+def _sum_blockwise(first: Array, second: Array) -> Array:
+    return compute_in_blocks(lambda part: (first[part] + second[part])[:, None], len(first))[:, 0]
+
+
+def _group_and_label(machine: Machine, name: str, unit: str) -> tuple[str, str]:
+    """Group and label of a channel."""
+    if name in machine.joints:
+        return ("Passive strokes" if machine.unit(name) == "m" else "Passive angles"), name
+    joint = name.removesuffix(VELOCITY_SUFFIX)
+    if joint in machine.joints:
+        return "Passive velocities", joint
+    if name in ("tip_x", "tip_y", "tip_z"):
+        return "Tip", name[-1]
+    prefix = next((x for x in _PREFIXES if name.startswith(x)), "")
+    label = name.removeprefix(prefix)
+    if prefix == "friction_":
+        return "Friction", label
+    if prefix == "spool_":
+        return "Spools", label
+    return _GROUP_BY_UNIT.get(unit, "Other"), label if unit in _GROUP_BY_UNIT else name
+
+
+def _peak_magnitude(values: Array) -> float:
+    release_pages()
+    return float(np.abs(values).max())
+
+
+def _varies(values: Array) -> bool:
+    """Whether a column is more than a constant and rounding noise."""
+    return float(np.ptp(values)) > 1e-9 * max(1.0, _peak_magnitude(values))
+
+
+def _with_colours(
+    machine: Machine, group_columns: list[PageColumn]
+) -> Iterator[tuple[PageColumn, int, int]]:
+    """Each column with a hue, the same for one joint everywhere, and a shade of it."""
+    hue_by_joint: Mapping[str, int] = {joint: i for i, joint in enumerate(machine.active)}
+    used_hues: dict[int, int] = {}
+    for column in group_columns:
+        # the longest name is meant: X_ext is no part of X_extra
+        joints = [x for x in hue_by_joint if f"_{x}_" in f"_{column.name}_"]
+        if joints:
+            hue = hue_by_joint[max(joints, key=len)]
+        else:
+            hue = next(free for free in itertools.count() if free not in used_hues)
+        shade = used_hues.get(hue, 0)
+        used_hues[hue] = shade + 1
+        yield column, hue, shade

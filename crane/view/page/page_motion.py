@@ -1,0 +1,187 @@
+"""What a page computes postures from: the tree of joints, and their coordinates per frame.
+
+A page holds no poses. Its script computes them as Pinocchio does, from the root outwards,
+
+    oM_i = oM_parent(i)  placement_i  exp(S_i q_i),
+
+S_i being the joint's unit axis, which it turns about or slides along. A body that floats has six
+coordinates, place and rotation vector.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.view.page.packed_arrays import pack_base64, quantise
+
+if TYPE_CHECKING:
+    from crane.recordings.recording import Recording
+
+FRAMES_PER_SECOND = 30.0
+MAX_FRAMES = 36_000  # twenty minutes at full rate; longer recordings get fewer per second
+
+
+def joint_tree(machine: Machine) -> dict[str, Any]:
+    """Joints, bodies' masses and link frames for the script; matrices column by column.
+
+    Returns:
+        joints, each after its parent, with the first of their coordinates; -1 is the world.
+    """
+    model = machine.model
+    joints = []
+    for i in range(1, model.njoints):
+        column = model.joints[i].idx_v
+        joint_kind, axis = "floating", np.zeros(3)
+        if column not in machine.coordinates.floating_base_columns:
+            subspace = np.ravel(model.joints[i].createData().S)
+            is_prismatic = bool(machine.coordinates.is_translation[column])
+            joint_kind = "prismatic" if is_prismatic else "revolute"
+            axis = subspace[:3] if is_prismatic else subspace[3:]
+        joints.append(
+            {
+                "name": model.names[i],
+                "parent": model.parents[i] - 1,
+                "column": column,
+                "placement": column_major_pose(model.jointPlacements[i]),
+                "type": joint_kind,
+                "axis": axis.tolist(),
+                "mass": model.inertias[i].mass,
+                "lever": model.inertias[i].lever.tolist(),
+            }
+        )
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    return {"joints": joints, "links": {link: frame_data(machine, link) for link in links}}
+
+
+def frame_data(machine: Machine, link: str) -> dict[str, Any]:
+    """Where a link's frame is: its joint, and its pose in the joint's frame."""
+    frame = machine.model.frames[machine.frame(link)]
+    return {"joint": frame.parentJoint - 1, "placement": column_major_pose(frame.placement)}
+
+
+def column_major_pose(pose: pin.SE3) -> list[float]:
+    """A pose as 16 numbers, column by column."""
+    values: list[float] = pose.homogeneous.ravel("F").tolist()
+    return values
+
+
+def payload_frame_data(machine: Machine) -> dict[str, Any] | None:
+    """Where the centre of mass of the machine's payload is; None without one."""
+    model = machine.model
+    payload_chains = [chain for chain in machine.chains if chain.name == "payload"]
+    if not payload_chains:
+        has_payload_frame = any(
+            f.name == "payload" and f.type == pin.FrameType.BODY for f in model.frames
+        )
+        return frame_data(machine, "payload") if has_payload_frame else None
+    total, moment, joint = 0.0, np.zeros(3), 0
+    child_joints, pending_links = (
+        machine.tree.joints_by_parent(),
+        [machine.tree.joints[payload_chains[0].attachment_name].child],
+    )
+    while pending_links:
+        link = pending_links.pop()
+        pending_links += [joint.child for joint in child_joints.get(link, ())]
+        frame = model.frames[machine.frame(link)]
+        joint = frame.parentJoint
+        if (inertial := machine.tree.links[link].inertial) is not None:
+            total += inertial.mass
+            moment += inertial.mass * frame.placement.act(np.array(inertial.com))
+    if not total:
+        return None
+    return {"joint": joint - 1, "placement": column_major_pose(pin.SE3(np.eye(3), moment / total))}
+
+
+def frame_rows(time: Array, frame_share: float = 1.0) -> np.ndarray:
+    """Rows of the samples that are frames: 30 per second, of a long recording fewer.
+
+    Args:
+        time: (N,) increasing [s].
+        frame_share: Of the frames that a page has at most.
+    """
+    duration = float(time[-1] - time[0])
+    return nearest_frame_rows(
+        time,
+        min(FRAMES_PER_SECOND, frame_share * MAX_FRAMES / duration)
+        if duration
+        else FRAMES_PER_SECOND,
+    )
+
+
+def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
+    """Rows of the samples nearest to the frames of a film, the first and the last among them.
+
+    Args:
+        time: (N,) increasing [s].
+        fps: Frames per second.
+    """
+    frame_times = np.arange(time[0], time[-1], 1 / fps)
+    nearest_rows = np.searchsorted((time[1:] + time[:-1]) / 2, frame_times)
+    return np.unique(np.append(nearest_rows, len(time) - 1))
+
+
+def motion_data(time: Array, q: Array) -> dict[str, Any]:
+    """Frames for the script: times (N,) [s] and postures (N, nq)."""
+    return {"time": pack_base64(time, "f8"), "q": [quantise(column) for column in q.T]}
+
+
+def check_joints(machine: Machine, recording: "Recording") -> None:
+    """See that a recording is of this machine.
+
+    Raises:
+        RecordingError: It lacks an active joint, has one that the machine does not have, or one
+            in another unit.
+    """
+    for joint in machine.active:
+        if joint not in recording.joints:
+            raise RecordingError(
+                f"the recording has no joint '{joint}', which drives {machine.name}, "
+                f"{suggest_names(recording.joints, joint)}"
+            )
+    for joint in recording.joints:
+        if joint not in machine.joints:
+            raise RecordingError(
+                f"the recording has a joint '{joint}' that {machine.name} does not have, "
+                f"{suggest_names(machine.joints, joint)}"
+            )
+        if recording.units[joint] != machine.unit(joint):
+            raise RecordingError(
+                f"'{joint}' is recorded in {recording.units[joint]}, in {machine.name} it is in "
+                f"{machine.unit(joint)}: give a recording of this machine"
+            )
+
+
+def recorded_configurations(machine: Machine, recording: "Recording", rows: np.ndarray) -> Array:
+    """(len(rows), nq) closed postures of some samples of a recording.
+
+    Raises:
+        RecordingError: It is of a machine with other joints.
+        ClosureError: The loops cannot be closed.
+        InputError: A coordinate is not finite.
+    """
+    check_joints(machine, recording)
+    columns = {joint: recording.q[rows, i] for i, joint in enumerate(recording.joints)}
+    q = np.empty((len(rows), len(machine.joints)))
+    if all(
+        joint in columns or _is_recorded(machine, recording, joint) for joint in machine.joints
+    ):
+        for joint in machine.joints:
+            column = columns[joint] if joint in columns else recording.channels[joint][rows]
+            q[:, machine.column(joint)] = column
+    else:
+        q_a = np.column_stack([columns[joint] for joint in machine.active])
+        q = machine.closure.solve(q_a)
+    for joint in machine.joints:
+        if not np.isfinite(q[:, machine.column(joint)]).all():
+            raise InputError(f"joint '{joint}' is not finite, check the recording")
+    return q
+
+
+def _is_recorded(machine: Machine, recording: "Recording", joint: str) -> bool:
+    """Whether the channel of a passive joint is there, in the joint's unit or in none."""
+    unit = recording.channel_units.get(joint)
+    return unit is not None and unit in ("", machine.unit(joint))

@@ -1,0 +1,222 @@
+"""One self-contained page that shows a machine, its forces and its numbers in any browser."""
+
+import json
+import webbrowser
+from html import escape
+from importlib.resources import files
+from math import cos, sin
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+from crane.common.atomic_output import replace_file
+from crane.common.errors import OutputError, RecordingError
+from crane.machine import Machine
+from crane.recordings.recording_differences import clock_shift, joint_differences
+from crane.recordings.recording_summary import label, point_channel, result_title
+from crane.view.page.force_markers import actuator_markers, load_markers, spring_markers
+from crane.view.page.packed_arrays import pack_base64
+from crane.view.page.page_channels import ThinningGrid, plot_groups
+from crane.view.page.page_motion import (
+    check_joints,
+    frame_data,
+    frame_rows,
+    joint_tree,
+    motion_data,
+    payload_frame_data,
+    recorded_configurations,
+)
+from crane.view.page.run_summary import summarize_run
+from crane.view.page.scene import Scene, build_scene
+
+if TYPE_CHECKING:
+    from crane.recordings.recording import Recording
+
+PAGE_SUFFIXES = (".html", ".htm")
+
+# Directions from the machine to the camera; x forward (see `Scene.heading`), z up.
+CAMERA_DIRECTIONS = {
+    "iso": (1.0, -1.6, 0.75), "side": (0.0, -1.0, 0.0), "front": (1.0, 0.0, 0.0),
+    "top": (0.0, -1e-3, 1.0),
+}  # fmt: skip
+# In the order in which they use each other.
+SCRIPT_NAMES = ("data", "kinematics", "timeline", "scene", "marks", "plots", "channels", "main")
+
+
+def report(
+    machine: Machine,
+    recording: "Recording | None",
+    path: str | Path,
+    second_recording: "Recording | None" = None,
+) -> Path:
+    """Write a machine, moving as recorded or in its home posture, as one HTML file.
+
+    The page holds the viewer, the motion and all columns of the recording; nothing is loaded from
+    anywhere. Space plays, the arrow keys step, and every recorded instant is shown as recorded.
+
+    Args:
+        machine: The machine.
+        recording: What it did; None for the home posture.
+        path: The file to write; replaced if it exists.
+        second_recording: A second recording of the machine: a ghost, and second lines in the
+            plots. Where its times do not overlap with those of the first, both start together.
+
+    Returns:
+        The path.
+
+    Raises:
+        RecordingError: A recording is of a machine with other joints.
+        ClosureError: The loops cannot be closed at a recorded sample.
+        InputError: A posture is not finite.
+        OutputError: The file's suffix is not .html or .htm, or it cannot be written.
+    """
+    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
+        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    text = report_html(machine, recording, second_recording)
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def report_html(
+    machine: Machine,
+    recording: "Recording | None",
+    second_recording: "Recording | None" = None,
+    frame_share: float = 1.0,
+) -> str:
+    """The page of `report`, as HTML.
+
+    Args:
+        machine: See there.
+        recording: See there.
+        second_recording: See there.
+        frame_share: Of the frames and spans of time that a page has at most.
+    """
+    scene = build_scene(machine, recording, frame_share)
+    page_data = _machine_data(machine, scene, recording)
+    if recording is not None:
+        page_data |= _run_data(machine, scene, recording, second_recording, frame_share)
+    return _render_page(page_data, scene)
+
+
+def open_in_browser(path: str | Path) -> bool:
+    """Open a page in the user's browser; False where there is none."""
+    return webbrowser.open(Path(path).resolve().as_uri())
+
+
+def _machine_data(machine: Machine, scene: Scene, recording: "Recording | None") -> dict[str, Any]:
+    """What is known of the machine itself."""
+    return {
+        "machine": machine.name,
+        "task": "home posture" if recording is None else label(recording),
+        "tree": joint_tree(machine),
+        "tip": None if machine.tip is None else frame_data(machine, machine.tip),
+        "payload": payload_frame_data(machine),
+        "pins": [
+            frame_data(machine, loop.predecessor) for loop in machine.closure.equations.loops
+        ],
+        "actuators": [],
+        "loads": [],
+        "springs": spring_markers(machine, scene.configurations),
+        "lower": scene.lower.tolist(),
+        "upper": scene.upper.tolist(),
+        "ground": scene.ground_height,
+        "views": {
+            name: _rotate_view(view, scene.heading) for name, view in CAMERA_DIRECTIONS.items()
+        },
+        "summary": summarize_run(machine, recording),
+        "runs": [{"motion": motion_data(scene.time, scene.configurations)}],
+        "groups": [],
+        "differences": [],
+        "reference": "",
+    }
+
+
+def _run_data(
+    machine: Machine,
+    scene: Scene,
+    recording: "Recording",
+    second_recording: "Recording | None",
+    frame_share: float,
+) -> dict[str, Any]:
+    """What was recorded, once or twice."""
+    span_share = frame_share * (1.0 if second_recording is None else 0.5)
+    grid = ThinningGrid.from_recording(recording, scene.frame_rows, span_share)
+    runs: list[dict[str, Any]] = [
+        {
+            "motion": motion_data(scene.time, scene.configurations),
+            "axis": grid.time_axis(),
+            "label": label(recording),
+        }
+    ]
+    second_run, difference_rows = None, []
+    if second_recording is not None:
+        try:
+            check_joints(machine, second_recording)
+        except RecordingError as error:
+            raise RecordingError(f"the second recording: {error}") from None
+        rows = frame_rows(second_recording.time, frame_share)
+        second_grid = ThinningGrid.from_recording(second_recording, rows, span_share)
+        runs.append(
+            {
+                "motion": motion_data(
+                    second_recording.time[rows],
+                    recorded_configurations(machine, second_recording, rows),
+                ),
+                "axis": second_grid.time_axis(),
+                "label": label(second_recording),
+                "shift": clock_shift(recording, second_recording),
+            }
+        )
+        second_run = (second_recording, second_grid)
+        difference_rows = [
+            (difference.joint, *difference.formatted)
+            for difference in joint_differences(recording, second_recording)
+        ]
+    reference_tip = point_channel(recording, "reference_tip")
+    return {
+        "actuators": actuator_markers(machine, recording, scene.frame_rows),
+        "loads": load_markers(machine, recording, scene.frame_rows),
+        "runs": runs,
+        "groups": plot_groups(machine, recording, grid, second_run),
+        "differences": difference_rows,
+        "reference": ""
+        if reference_tip is None
+        else pack_base64(reference_tip[scene.frame_rows], "f4"),
+    }
+
+
+def _render_page(page_data: dict[str, Any], scene: Scene) -> str:
+    import base64
+
+    import meshcat
+    import umsgpack  # type: ignore[import-untyped]
+
+    assets = files("crane.view.page") / "assets"
+    encoded_commands = [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
+    viewer = files(meshcat) / "viewer" / "dist" / "main.min.js"
+    template = Template((assets / "page.html").read_text(encoding="utf-8"))
+    return template.substitute(
+        title=escape(result_title(page_data["machine"], page_data["task"])),
+        style=(assets / "page.css").read_text(encoding="utf-8"),
+        viewer=viewer.read_text(encoding="utf-8"),
+        data=_script_json(page_data),
+        commands=_script_json(encoded_commands),
+        script="\n".join(
+            (assets / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPT_NAMES
+        ),
+    )
+
+
+def _rotate_view(direction: tuple[float, float, float], heading: float) -> list[float]:
+    x, y, z = direction
+    return [
+        x * cos(heading) - y * sin(heading),
+        x * sin(heading) + y * cos(heading),
+        z,
+    ]
+
+
+def _script_json(value: Any) -> str:
+    """JSON that may stand inside of a script element."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,0 +1,329 @@
+"""Rated loads over radius and height: contours, coloured by what ends them."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from contourpy import contour_generator
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.contour import ContourSet
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+
+from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.ratings import Capacity
+from crane.ratings.capacity_report import slew_labels
+from crane.recordings.recording_summary import result_title
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.sketch.machine_outline import MachineOutline, machine_outline
+
+FACTOR_COLOURS = (
+    "#a9c8ea", "#f6c08c", "#a6d9b0", "#d5b8e4", "#f0aaa6", "#a5d8df", "#e5d98f", "#c3c7cd",
+    "#e2b9d0", "#c9b79c",
+)  # fmt: skip
+_UNLIMITED_COLOUR = "#eeeeee"  # where nothing ends a load
+BODY_COLOUR, ROD_COLOUR = "#4a4f57", "#8b929b"
+_LABEL_SIZE, _LETTER_WIDTH, _MIN_LABEL_DISTANCE = (
+    7,
+    0.62,
+    1.5,
+)  # of labels: points, width, distance by that
+_LABEL_POSITIONS = (0.5, 0.35, 0.65, 0.2, 0.8, 0.1, 0.9)  # shares of a line
+_ROOM = 0.1  # above and below panels [inch]
+_DENSE = 8  # parts of a contour within a cell, to end it where the cells do
+_MAX_CONTOURS, _CONTOUR_QUANTILES = (
+    8,
+    (0.05, 0.9),
+)  # contours at most, and between which quantiles of the loads
+_ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+
+
+def plot_capacity(chart: Capacity, path: str | Path) -> None:
+    """Write the picture of rated loads to a file.
+
+    Args:
+        chart: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: capacity_figure(chart))
+
+
+def capacity_figure(chart: Capacity) -> Figure:
+    """The figure of rated loads: one panel per slew angle."""
+    lower, upper = drawing_extent(chart)
+    panel_count = len(chart.slews)
+    columns = min(panel_count, 3)
+    lines = -(-panel_count // columns)
+    content_width, content_height = upper - lower
+    height = float(np.clip(8.6 / columns * content_height / content_width, 3.0, 6.5))
+    width = float(np.clip(columns * height * content_width / content_height + 1.0, 5.0, 10.0))
+    with mpl.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
+        panels = figure.subplots(lines, columns, squeeze=False).ravel()
+        for k, axes in enumerate(panels):
+            if k < panel_count:
+                draw_capacity_panel(axes, chart, k)
+                if k % columns:
+                    axes.set_ylabel("")
+            else:
+                axes.set_axis_off()
+        figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
+        figure.suptitle(
+            escape_label(capacity_heading(chart)),
+            x=0.01,
+            ha="left",
+            fontsize=11,
+            fontweight="bold",
+        )
+        figure.legend(
+            handles=legend_patches(chart),
+            loc="outside lower center",
+            ncols=2 if panel_count > 1 else 1,
+        )
+    return figure
+
+
+def capacity_heading(chart: Capacity) -> str:
+    """What pictures of a chart are headed with."""
+    rule_text = "" if chart.rule.name == "none" else f" by {chart.rule.name}"
+    return result_title(chart.machine.name, f"lifting capacity at {chart.frame}{rule_text}")
+
+
+def factor_colours(chart: Capacity) -> Mapping[int, str]:
+    """Of each cause that ends loads, by its index."""
+    return {k: FACTOR_COLOURS[i % len(FACTOR_COLOURS)] for i, k in enumerate(chart.active_factors)}
+
+
+def legend_patches(chart: Capacity) -> list[Patch]:
+    """The legend: causes in their colours."""
+    patches = [
+        Patch(color=colour, label=escape_label(str(chart.limiting_factors[k])))
+        for k, colour in factor_colours(chart).items()
+    ]
+    if np.isinf(chart.loads).any():
+        patches.append(Patch(color=_UNLIMITED_COLOUR, label="nothing ends it"))
+    return patches
+
+
+def home_outlines(chart: Capacity) -> list[MachineOutline]:
+    """The machine at home, turned to each slew angle."""
+    outlines, machine = [], chart.machine
+    for slew_coordinate in chart.slews:
+        q = machine.home.copy()
+        if chart.section.slewing_joint is not None:
+            q[machine.closure.active[chart.section.slewing_joint]] = slew_coordinate
+        outlines.append(machine_outline(machine, chart.frame, chart.section, q))
+    return outlines
+
+
+def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
+    """Lowest and highest corner (2,) of what is shown [m]."""
+    b, a = np.nonzero(~np.isnan(chart.loads).all(axis=0))
+    points = [np.column_stack([chart.radii[a], chart.heights[b]])]
+    for home_outline in home_outlines(chart):
+        points += [
+            *home_outline.bodies,
+            home_outline.cylinders.reshape(-1, 2),
+            home_outline.stationary_hull,
+        ]
+    all_points = np.concatenate(points)
+    margin = 0.03 * float(np.ptp(all_points, axis=0).max())
+    return all_points.min(axis=0) - margin, all_points.max(axis=0) + margin
+
+
+def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
+    """Loads at one slew angle."""
+    lower, upper = drawing_extent(chart)
+    axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal")
+    axes.grid(visible=False)
+    active_factors = list(chart.active_factors)
+    index = np.full(chart.loads.shape[1:], np.nan)
+    for i, cause in enumerate(active_factors):
+        index[chart.limiting_factor_index[k] == cause] = i
+    index[np.isinf(chart.loads[k])] = len(active_factors)
+    factor_tints = [*factor_colours(chart).values(), _UNLIMITED_COLOUR]
+    if len(chart.radii) > 1 and len(chart.heights) > 1:
+        axes.pcolormesh(
+            chart.radii,
+            chart.heights,
+            np.ma.masked_invalid(index),
+            cmap=ListedColormap(factor_tints),
+            vmin=-0.5,
+            vmax=len(factor_tints) - 0.5,
+            shading="nearest",
+            rasterized=True,
+            zorder=1,
+        )
+        _draw_contours(axes, chart, k)
+    else:
+        b, a = np.nonzero(np.isfinite(index))
+        faces = [factor_tints[int(i)] for i in index[b, a]]
+        axes.scatter(
+            chart.radii[a], chart.heights[b], c=faces, edgecolors=INK_COLOUR, s=30, zorder=3
+        )
+    if lower[1] < 0 < upper[1] and chart.section.coordinate_names[1] == "height":
+        axes.axhline(0.0, color=INK_COLOUR, linewidth=1.0, zorder=2)
+    _draw_machine(axes, home_outlines(chart)[k])
+    u, w = chart.section.coordinate_names
+    axes.set(xlabel=f"{u} [m]", ylabel=f"{w} [m]")
+    axes.set_title(slew_labels(chart)[k], fontsize=9.5, loc="left")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
+
+
+def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
+    """Lines (n, 2) of equal load at one slew angle, by their load [kg]; the same at all angles."""
+    if min(len(chart.radii), len(chart.heights)) < 2:
+        return []
+    finite_loads = chart.loads[np.isfinite(chart.loads)]
+    finite_loads = finite_loads[finite_loads > 0]
+    if not len(finite_loads):
+        return []
+    loads = chart.loads[k]
+    beyond = np.ma.masked_invalid(_continued(np.where(np.isfinite(loads), loads, np.nan)))
+    lines = contour_generator(chart.radii, chart.heights, beyond, name="serial")
+    lowest, highest = np.quantile(finite_loads, _CONTOUR_QUANTILES)
+    return [(level, [part for line in lines.lines(level)
+                     for part in _parts_within(chart, k, np.asarray(line))])
+            for level in _contour_levels(float(lowest), float(highest))]  # fmt: skip
+
+
+def _continued(loads: Array) -> Array:
+    """Loads (b, a), and around them those that two places beside continue, in a straight line.
+
+    Of cells at the border the contours would miss the outer half else.
+    """
+    b, a = loads.shape
+    wide = np.pad(loads, 2, constant_values=np.nan)
+    sums, counts = np.zeros(loads.shape), np.zeros(loads.shape)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        one, two = (wide[2 + n * i :, 2 + n * j :][:b, :a] for n in (1, 2))
+        ahead = np.where(np.isfinite(two), 2 * one - two, one)
+        sums += np.where(np.isfinite(ahead), ahead, 0.0)
+        counts += np.isfinite(ahead)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(np.isfinite(loads), loads, sums / counts))
+
+
+def _parts_within(chart: Capacity, k: int, line: Array) -> list[Array]:
+    """Parts of a line (n, 2) within the cells that have loads."""
+    along = np.arange(len(line))
+    fine = np.linspace(0.0, len(line) - 1.0, _DENSE * (len(line) - 1) + 1)
+    points = np.column_stack([np.interp(fine, along, x) for x in line.T])
+    a, b = (
+        np.searchsorted((x[1:] + x[:-1]) / 2, points[:, i])
+        for i, x in enumerate((chart.radii, chart.heights))
+    )
+    inside = np.isfinite(chart.loads[k, b, a])
+    cuts = np.flatnonzero(np.diff(inside)) + 1
+    parts = zip(np.split(points, cuts), np.split(inside, cuts), strict=True)
+    return [part for part, kept in parts if kept[0] and len(part) > 1]
+
+
+def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
+    """Lines of equal load, labelled in kg or t."""
+    contour_lines = load_contours(chart, k)
+    levels = [level for level, lines in contour_lines if lines]
+    if not levels:
+        return
+    lines = ContourSet(
+        axes,
+        levels,
+        [ways for _, ways in contour_lines if ways],
+        colors=[INK_COLOUR],
+        linewidths=0.9,
+        zorder=4,
+    )
+    unit, scale = display_unit("kg", max(level for level, _ in contour_lines))
+
+    def format_level(level: float) -> str:
+        return f"{scale * level:g} {unit}"
+
+    axes.apply_aspect()
+    size = float(np.ptp(axes.transData.transform([(0, 0), (1, 0)])[:, 0])) * 72 / axes.figure.dpi
+    label_positions = contour_label_positions(
+        [(format_level(level), lines) for level, lines in contour_lines], size
+    )
+    if not label_positions:
+        return
+    labels = axes.clabel(lines, fmt=format_level, fontsize=_LABEL_SIZE, manual=label_positions)
+    for label in labels or ():
+        label.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
+
+
+def contour_label_positions(
+    lines: Sequence[tuple[str, list[Array]]], size: float
+) -> list[tuple[float, float]]:
+    """Where on lines there is room for their labels: none upon another, few on a bundle of lines.
+
+    Args:
+        lines: Words, and lines (n, 2) [m] that they stand on.
+        size: Points of a metre.
+    """
+    occupied = np.empty((0, 2))
+    positions: list[tuple[float, float]] = []
+    for text, polylines in lines:
+        label_width = _LETTER_WIDTH * _LABEL_SIZE * len(text) / size
+        label_height = _MIN_LABEL_DISTANCE * _LABEL_SIZE / size
+        for polyline in polylines:
+            arc_lengths = np.append(
+                0.0, np.cumsum(np.linalg.norm(np.diff(polyline, axis=0), axis=1))
+            )
+            if arc_lengths[-1] < 1.5 * label_width:
+                continue
+            for share in _LABEL_POSITIONS:
+                label_arc_lengths = arc_lengths[-1] * share + label_width * np.linspace(
+                    -0.5, 0.5, 5
+                )
+                if label_arc_lengths[0] < 0 or label_arc_lengths[-1] > arc_lengths[-1]:
+                    continue
+                label_points = np.column_stack(
+                    [np.interp(label_arc_lengths, arc_lengths, x) for x in polyline.T]
+                )
+                distances = np.linalg.norm(label_points[:, None] - occupied, axis=2)
+                if (distances > label_height).all():
+                    occupied = np.concatenate([occupied, label_points])
+                    positions.append((float(label_points[2, 0]), float(label_points[2, 1])))
+                    break
+    return positions
+
+
+def _contour_levels(low: float, high: float) -> list[float]:
+    """Round loads, denser where they are small, as the load falls with the radius."""
+    levels = set()
+    for load in np.geomspace(max(low, 1e-3 * high), high, _MAX_CONTOURS):
+        power = 10.0 ** np.floor(np.log10(load))
+        levels.add(
+            float(power * _ROUND_VALUES[int(np.abs(_ROUND_VALUES * power - load).argmin())])
+        )
+    return sorted(levels)
+
+
+def _draw_machine(axes: Axes, machine_outline: MachineOutline) -> None:
+    if len(machine_outline.stationary_hull) > 1:  # an undercarriage is often no more than its feet
+        axes.fill(
+            *machine_outline.stationary_hull.T,
+            facecolor=ROD_COLOUR,
+            edgecolor=ROD_COLOUR,
+            linewidth=4.0,
+            zorder=4.9,
+        )
+    for body in machine_outline.bodies:
+        if len(body) > 2:
+            axes.fill(*body.T, facecolor=BODY_COLOUR, alpha=0.25, linewidth=0, zorder=5)
+        axes.plot(*np.vstack([body, body[:1]]).T, color=BODY_COLOUR, linewidth=1.3, zorder=5.2,
+                  solid_joinstyle="round", alpha=0.85)  # fmt: skip
+    for start, mouth, end in machine_outline.cylinders:
+        axes.plot(*np.array([start, end]).T, color=ROD_COLOUR, linewidth=1.2, zorder=5.4)
+        axes.plot(*np.array([start, mouth]).T, color=BODY_COLOUR, linewidth=2.8, zorder=5.5,
+                  solid_capstyle="butt")  # fmt: skip

@@ -1,0 +1,229 @@
+"""Linear models as pictures: poles and frequency responses, and modes over strokes and loads."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.optimize import linear_sum_assignment
+
+from crane.common.samples import Array
+from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
+from crane.simulation.linear import LinearModel, Mode
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import (
+    FIGURE_STYLE,
+    INK_COLOUR,
+    RECORDED_COLOUR,
+    write_figure,
+)
+
+_CURVE_COLOURS = (
+    "#1f5fa8",
+    "#e0701a",
+    "#2a8c4a",
+    "#8a5fb0",
+    "#c2452d",
+    "#7f7f3f",
+    "#3f8f9f",
+    "#909090",
+)
+_FREQUENCY_COUNT = 600  # frequencies of a response
+_MAX_INPUT_PANELS = 6  # panels of inputs
+_MIN_MODAL_ASSURANCE = 0.2  # modal assurance of a mode that goes on
+_MIN_RESPONSE_SHARE = 1e-6  # share of the largest response that is not drawn
+
+
+def plot_modes(model: LinearModel, path: str | Path) -> None:
+    """Write poles and frequency responses of a linear model to a file.
+
+    Args:
+        model: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: modes_figure(model))
+
+
+def plot_parameter_modes(
+    models: Sequence[tuple[dict[str, float], LinearModel]], path: str | Path
+) -> None:
+    """Write frequency and damping of what rings over what was varied, see `linear_models`.
+
+    Raises:
+        OutputError: The suffix is not .png, .svg or .pdf, or the file cannot be written.
+    """
+    write_figure(path, lambda: parameter_modes_figure(models))
+
+
+def modes_figure(model: LinearModel) -> Figure:
+    """Poles, each with what it moves most, and a panel of responses per input that has any."""
+    frequencies = _frequency_grid(model)
+    responses = np.abs(model.response(frequencies))
+    responding_inputs = [
+        j
+        for j in range(len(model.inputs))
+        if responses[:, _position_outputs(model), j].max(initial=0) > 0
+    ][:_MAX_INPUT_PANELS]
+    with mpl.rc_context(FIGURE_STYLE):
+        columns = 1 + min(len(responding_inputs), 3)
+        rows = max(1, -(-len(responding_inputs) // 3))
+        figure = Figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5), layout="constrained")
+        grid = figure.add_gridspec(rows, columns)
+        _draw_poles(figure.add_subplot(grid[:, 0]), model)
+        for i, j in enumerate(responding_inputs):
+            axes = figure.add_subplot(grid[i // 3, 1 + i % 3])
+            _draw_response(axes, model, frequencies, responses[:, :, j], j)
+        heading = result_title(model.machine.name, "small motions")
+        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    return figure
+
+
+def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]]) -> Figure:
+    """Above frequencies, below damping, over the first name; a colour per value of the others."""
+    names = list(models[0][0])
+    families: dict[tuple[float, ...], list[tuple[float, LinearModel]]] = {}
+    for values, model in models:
+        first_value, other_values = next(iter(values.values())), tuple(values.values())[1:]
+        families.setdefault(other_values, []).append((first_value, model))
+    with mpl.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        for color, (family_values, family) in zip(
+            _cycle_colours(len(families)), families.items(), strict=True
+        ):
+            pairs = zip(names[1:], family_values, strict=True)
+            label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
+            family.sort(key=lambda pair: pair[0])
+            for k, (x, frequency, damping) in enumerate(_track_modes(family)):
+                label = escape_label(label_text) if label_text and not k else "_"
+                upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
+                lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
+        upper.set_yscale("log")
+        upper.set_ylabel("frequency [Hz]")
+        lower.set_ylabel("damping [%]")
+        machine = models[0][1].machine
+        unit = machine.unit(names[0]) if names[0] in machine.active else ""
+        lower.set_xlabel(escape_label(f"{names[0]} [{unit}]" if unit else names[0]))
+        if len(families) > 1:
+            figure.legend(loc="outside lower center", ncols=min(len(families), 5))
+        label_text = result_title(machine.name, "what rings")
+        figure.suptitle(
+            escape_label(label_text), x=0.01, ha="left", fontsize=11, fontweight="bold"
+        )
+    return figure
+
+
+def _cycle_colours(count: int) -> list[str]:
+    return [_CURVE_COLOURS[i % len(_CURVE_COLOURS)] for i in range(count)]
+
+
+def _track_modes(family: Sequence[tuple[float, LinearModel]]) -> list[tuple[Array, Array, Array]]:
+    """Of the modes that ring, each followed by its shape: places, frequencies, damping."""
+    branches: list[list[tuple[float, Mode]]] = []
+    for x, model in family:
+        modes = [mode for mode in model.modes if mode.is_oscillatory]
+        unmatched = list(range(len(modes)))
+        if branches and modes:
+            last_modes = [branch[-1][1] for branch in branches]
+            assurances = np.array(
+                [
+                    [_modal_assurance(model, last_mode, mode) for mode in modes]
+                    for last_mode in last_modes
+                ]
+            )
+            for k, i in zip(*linear_sum_assignment(-assurances), strict=True):
+                if assurances[k, i] > _MIN_MODAL_ASSURANCE:
+                    branches[k].append((x, modes[i]))
+                    unmatched.remove(int(i))
+        branches += [[(x, modes[i])] for i in unmatched]
+    return [
+        (
+            np.array([x for x, _ in branch]),
+            np.array([mode.frequency for _, mode in branch]),
+            np.array([mode.damping for _, mode in branch]),
+        )
+        for branch in branches
+    ]
+
+
+def _modal_assurance(model: LinearModel, first: Mode, second: Mode) -> float:
+    """The modal assurance criterion of two shapes, 1 where they are the same."""
+    units = model.machine.closure.units
+    a, b = first.shape / units, second.shape / units
+    product = np.linalg.norm(a) * np.linalg.norm(b)
+    return float(abs(np.vdot(a, b)) / product) ** 2 if product else 0.0
+
+
+def _frequency_grid(model: LinearModel) -> Array:
+    """Frequencies [Hz] around what rings, or all poles, close at the former."""
+    oscillating_frequencies = [mode.frequency for mode in model.modes if mode.is_oscillatory]
+    used_frequencies = (
+        oscillating_frequencies
+        or [mode.frequency for mode in model.modes if mode.frequency > 0]
+        or [1.0]
+    )
+    lowest, highest = max(min(used_frequencies) / 30, 1e-3), min(max(used_frequencies) * 5, 1e4)
+    refined_frequencies = [f * np.linspace(0.98, 1.02, 41) for f in oscillating_frequencies]
+    return np.unique(
+        np.concatenate(
+            [
+                np.geomspace(lowest, max(highest, 10 * lowest), _FREQUENCY_COUNT),
+                *refined_frequencies,
+            ]
+        )
+    )
+
+
+def _draw_poles(axes: Axes, model: LinearModel) -> None:
+    """Over frequency and damping, which show slow and fast poles alike."""
+    drawn_modes = [mode for mode in model.modes if mode.frequency > 0]
+    axes.axhline(0.0, color=INK_COLOUR, lw=0.6)
+    for mode in drawn_modes:
+        is_oscillating = mode.is_oscillatory
+        axes.plot(
+            [mode.frequency], [100 * mode.damping], "o" if is_oscillating else "x", ms=4.5,
+            color=RECORDED_COLOUR if is_oscillating else "#909090", clip_on=False, zorder=3,
+        )  # fmt: skip
+        if is_oscillating:
+            axes.annotate(
+                escape_label(model.dominant_state(mode)),
+                (mode.frequency, 100 * mode.damping),
+                fontsize=7,
+                xytext=(3, 4),
+                textcoords="offset points",
+            )
+    axes.set_xscale("log")
+    powers = np.log10([mode.frequency for mode in drawn_modes] or [1.0])
+    axes.set_xlim(10 ** np.floor(powers.min()), 10 ** (np.floor(powers.max()) + 1))
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set_xlabel("frequency [Hz]")
+    axes.set_ylabel("damping [%]")
+    lowest = min((100 * mode.damping for mode in drawn_modes), default=0.0)
+    axes.set_ylim(min(0.0, 1.5 * lowest), 200.0)
+    zero_count = sum(mode.frequency == 0 for mode in model.modes)
+    axes.set_title("poles" + (f" ({zero_count} more at zero)" if zero_count else ""))
+
+
+def _position_outputs(model: LinearModel) -> list[int]:
+    """Outputs that are coordinates of active joints."""
+    return [i for i, name in enumerate(model.outputs) if name in model.machine.active]
+
+
+def _draw_response(
+    axes: Axes, model: LinearModel, frequencies: Array, response: Array, input_index: int
+) -> None:
+    position_outputs = _position_outputs(model)
+    for color, i in zip(_cycle_colours(len(position_outputs)), position_outputs, strict=True):
+        joint = model.outputs[i]
+        unit, factor = DISPLAY_UNITS[model.machine.unit(joint)]
+        if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():
+            label = escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]")
+            axes.loglog(frequencies, factor * response[:, i], color=color, lw=1.1, label=label)
+    axes.set_title(escape_label(f"per {model.inputs[input_index]}"))
+    axes.set_xlabel("frequency [Hz]")
+    axes.legend(fontsize=6.5)

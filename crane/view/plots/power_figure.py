@@ -1,0 +1,132 @@
+"""The power account of a run over time: what goes where, stacked under what the shafts give."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.hydraulics.power_balance import SHAFT_POWER
+from crane.recordings.recording_summary import result_title
+from crane.studies.hydraulic_power_balance import (
+    POWER_CLASSES,
+    PowerBalance,
+    part_class,
+    part_kind,
+    part_owner,
+)
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+
+_CLASS_PALETTE = (
+    "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
+    "#d9b53f",
+)  # fmt: skip
+CLASS_COLOURS: Mapping[str, str] = dict(zip(POWER_CLASSES, _CLASS_PALETTE, strict=True))
+_OWNER_COLOURS = (
+    "#1f5fa8",
+    "#e0701a",
+    "#2a8c4a",
+    "#8a5fb0",
+    "#d9b53f",
+    "#b04a7a",
+    "#3f8f9f",
+    "#9a6b3f",
+)
+_MAX_POINTS = 1500  # points of a stack
+
+
+def plot_power(balance: PowerBalance, path: str | Path) -> None:
+    """Write the picture to a file.
+
+    Args:
+        balance: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: power_figure(balance))
+
+
+def power_figure(balance: PowerBalance) -> Figure:
+    """Two stacks over time under the power of the shafts: by what it goes into, and by joint.
+
+    What is negative, as a load that drives its cylinder, is stacked below zero.
+    """
+    by_class = {name: np.zeros_like(balance.time) for name in CLASS_COLOURS}
+    by_owner: dict[str, Array] = {}
+    for name, power in balance.powers.items():
+        if part_kind(name) == SHAFT_POWER:
+            continue
+        owner = part_owner(name)
+        owner = owner if owner in balance.joints else "circuit"
+        by_owner[owner] = by_owner.get(owner, np.zeros_like(power)) + power
+        by_class[part_class(balance, name)] += power
+    unit, scale = display_unit("W", float(np.abs(balance.shaft_power).max()))
+    order = [*balance.joints, *(x for x in by_owner if x not in balance.joints)]
+    colors = dict(
+        zip(order, _OWNER_COLOURS * (1 + len(order) // len(_OWNER_COLOURS)), strict=False)
+    )
+    with mpl.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(8.6, 6.4), layout="constrained")
+        upper_axes, lower_axes = figure.subplots(2, 1, sharex=True)
+        _draw_stack(upper_axes, balance, by_class, CLASS_COLOURS, scale)
+        _draw_stack(lower_axes, balance, {x: by_owner[x] for x in order}, colors, scale)
+        upper_axes.set_title("by what it goes into", loc="left", fontsize=9)
+        lower_axes.set_title("by joint", loc="left", fontsize=9)
+        lower_axes.set_xlabel("time [s]")
+        for axes in (upper_axes, lower_axes):
+            axes.set_ylabel(f"power [{unit}]")
+            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
+        heading = result_title(balance.machine_name, f"{balance.task_name} power".strip())
+        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    return figure
+
+
+def _draw_stack(
+    axes: Axes,
+    balance: PowerBalance,
+    layers: Mapping[str, Array],
+    colors: Mapping[str, str],
+    scale: float,
+) -> None:
+    """Layers (N,) upwards where they are positive, downwards where negative."""
+    time, shaft = _block_means(balance.time), scale * _block_means(balance.shaft_power)
+    positive_sum, negative_sum = np.zeros_like(time), np.zeros_like(time)
+    min_power = 1e-3 * max(float(np.abs(balance.shaft_power).max()), 1e-9)
+    for name, power in layers.items():
+        if np.abs(power).max() < min_power:
+            continue
+        values, color = scale * _block_means(power), colors[name]
+        upper_edge, lower_edge = (
+            positive_sum + np.maximum(values, 0.0),
+            negative_sum + np.minimum(values, 0.0),
+        )
+        axes.fill_between(
+            time, positive_sum, upper_edge, color=color, linewidth=0, label=escape_label(name)
+        )
+        axes.fill_between(time, negative_sum, lower_edge, color=color, linewidth=0)
+        positive_sum, negative_sum = upper_edge, lower_edge
+    axes.plot(time, shaft, color=INK_COLOUR, linewidth=1.1, label="shafts")
+    axes.axhline(0.0, color=INK_COLOUR, linewidth=0.6)
+    axes.margins(x=0.0)
+    axes.set_ylim(-_axis_end(-negative_sum, -shaft), _axis_end(positive_sum, shaft))
+
+
+def _axis_end(stack_edge: Array, shaft: Array) -> float:
+    """How far an axis goes: a line that fills or empties within a sample may leave it."""
+    stack_end = min(float(stack_edge.max()), 1.5 * float(np.quantile(stack_edge, 0.998)))
+    return 1.06 * max(stack_end, float(shaft.max()), 0.02 * float(np.abs(shaft).max()), 1e-3)
+
+
+def _block_means(values: Array) -> Array:
+    """Means of so many neighbours that a picture can show them."""
+    block_size = -(-len(values) // _MAX_POINTS)
+    return np.add.reduceat(values, starts := np.arange(0, len(values), block_size)) / np.diff(
+        [*starts, len(values)]
+    )

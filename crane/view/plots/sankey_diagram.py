@@ -1,0 +1,372 @@
+"""Where a run's energy went, as ribbons as wide as it is much: a Sankey diagram."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch, Polygon, Rectangle
+from matplotlib.path import Path as Outline
+from matplotlib.patheffects import withStroke
+
+from crane.common.units import format_number
+from crane.hydraulics.power_balance import SHAFT_POWER
+from crane.recordings.recording_summary import result_title
+from crane.studies.hydraulic_power_balance import (
+    LOAD,
+    PowerBalance,
+    part_class,
+    part_kind,
+    part_owner,
+)
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.power_figure import CLASS_COLOURS
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+
+_TOTAL_HEIGHT = 4.2  # of all that is given [inch]
+_LABEL_HEIGHT, _LABEL_GAP, _GROUP_GAP = (
+    0.19,
+    0.05,
+    0.42,
+)  # of a label, between labels, between groups [inch]
+_COLUMN_POSITIONS = (1.35, 3.1, 5.5, 8.1)  # where bars stand [inch]
+_FIGURE_WIDTH, _BAR_WIDTH, _TOP_MARGIN, _BOTTOM_MARGIN, _RETURN_ARROW_LENGTH = (
+    10.2,
+    0.14,
+    0.3,
+    0.3,
+    0.32,
+)  # [inch]
+_MIN_RIBBON_SHARE, _MIN_OTHERS_SHARE = (
+    4e-3,
+    1e-3,
+)  # shares of all that have a ribbon of their own, and one at all
+_NEUTRAL_COLOUR = "#8c9aa8"
+
+
+@dataclass
+class _SankeyRibbon:
+    """A ribbon on the right.
+
+    Attributes:
+        label: What it is.
+        energy: [J].
+        color: Its colour.
+        centre: Of its middle [inch].
+    """
+
+    label: str
+    energy: float
+    color: str
+    centre: float = 0.0
+
+
+@dataclass
+class _SankeyGroup:
+    """What one owner's energy goes into.
+
+    Attributes:
+        label: Whose it is.
+        ribbons: Into what.
+        returned_energy: That it gets from elsewhere than the pumps [J].
+        top: Of its top [inch].
+    """
+
+    label: str
+    ribbons: list[_SankeyRibbon]
+    returned_energy: float
+    top: float = 0.0
+
+    @property
+    def total_energy(self) -> float:
+        """Energy of all its items [J]."""
+        return sum(item.energy for item in self.ribbons)
+
+
+def plot_sankey(balance: PowerBalance, path: str | Path) -> None:
+    """Write the picture to a file.
+
+    Args:
+        balance: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: sankey_figure(balance))
+
+
+def sankey_figure(balance: PowerBalance) -> Figure:
+    """Energies from the shafts by pump and joint into what they go into, in kJ and %.
+
+    What a load gives back while it drives its cylinder enters its joint from the left.
+    What has less than 0.4 % is drawn as others, less than 0.1 % not at all. Percentages are of
+    what the shafts give.
+    """
+    with mpl.rc_context(FIGURE_STYLE):
+        return _SankeyDiagram(balance).figure
+
+
+class _SankeyDiagram:
+    """The drawing.
+
+    Args:
+        balance: What to show.
+    """
+
+    def __init__(self, balance: PowerBalance):
+        energies = balance.energies
+        self._balance = balance
+        self._shaft_energies = {x: energies[f"{x}.{SHAFT_POWER}"] for x in balance.pumps
+                       if energies.get(f"{x}.{SHAFT_POWER}", 0.0) > 0}  # fmt: skip
+        self._total_energy = sum(self._shaft_energies.values())
+        pump_loss_names = [x for x in balance.powers if part_owner(x) in balance.pumps
+                 and part_kind(x) in ("friction", "slip")]  # fmt: skip
+        names = [
+            x for x in balance.powers if part_kind(x) != SHAFT_POWER and x not in pump_loss_names
+        ]
+        self._pump_group = self._create_group("pumps", pump_loss_names)
+        self._pump_losses = {
+            pump: sum(energies[x] for x in pump_loss_names if part_owner(x) == pump)
+            for pump in self._shaft_energies
+        }
+        groups = [
+            self._create_group(joint, [x for x in names if part_owner(x) == joint])
+            for joint in balance.joints
+        ]
+        circuit_names = [x for x in names if part_owner(x) not in balance.joints]
+        groups.append(self._create_group("circuit", circuit_names))
+        # what gives more than it takes feeds the others
+        self._returning_groups: dict[str, float] = {}
+        for group in groups:
+            if group.returned_energy > group.total_energy:
+                if group.returned_energy > _MIN_RIBBON_SHARE * self._total_energy:
+                    self._returning_groups[f"{escape_label(group.label)}\ngives back"] = (
+                        group.returned_energy
+                    )
+                group.returned_energy = 0.0
+        self._owner_groups = [
+            group
+            for group in groups
+            if group.total_energy > _MIN_RIBBON_SHARE * self._total_energy
+        ]
+        self.figure = self._draw_figure()
+
+    def _create_group(self, owner: str, names: list[str]) -> _SankeyGroup:
+        balance, ribbons, returned_energy, small_energy = self._balance, [], 0.0, 0.0
+        for name in names:
+            power, kind = balance.powers[name], part_kind(name)
+            energy, returned = balance.integrate_energy(power), 0.0
+            if kind == LOAD:
+                returned = balance.integrate_energy(np.maximum(-power, 0.0))
+            elif energy < 0:
+                returned = -energy
+            energy, returned_energy = energy + returned, returned_energy + returned
+            part_owner_name = part_owner(name)
+            is_own = owner == part_owner_name or len(self._shaft_energies) == 1
+            label = (
+                part_owner_name
+                if kind == "element"
+                else kind
+                if is_own and kind != "stored"
+                else ""
+            )
+            if energy < _MIN_RIBBON_SHARE * self._total_energy:
+                small_energy += energy
+            elif energy > 0:
+                color = CLASS_COLOURS[part_class(balance, name)]
+                ribbons.append(
+                    _SankeyRibbon(
+                        escape_label(label or f"{part_owner_name} {kind}"), energy, color
+                    )
+                )
+        if small_energy > _MIN_OTHERS_SHARE * self._total_energy:
+            ribbons.append(_SankeyRibbon("others", small_energy, _NEUTRAL_COLOUR))
+        return _SankeyGroup(owner, ribbons, returned_energy)
+
+    def _draw_figure(self) -> Figure:
+        groups = ([self._pump_group] if self._pump_group.ribbons else []) + self._owner_groups
+        scale = _TOTAL_HEIGHT / max(
+            self._total_energy + sum(self._returning_groups.values()), 1e-9
+        )
+        figure_height = self._place_groups(groups, scale)
+        figure = Figure(figsize=(_FIGURE_WIDTH, figure_height))
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_xlim(0.0, _FIGURE_WIDTH)
+        axes.set_ylim(-figure_height, 0.0)
+        axes.axis("off")
+        self._axes, self._scale = axes, scale
+        heading = result_title(
+            self._balance.machine_name, f"{self._balance.task_name} energy".strip()
+        )
+        axes.text(0.1, -0.1, escape_label(heading), fontsize=11, fontweight="bold", va="top")
+        if not self._total_energy > 0 or not self._owner_groups:
+            axes.text(0.1, -0.6, "nothing is driven", va="top")
+            return figure
+        self._draw_sources(self._draw_hydraulic_bar(groups))
+        for group in groups:
+            self._draw_group(group)
+        return figure
+
+    def _place_groups(self, groups: list[_SankeyGroup], scale: float) -> float:
+        """Place all from above downwards; the height of the figure [inch]."""
+        y = -_TOP_MARGIN
+        for group in groups:
+            y -= _GROUP_GAP
+            group_start = y
+            for ribbon in group.ribbons:
+                ribbon_height = max(scale * ribbon.energy, _LABEL_HEIGHT)
+                ribbon.centre = y - 0.5 * ribbon_height
+                y -= ribbon_height + _LABEL_GAP
+            y += _LABEL_GAP
+            group.top = 0.5 * (group_start + y + scale * group.total_energy)
+        return max(_BOTTOM_MARGIN - y, _TOP_MARGIN + _TOTAL_HEIGHT + 1.2)
+
+    def _draw_hydraulic_bar(self, groups: list[_SankeyGroup]) -> float:
+        """Draw the bar that feeds the groups, and its ribbons; its top [inch]."""
+        scale, (_, x, target_x, _) = self._scale, _COLUMN_POSITIONS
+        first_centre, last_centre = (
+            self._owner_groups[0].ribbons[0].centre,
+            self._owner_groups[-1].ribbons[-1].centre,
+        )
+        flow = sum(group.total_energy - group.returned_energy for group in self._owner_groups)
+        top = ribbon_top = 0.5 * (first_centre + last_centre + scale * flow)
+        self._draw_bar(x, top, scale * flow, INK_COLOUR)
+        label = f"hydraulic {self._energy_text(flow)}"
+        self._draw_text(
+            x - 0.04, top - 0.5 * scale * flow, label, "right", "center", is_vertical=True
+        )
+        for group in self._owner_groups:
+            ribbon_height = scale * (group.total_energy - group.returned_energy)
+            self._draw_ribbon(
+                (x + _BAR_WIDTH, ribbon_top), (target_x, group.top), ribbon_height, _NEUTRAL_COLOUR
+            )
+            ribbon_top -= ribbon_height
+        return top
+
+    def _draw_sources(self, bar_top: float) -> None:
+        """Draw what gives, on the left, beside the bar at a height."""
+        scale, (x, bar_x, group_x, _) = self._scale, _COLUMN_POSITIONS
+        target_top, loss_top = bar_top, self._pump_group.top
+        sources = {f"{escape_label(pump)}\nshaft": (energy, self._pump_losses[pump])
+                 for pump, energy in self._shaft_energies.items()}  # fmt: skip
+        sources |= {words: (energy, 0.0) for words, energy in self._returning_groups.items()}
+        y = bar_top + scale * next(iter(sources.values()))[1]
+        y += 0.5 * _GROUP_GAP * (len(sources) - 1)
+        for label, (energy, loss) in sources.items():
+            self._draw_bar(x, y, scale * energy, INK_COLOUR)
+            label_y = y - 0.5 * scale * energy
+            self._draw_text(
+                x - 0.08, label_y, f"{label}\n{self._energy_text(energy)}", ha="right", va="center"
+            )
+            if loss > 0:
+                color = CLASS_COLOURS["pump"]
+                self._draw_ribbon((x + _BAR_WIDTH, y), (group_x, loss_top), scale * loss, color)
+                loss_top -= scale * loss
+            ribbon_height = scale * (energy - loss)
+            self._draw_ribbon(
+                (x + _BAR_WIDTH, y - scale * loss),
+                (bar_x, target_top),
+                ribbon_height,
+                _NEUTRAL_COLOUR,
+            )
+            target_top -= ribbon_height
+            y -= scale * energy + _GROUP_GAP
+
+    def _draw_group(self, group: _SankeyGroup) -> None:
+        scale, (_, _, x, target_x) = self._scale, _COLUMN_POSITIONS
+        bar_height, return_height = scale * group.total_energy, scale * group.returned_energy
+        self._draw_bar(x, group.top, bar_height, INK_COLOUR)
+        label = f"{escape_label(group.label)}\n{self._energy_text(group.total_energy)}"
+        self._draw_text(x, group.top + 0.05, label, weight="bold")
+        if group.returned_energy > _MIN_RIBBON_SHARE * self._total_energy:
+            bar_bottom = group.top - bar_height
+            left, arrow_tip = x - _RETURN_ARROW_LENGTH, x - 0.5 * _RETURN_ARROW_LENGTH
+            corners = [
+                (left, bar_bottom),
+                (arrow_tip, bar_bottom),
+                (x, bar_bottom),
+                (x, bar_bottom + return_height),
+                (left, bar_bottom + return_height),
+            ]
+            corners.append((left + 0.1, bar_bottom + 0.5 * return_height))
+            color = CLASS_COLOURS[LOAD if group.label in self._balance.joints else "stored"]
+            self._axes.add_patch(Polygon(corners, facecolor=color, alpha=0.5, linewidth=0))
+            label = f"gives back {self._kilojoule_text(group.returned_energy)}"
+            self._draw_text(
+                left - 0.05, bar_bottom + 0.5 * return_height, label, ha="right", va="center"
+            )
+        ribbon_top = group.top
+        for ribbon in group.ribbons:
+            ribbon_height = scale * ribbon.energy
+            self._draw_ribbon(
+                (x + _BAR_WIDTH, ribbon_top),
+                (target_x, ribbon.centre + 0.5 * ribbon_height),
+                ribbon_height,
+                ribbon.color,
+            )
+            self._draw_bar(
+                target_x, ribbon.centre + 0.5 * ribbon_height, ribbon_height, ribbon.color
+            )
+            self._draw_text(
+                target_x + _BAR_WIDTH + 0.07,
+                ribbon.centre,
+                f"{ribbon.label}  {self._energy_text(ribbon.energy)}",
+                va="center",
+            )
+            ribbon_top -= ribbon_height
+
+    def _energy_text(self, energy: float) -> str:
+        return (
+            f"{self._kilojoule_text(energy)} "
+            f"({format_number(100 * energy / self._total_energy, 2)} %)"
+        )
+
+    def _kilojoule_text(self, energy: float) -> str:
+        return f"{format_number(1e-3 * energy)} kJ"
+
+    def _draw_text(
+        self, x: float, y: float, text: str, ha: str = "left", va: str = "bottom",
+        weight: str = "normal", is_vertical: bool = False,
+    ) -> None:  # fmt: skip
+        halo = [withStroke(linewidth=2.0, foreground="white", alpha=0.8)]
+        self._axes.text(
+            x, y, text, ha=ha, va=va, fontsize=8, fontweight=weight, path_effects=halo,
+            rotation=90 if is_vertical else 0, zorder=3,
+        )  # fmt: skip
+
+    def _draw_bar(self, x: float, top: float, size: float, color: str) -> None:
+        box = Rectangle((x, top - size), _BAR_WIDTH, size, facecolor=color, linewidth=0, zorder=2)
+        self._axes.add_patch(box)
+
+    def _draw_ribbon(
+        self, start: tuple[float, float], end: tuple[float, float], size: float, color: str
+    ) -> None:
+        """From one top edge to another."""
+        self._axes.add_patch(_ribbon_patch(start, end, size, color))
+
+    _axes: Axes
+    _scale: float
+
+
+def _ribbon_patch(
+    start: tuple[float, float], end: tuple[float, float], size: float, color: str
+) -> PathPatch:
+    (x, y), (end_x, end_y) = start, end
+    middle_x = 0.5 * (x + end_x)
+    points = [
+        (x, y),
+        (middle_x, y),
+        (middle_x, end_y),
+        (end_x, end_y),
+        (end_x, end_y - size),
+        (middle_x, end_y - size),
+        (middle_x, y - size),
+        (x, y - size),
+        (x, y),
+    ]
+    curve = [Outline.CURVE4] * 3
+    codes = [Outline.MOVETO, *curve, Outline.LINETO, *curve, Outline.CLOSEPOLY]
+    return PathPatch(Outline(points, codes), facecolor=color, alpha=0.45, linewidth=0)

@@ -1,0 +1,220 @@
+"""A design study as one picture: curves, maps, or scatter plots with rank correlations."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from scipy.stats import rankdata
+
+from crane.common.samples import Array
+from crane.recordings.recording_summary import result_title
+from crane.studies import Study
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import (
+    DASHED_STYLE,
+    FIGURE_STYLE,
+    RECORDED_COLOUR,
+    write_figure,
+)
+
+_MAX_PANELS = 12  # measures of one picture
+_MAX_SCATTER_ROWS = 6
+_MAX_COLUMNS = 3
+_TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
+_INFEASIBLE_COLOUR = "#d9d9d9"
+
+
+def plot_study(study: Study, path: str | Path) -> None:
+    """Write the picture of a study to a file.
+
+    Args:
+        study: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: study_figure(study))
+
+
+def study_figure(study: Study) -> Figure:
+    """The figure of a study, a panel per measure; measures that do not change are left out.
+
+    Of one parameter curves, of a grid of two maps with the best variant marked; of anything else
+    points over each parameter with their rank correlation.
+    """
+    shown_measures = [name for name in study.measures if _is_varying(study.columns[name])]
+    shown_measures = (shown_measures or list(study.measures))[:_MAX_PANELS]
+    with mpl.rc_context(FIGURE_STYLE):
+        if not study.grid_shape or len(study.parameters) > 2:
+            figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
+        else:
+            figure = _draw_panels(study, shown_measures)
+        heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
+        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    return figure
+
+
+def _is_varying(values: Array) -> bool:
+    finite_values = values[np.isfinite(values)]
+    return bool(
+        len(finite_values)
+        and np.ptp(finite_values) > 1e-6 * max(np.abs(finite_values).max(), 1e-12)
+    )
+
+
+def _column_label(study: Study, name: str) -> str:
+    unit = study.units[name]
+    return escape_label(f"{name} [{unit}]" if unit else name)
+
+
+def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
+    columns = 2 if len(shown_measures) == 4 else min(_MAX_COLUMNS, len(shown_measures))
+    rows = -(-len(shown_measures) // columns)
+    size = (max(5.2, 4.0 * columns), 3.3 * rows + 0.5)
+    figure = Figure(figsize=size, layout="constrained")
+    for index, name in enumerate(shown_measures):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        if len(study.parameters) == 1:
+            _draw_curves(axes, study, name)
+        else:
+            _draw_map(figure, axes, study, name)
+        axes.set_title(_column_label(study, name))
+        axes.set_xlabel(_column_label(study, study.parameters[0]))
+    lines = {
+        line.get_label(): line
+        for axes in figure.axes
+        for line in axes.get_lines()
+        if not str(line.get_label()).startswith("_")
+    }
+    if lines:
+        handles, labels = list(lines.values()), [str(label) for label in lines]
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(lines), 6))
+    return figure
+
+
+def _draw_curves(axes: Axes, study: Study, name: str) -> None:
+    """One measure over one parameter, the values of each task below that of all together."""
+    x = study.columns[study.parameters[0]]
+    order = np.argsort(x)
+    x = x[order]
+    marker = "o" if len(x) < 40 else ""
+    for k, task in enumerate(study.tasks):
+        values = study.columns.get(f"{name} {task}")
+        if values is not None:
+            color = _TASK_COLORS[k % len(_TASK_COLORS)]
+            axes.plot(
+                x,
+                values[order],
+                marker=marker,
+                ms=2.5,
+                lw=1.0,
+                color=color,
+                label=escape_label(task),
+            )
+    measure_values = study.columns[name][order]
+    label = (
+        "together" if f"{name} {study.tasks[0] if study.tasks else ''}" in study.columns else ""
+    )
+    width, color = (
+        (5.0, "#c4ccd4") if label else (1.4, RECORDED_COLOUR)
+    )  # below the lines of the tasks
+    axes.plot(
+        x,
+        measure_values,
+        marker=marker,
+        ms=width,
+        lw=width,
+        color=color,
+        label=label or "_",
+        zorder=1.5,
+    )
+    best_variant = study.rank(name)[:1]
+    axes.plot(
+        study.columns[study.parameters[0]][best_variant],
+        study.columns[name][best_variant],
+        "*",
+        ms=11,
+        color=DASHED_STYLE["color"],
+        label="best",
+    )
+    for parameter_value, value in zip(x, measure_values, strict=True):
+        if not np.isfinite(value):  # a cross at the foot
+            axes.plot(
+                [parameter_value], [0.02], "x", ms=4, color="#909090", label="not possible",
+                transform=axes.get_xaxis_transform(),
+            )  # fmt: skip
+
+
+def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
+    """One measure over a grid of two parameters, hatched where it cannot be measured."""
+    first_values, second_values = (
+        study.columns[name].reshape(study.grid_shape) for name in study.parameters
+    )
+    x, y = first_values[:, 0], second_values[0]
+    values = study.columns[name].reshape(study.grid_shape).T
+    is_infeasible = ~np.isfinite(values)
+    axes.grid(False)
+    mesh = axes.pcolormesh(
+        x, y, np.ma.masked_array(values, is_infeasible), cmap="viridis", shading="nearest"
+    )
+    if is_infeasible.any():
+        infeasible_mask = np.ma.masked_array(np.zeros_like(values), ~is_infeasible)
+        axes.pcolormesh(
+            x, y, infeasible_mask, cmap=ListedColormap([_INFEASIBLE_COLOUR]), shading="nearest"
+        )
+        axes.plot([], [], "s", ms=8, color=_INFEASIBLE_COLOUR, label="not possible")
+    if min(values.shape) > 1 and _is_varying(values):
+        lines = axes.contour(x, y, np.ma.masked_array(values, is_infeasible), 6, colors="white",
+                             linewidths=0.7)  # fmt: skip
+        axes.clabel(lines, fontsize=6.5)
+    figure.colorbar(mesh, ax=axes, shrink=0.9).outline.set_visible(False)
+    best_variant = study.rank(name)[0]
+    axes.plot(
+        study.columns[study.parameters[0]][best_variant],
+        study.columns[study.parameters[1]][best_variant],
+        "*",
+        ms=13,
+        color=DASHED_STYLE["color"],
+        mec="white",
+        mew=0.8,
+        ls="",
+        label="best",
+        clip_on=False,
+    )
+    axes.set_ylabel(_column_label(study, study.parameters[1]))
+
+
+def _draw_cloud(axes: Axes, x: Array, values: Array, best_variant: Sequence[int]) -> None:
+    """A measure over a parameter, ticks where it is missing, and how well their ranks agree."""
+    is_finite = np.isfinite(values)
+    axes.plot(x[is_finite], values[is_finite], "o", ms=3, color=RECORDED_COLOUR, alpha=0.7)
+    axes.plot(x[best_variant], values[best_variant], "*", ms=11, color=DASHED_STYLE["color"])
+    for missing_value in x[~is_finite]:
+        axes.axvline(missing_value, ymax=0.04, color="#909090", lw=0.8)
+    if is_finite.sum() > 2:
+        r = np.corrcoef(rankdata(x[is_finite]), rankdata(values[is_finite]))[0, 1]
+        axes.set_title(f"rank correlation {r:+.2f}", fontsize=7.5, loc="right")
+
+
+def _draw_scatter(study: Study, shown_measures: list[str]) -> Figure:
+    """Measures over parameters, all other parameters varying too."""
+    size = (2.5 * len(study.parameters) + 0.8, 2.0 * len(shown_measures) + 0.6)
+    figure = Figure(figsize=(max(4.5, size[0]), size[1]), layout="constrained")
+    panels = figure.subplots(
+        len(shown_measures), len(study.parameters), sharex="col", sharey="row", squeeze=False
+    )
+    for row, name in zip(panels, shown_measures, strict=True):
+        values = study.columns[name]
+        best_variant = study.rank(name)[:1]
+        for axes, parameter in zip(row, study.parameters, strict=True):
+            x = study.columns[parameter]
+            _draw_cloud(axes, x, values, best_variant)
+        row[0].set_ylabel(_column_label(study, name))
+    for axes, parameter in zip(panels[-1], study.parameters, strict=True):
+        axes.set_xlabel(_column_label(study, parameter))
+    return figure

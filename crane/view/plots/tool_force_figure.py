@@ -1,0 +1,137 @@
+"""Tool forces over the reach: how large, which way, and what ends them."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch as Swatch
+from matplotlib.ticker import MaxNLocator
+
+from crane.common.samples import Array
+from crane.ratings.tool_forces import ToolForce
+from crane.recordings.recording_summary import result_title
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+
+_FACTOR_COLOURS = (
+    "#1f5fa8",
+    "#e0701a",
+    "#2a8c4a",
+    "#8a5fb0",
+    "#d9b53f",
+    "#b04a7a",
+    "#3f8f9f",
+    "#9a6b3f",
+    "#7a7a7a",
+    "#6f9bca",
+    "#c2452d",
+    "#333333",
+)
+_MAX_ARROWS = 12  # along the larger side
+
+
+def plot_tool_force(chart: ToolForce, path: str | Path) -> None:
+    """Write the picture of tool forces to a file.
+
+    Args:
+        chart: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: tool_force_figure(chart))
+
+
+def tool_force_figure(chart: ToolForce) -> Figure:
+    """The figure: a row per slew, forces with arrows on the left, causes on the right."""
+    count = len(chart.slews)
+    radius_range, height_range = float(np.ptp(chart.radii)), float(np.ptp(chart.heights))
+    directions = chart.section_directions()
+    largest_force = (
+        float(np.nanmax(np.where(np.isfinite(chart.forces), chart.forces, np.nan))) / 1e3
+    )
+    with mpl.rc_context(FIGURE_STYLE):
+        height = np.clip(4.2 * height_range / max(radius_range, 1e-9), 2.6, 6.5) * count + 2.0
+        figure = Figure(figsize=(9.6, float(height)), layout="constrained")
+        grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
+        active_factors = chart.active_factors
+        colors = {
+            k: _FACTOR_COLOURS[j % len(_FACTOR_COLOURS)] for j, k in enumerate(active_factors)
+        }
+        for s, (left, right) in enumerate(grid):
+            forces = chart.forces[s] / 1e3
+            masked_forces = np.ma.masked_invalid(forces)
+            mesh = left.pcolormesh(
+                chart.radii,
+                chart.heights,
+                masked_forces,
+                shading="nearest",
+                cmap="viridis",
+                vmin=0.0,
+                vmax=largest_force,
+                rasterized=True,
+            )
+            if np.ptp(masked_forces.compressed()) > 0 and min(masked_forces.shape) > 1:
+                lines = left.contour(chart.radii, chart.heights, masked_forces,
+                                     levels=MaxNLocator(8).tick_values(0, largest_force),
+                                     colors="white", linewidths=0.7)  # fmt: skip
+                left.clabel(lines, fmt="%g", fontsize=7)
+            _draw_arrows(left, chart, forces, directions[s], largest_force)
+            colour_bar = figure.colorbar(
+                mesh, cax=left.inset_axes((1.03, 0.03, 0.04, 0.94)), label="force [kN]"
+            )
+            colour_bar.outline.set_visible(False)
+            factor_index = np.full(forces.shape, np.nan)
+            for j, k in enumerate(active_factors):
+                factor_index[chart.limiting_factor_index[s] == k] = j
+            palette = ListedColormap([colors[k] for k in active_factors] or [INK_COLOUR])
+            right.pcolormesh(chart.radii, chart.heights, np.ma.masked_invalid(factor_index),
+                             shading="nearest", cmap=palette, vmin=-0.5,
+                             vmax=max(len(active_factors), 1) - 0.5, rasterized=True)  # fmt: skip
+            slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
+            left.set_title(f"largest force{slew_text}")
+            right.set_title("what ends it")
+            left.set_ylabel(f"{chart.section.coordinate_names[1]} [m]")
+            for axes in (left, right):
+                axes.set_aspect("equal")
+                axes.grid(False)
+                if s == count - 1:
+                    axes.set_xlabel(f"{chart.section.coordinate_names[0]} [m]")
+        handles = [
+            Swatch(color=colors[k], label=escape_label(str(chart.limiting_factors[k])))
+            for k in active_factors
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
+        heading = escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
+        figure.suptitle(heading, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    return figure
+
+
+def _draw_arrows(
+    axes: Axes, chart: ToolForce, forces: Array, directions: Array, largest_force: float
+) -> None:
+    """Which way the tool pushes, at some places, as long as the force is large."""
+    step = max(1, max(forces.shape) // _MAX_ARROWS)
+    rows, columns = (np.arange(n % step // 2, n, step) for n in forces.shape)
+    b, a = np.meshgrid(rows, columns, indexing="ij")
+    b, a = (x[np.isfinite(forces[b, a])] for x in (b, a))
+    if len(b):
+        arrow_length = max(np.ptp(chart.radii), np.ptp(chart.heights)) / _MAX_ARROWS
+        arrow_vectors = directions[b, a] * (forces[b, a] / largest_force * arrow_length)[:, None]
+        axes.quiver(
+            chart.radii[a],
+            chart.heights[b],
+            *arrow_vectors.T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            color="#f2f2f2",
+            edgecolor=INK_COLOUR,
+            linewidth=0.4,
+            width=0.008,
+            pivot="mid",
+        )

@@ -1,0 +1,307 @@
+"""A workspace as one picture: what the tip reaches, and which strokes close."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pinocchio as pin
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch as Swatch
+from matplotlib.ticker import MaxNLocator
+
+from crane.common.samples import Array
+from crane.motion.workspaces import Workspace
+from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import (
+    DASHED_STYLE,
+    FIGURE_STYLE,
+    INK_COLOUR,
+    RECORDED_COLOUR,
+    joint_symbol,
+    write_figure,
+)
+
+_REGION_COLOUR, _GRID_COLOUR, _OPEN_COLOUR = "#e3ecf6", "#a9c3e0", "#d9d9d9"
+_CURVE_STYLES = {
+    "branch": {"color": "#c2452d", "linewidth": 1.8},
+    "tip": {
+        "color": DASHED_STYLE["color"],
+        "linewidth": 1.3,
+        "linestyle": DASHED_STYLE["linestyle"],
+    },
+}
+_CURVE_LABELS = {"branch": "end of the branch", "tip": "tip singular"}
+_MAX_GAP_SHARE = 0.1  # share of the extent that neighbours on a line are not apart
+_MAX_SHOWN_CONDITION = 30.0  # condition at which colours end
+_MIN_SHOWN_CONDITION = 1.2  # condition up to which a drive has nothing to show
+_CONDITION_TICKS = (1, 1.1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7, 10, 15, 20, 30)
+_GRID_LINE_COUNT = 10  # of the grid, per stroke
+
+
+def plot_workspace(reachable_space: Workspace, path: str | Path) -> None:
+    """Write the picture of a workspace to a file.
+
+    Args:
+        reachable_space: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: workspace_figure(reachable_space))
+
+
+def workspace_figure(reachable_space: Workspace) -> Figure:
+    """The figure of a workspace.
+
+    Left what the tip covers in the section, the images of even steps of the two strokes that
+    move it most, and the machine at home; right over these two strokes the condition of the drive
+    and the least singular value of the tip's slopes, grey where the loops do not close.
+    """
+    with mpl.rc_context(FIGURE_STYLE):
+        lower, upper = (
+            reachable_space.section_positions.min(axis=0),
+            reachable_space.section_positions.max(axis=0),
+        )
+        skeleton = skeleton_lines(reachable_space)
+        lower = np.minimum(lower, skeleton.reshape(-1, 2).min(axis=0))
+        upper = np.maximum(upper, skeleton.reshape(-1, 2).max(axis=0))
+        aspect = np.clip((upper - lower)[1] / max((upper - lower)[0], 1e-9), 0.45, 1.5)
+        has_condition_panel = (
+            float(np.nanmax(reachable_space.stroke_map.condition)) > _MIN_SHOWN_CONDITION
+        )
+        height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
+        figure = Figure(figsize=(9.6, height), layout="constrained")
+        grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
+        _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, (lower, upper))
+        right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
+        if has_condition_panel:
+            _draw_stroke_map(
+                right[0],
+                reachable_space,
+                reachable_space.stroke_map.condition,
+                "condition of the drive",
+            )
+            right[0].sharex(right[1])
+            right[0].tick_params(labelbottom=False)
+            right[0].set_xlabel("")
+        _draw_stroke_map(
+            right[-1],
+            reachable_space,
+            reachable_space.stroke_map.least_singular_value,
+            "tip, least singular [m]",
+        )
+        right[0].set_title(_stroke_title(reachable_space))
+        _add_caption(figure, reachable_space)
+    return figure
+
+
+def _draw_section(
+    axes: Axes, reachable_space: Workspace, skeleton: Array, limits: tuple[Array, Array]
+) -> None:
+    if reachable_space.area:
+        raster = reachable_space.raster
+        covered = raster.fill_cracks(2 if reachable_space.is_complete else 6)
+        axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
+        lines = _grid_images(reachable_space)
+        axes.add_collection(LineCollection(lines, colors=_GRID_COLOUR, linewidths=0.6, zorder=2))
+        axes.contour(
+            raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=1.1, zorder=3
+        )
+    else:
+        path = reachable_space.section_positions[
+            np.argsort(
+                reachable_space.q_a[
+                    :, reachable_space.machine.active.index(reachable_space.strokes[0])
+                ]
+            )
+        ]
+        axes.plot(*path.T, color=RECORDED_COLOUR, linewidth=1.8, zorder=3)
+        axes.plot(*path[[0, -1]].T, "o", ms=4.5, color=RECORDED_COLOUR, mfc="white", zorder=4)
+    for curve in reachable_space.curves:
+        if len(curve.section_positions) > 1:
+            axes.plot(*curve.section_positions.T, zorder=4, **_CURVE_STYLES[curve.kind])
+        else:
+            axes.plot(
+                *curve.section_positions.T,
+                "o",
+                ms=5,
+                color=_CURVE_STYLES[curve.kind]["color"],
+                zorder=5,
+            )
+    axes.add_collection(LineCollection(list(skeleton), colors=INK_COLOUR, linewidths=1.6, zorder=5,
+                                       capstyle="round", alpha=0.75))  # fmt: skip
+    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5, alpha=0.75)
+    home_position = reachable_space.section.coordinates(_home_tip(reachable_space)[None])[0]
+    axes.plot(*home_position, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3, zorder=6)
+    axes.set_aspect("equal")
+    margin = 0.05 * float((limits[1] - limits[0]).max())
+    axes.set_xlim(limits[0][0] - margin, limits[1][0] + margin)
+    axes.set_ylim(limits[0][1] - margin, limits[1][1] + margin)
+    axes.set_anchor("N")
+    u, w = reachable_space.section.coordinate_names
+    axes.set(
+        xlabel=f"{u} [m]",
+        ylabel=f"{w} [m]",
+        title=f"reach of {escape_label(reachable_space.frame)}",
+    )
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _grid_images(reachable_space: Workspace) -> list[Array]:
+    """Images (k, 2) of even steps of the two strokes of the map."""
+    patch = reachable_space.stroke_map.patch
+    section_positions = np.full((*patch.is_closed.shape, 2), np.nan)
+    tip_positions = [
+        _tip_position(reachable_space, q) for q in patch.configurations[patch.is_closed]
+    ]
+    section_positions[patch.is_closed] = reachable_space.section.coordinates(
+        np.array(tip_positions)
+    )
+    extent = float(np.ptp(reachable_space.section_positions, axis=0).max())
+    lines: list[Array] = []
+    for rows in (section_positions, section_positions.swapaxes(0, 1)):
+        row_indices = np.unique(
+            np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int)
+        )
+        for row in rows[row_indices]:
+            steps = np.linalg.norm(np.diff(row, axis=0), axis=1)
+            gap_indices = np.flatnonzero(~(steps < _MAX_GAP_SHARE * extent)) + 1
+            lines += [
+                segment for segment in np.split(row, gap_indices) if not np.isnan(segment).any()
+            ]
+    return [line for line in lines if len(line) > 1]
+
+
+def _tip_position(reachable_space: Workspace, q: Array) -> Array:
+    model, data = reachable_space.machine.model, reachable_space.machine.model.createData()
+    pin.forwardKinematics(model, data, reachable_space.machine.coordinates.configuration(q))
+    frame = reachable_space.machine.frame(reachable_space.frame)
+    return np.array(pin.updateFramePlacement(model, data, frame).translation)
+
+
+def _home_tip(reachable_space: Workspace) -> Array:
+    return _tip_position(reachable_space, reachable_space.machine.home)
+
+
+def skeleton_lines(reachable_space: Workspace) -> Array:
+    """Lines (k, 2, 2) between the joints of the machine at home, in the section."""
+    machine, model = reachable_space.machine, reachable_space.machine.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
+    line_ends = []
+    for joint in range(1, model.njoints):
+        if model.parents[joint] > 0:
+            line_ends.append(
+                (data.oMi[model.parents[joint]].translation, data.oMi[joint].translation)
+            )
+    loops = machine.closure.equations.loops
+    for name in [name for loop in loops for name in (loop.predecessor, loop.successor)]:
+        frame = machine.frame(name)
+        parent = model.frames[frame].parentJoint
+        if parent > 0:
+            line_ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
+    frame = machine.frame(reachable_space.frame)
+    parent = model.frames[frame].parentJoint
+    line_ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
+    return reachable_space.section.coordinates(np.array(line_ends).reshape(-1, 3)).reshape(
+        -1, 2, 2
+    )
+
+
+def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, label: str) -> None:
+    """A number (a, b) over the two strokes of the map, or over the only one."""
+    machine, stroke_map = reachable_space.machine, reachable_space.stroke_map
+    patch = stroke_map.patch
+    names = [machine.active[i] for i in patch.stroke_pair]
+    units = [DISPLAY_UNITS[machine.unit(name)] for name in names]
+    factors = np.array([factor for _, factor in units])
+    labels = [f"{joint_symbol(n)} [{u}]" for n, (u, _) in zip(names, units, strict=True)]
+    home = machine.home[machine.closure.active][list(patch.stroke_pair)] * factors
+    x = patch.axes[0] * factors[0]
+    axes.set_xlabel(labels[0])
+    axes.set_anchor("N")
+    if patch.stroke_pair[0] == patch.stroke_pair[1]:
+        axes.plot(x, values[:, 0], color=RECORDED_COLOUR)
+        for curve in stroke_map.curves:
+            axes.axvline(
+                curve.q_a[0, patch.stroke_pair[0]] * factors[0], **_CURVE_STYLES[curve.kind]
+            )
+        home_value = np.interp(home[0], x, values[:, 0])
+        axes.plot(home[0], home_value, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
+        axes.set(xlim=(x[0], x[-1]), ylabel=label)
+        top = min(float(np.nanmax(values)), _MAX_SHOWN_CONDITION * float(np.nanmin(values)) + 1)
+        axes.set_ylim(0, 1.1 * top)
+        return
+    y = patch.axes[1] * factors[1]
+    axes.grid(False)
+    axes.set_facecolor(_OPEN_COLOUR)
+    largest = float(np.nanmax(values))
+    is_truncated = values is stroke_map.condition and largest > _MAX_SHOWN_CONDITION
+    norm: Normalize = Normalize(0.0, largest)
+    if values is stroke_map.condition:
+        bottom = float(np.nanmin(values))
+        norm = LogNorm(bottom, max(min(largest, _MAX_SHOWN_CONDITION), 1.5 * bottom))
+    mesh = axes.pcolormesh(
+        x, y, np.ma.masked_invalid(values.T), norm=norm, shading="nearest", rasterized=True,
+        cmap="viridis" if values is stroke_map.condition else "cividis_r",
+    )  # fmt: skip
+    for curve in stroke_map.curves:
+        axes.plot(
+            *(curve.q_a[:, list(patch.stroke_pair)] * factors).T, **_CURVE_STYLES[curve.kind]
+        )
+    axes.plot(*home, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), ylabel=labels[1])
+    figure = axes.get_figure()
+    assert figure is not None, "axes belong to a figure"
+    colour_bar_axes = axes.inset_axes((1.03, 0.03, 0.04, 0.94))
+    colour_bar = figure.colorbar(
+        mesh, cax=colour_bar_axes, label=label, extend="max" if is_truncated else "neither"
+    )
+    colour_bar.outline.set_visible(False)
+    if values is stroke_map.condition:
+        ticks = [
+            value for value in _CONDITION_TICKS if (norm.vmin or 0) <= value <= (norm.vmax or 0)
+        ]
+        colour_bar.set_ticks(ticks, labels=[f"{value:g}" for value in ticks])
+    colour_bar.ax.minorticks_off()
+
+
+def _stroke_title(reachable_space: Workspace) -> str:
+    mapped_strokes = [
+        reachable_space.machine.active[i] for i in reachable_space.stroke_map.patch.stroke_pair
+    ]
+    others = [
+        joint_symbol(joint) for joint in reachable_space.strokes if joint not in mapped_strokes
+    ]
+    if not others:
+        return "strokes" if len(reachable_space.strokes) > 1 else "along the stroke"
+    return f"strokes, {', '.join(others) if len(others) < 3 else 'others'} at home"
+
+
+def _add_caption(figure: Figure, reachable_space: Workspace) -> None:
+    heading = escape_label(result_title(reachable_space.machine.name, "workspace"))
+    if reachable_space.slewing_joint_name is not None:
+        i = reachable_space.machine.active.index(reachable_space.slewing_joint_name)
+        slewing_range = np.rad2deg([reachable_space.lower[i], reachable_space.upper[i]])
+        heading += (
+            f", turned by {joint_symbol(reachable_space.slewing_joint_name)} from "
+            f"{slewing_range[0]:.4g}° to {slewing_range[1]:.4g}°"
+        )
+    figure.suptitle(heading, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    handles: list[Line2D | Swatch] = [
+        Line2D([], [], marker="o", ls="", color=INK_COLOUR, mfc="white", mew=1.3, label="home")
+    ]
+    kinds = {curve.kind for curve in (*reachable_space.curves, *reachable_space.stroke_map.curves)}
+    for kind, heading in _CURVE_LABELS.items():
+        if kind in kinds:
+            handles.append(Line2D([], [], label=heading, **_CURVE_STYLES[kind]))
+    if not reachable_space.stroke_map.patch.is_closed.all() and reachable_space.area:
+        handles.append(Swatch(color=_OPEN_COLOUR, label="loops do not close"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

@@ -1,0 +1,308 @@
+"""The circuit of a machine as a figure: rails, functions above them, pumps and the rest below."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from crane.common.errors import InputError
+from crane.hydraulics.components import Hydraulics
+from crane.hydraulics.supply_and_engine import TANK_NODE
+from crane.machine import Machine
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
+from crane.view.sketch.circuit import circuit_section
+from crane.view.sketch.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
+from crane.view.sketch.circuit.circuit_section import CircuitFunction, CircuitSection
+from crane.view.sketch.circuit.open_centre_lines import OpenCentreLines
+from crane.view.sketch.circuit.spool_symbol import SPOOL_HEIGHT
+from crane.view.sketch.circuit.supply_items import SupplyItem, create_supply_items
+
+_FUNCTIONS_PER_ROW = 4  # functions beside each other
+_RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest to what hangs on it
+_MARGIN, _HEADING_HEIGHT = 10.0, 26.0  # around all of it
+_MIN_WIRE_DISTANCE = 3.0  # least distance of wires
+_MAX_LABEL_LENGTH = 24  # letters of a rail's name
+
+
+def sketch_circuit(machine: Machine, path: str | Path) -> None:
+    """Write a drawing of the hydraulic circuit to a file.
+
+    Args:
+        machine: A machine with hydraulics.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+        InputError: The machine has no hydraulics.
+    """
+    write_figure(path, lambda: circuit_figure(machine)[0])
+
+
+def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
+    """The figure of a circuit, and what it was drawn with; see `sketch_circuit`.
+
+    Functions stand side by side in the order of the active joints, at most four in a row, each
+    over the rails that it is joined to; pumps, tank, accumulators and elements hang below the
+    lowest rails. Coordinates are points.
+    """
+    hydraulics = machine.hydraulics
+    if hydraulics is None:
+        raise InputError(
+            f"'{machine.name}' has no hydraulic circuit, sketch its mechanism or add 'hydraulics'"
+        )
+    with mpl.rc_context(FIGURE_STYLE):
+        return _CircuitDrawing(machine, hydraulics).draw()
+
+
+class _CircuitDrawing:
+    """A circuit as it is laid out."""
+
+    def __init__(self, machine: Machine, hydraulics: Hydraulics):
+        self._machine, self._hydraulics = machine, hydraulics
+        functions = _circuit_functions(machine, hydraulics)
+        count = -(-len(functions) // _FUNCTIONS_PER_ROW)
+        self._function_rows = _split_into_rows(functions, count)
+        self._open_centres = OpenCentreLines(hydraulics, self._function_rows)
+        items = create_supply_items(hydraulics, functions)
+        functions_width = (
+            max(len(row) for row in self._function_rows) * circuit_section.SECTION_WIDTH
+        )
+        self._item_rows = _pack_items(
+            items, max(functions_width, _FUNCTIONS_PER_ROW * circuit_section.SECTION_WIDTH)
+        )
+        items_width = max(sum(item.width for item in row) + 16 for row in self._item_rows)
+        self._net_names = _rail_nets(hydraulics, functions, self._open_centres)
+        labels = {net: _rail_label(hydraulics, net) for net in self._net_names}
+        self._label_width = 4 + 0.62 * SMALL_TEXT_SIZE * max(map(len, labels.values()))
+        self._rail_labels = labels
+        self._content_width = max(functions_width, items_width)
+
+    def draw(self) -> tuple[Figure, CircuitCanvas]:
+        nets_by_row = self._used_nets()
+        risers = [net for net in self._net_names if sum(net in row for row in nets_by_row) > 1]
+        left = self._label_width + 5.0 * len(risers)
+        heights = [self._row_height(k, len(row)) for k, row in enumerate(nets_by_row)]
+        width = _MARGIN + left + self._content_width + 2 * _MARGIN
+        height = sum(heights) + _HEADING_HEIGHT + _MARGIN
+        figure = Figure(figsize=(width / 72, height / 72))
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(0, width), ylim=(0, height), aspect="equal")
+        axes.axis("off")
+        canvas = CircuitCanvas(axes)
+        heading = escape_label(self._machine.name.replace("_", " "))
+        canvas.draw_text(_MARGIN, height - 12, f"{heading}: hydraulic circuit", "heading", size=11,
+                  weight="bold", ha="left")  # fmt: skip
+        top, rail_heights_by_row = height - _HEADING_HEIGHT, []
+        for k, row in enumerate(nets_by_row):
+            height_above = self._height_above_rail(k)
+            start = top - height_above
+            rails = {net: start - _RAIL_SPACING * i for i, net in enumerate(row)}
+            self._draw_row(canvas, k, rails, _MARGIN + left, start)
+            rail_heights_by_row.append(rails)
+            top -= heights[k]
+        self._draw_rails(canvas, rail_heights_by_row, risers, _MARGIN + self._label_width)
+        canvas.draw_junctions()
+        return figure, canvas
+
+    def _used_nets(self) -> list[list[str]]:
+        """Nets that have a rail, by row; the last row of functions is the first that hangs."""
+        rows: list[set[str]] = []
+        for k, functions in enumerate(self._function_rows):
+            row = {net for x in functions for net in x.rails.values()}
+            rows.append(row | self._open_centres.required_nets(k))
+        for k, items in enumerate(self._item_rows):
+            row_index = len(self._function_rows) - 1 + k
+            if row_index == len(rows):
+                rows.append(set())
+            rows[row_index] |= {net for item in items for net, _ in item.wires}
+        return [[net for net in self._net_names if net in row] for row in rows]
+
+    def _height_above_rail(self, row: int) -> float:
+        if row >= len(self._function_rows):
+            return 14.0
+        return (
+            self._valve_height(row)
+            + SPOOL_HEIGHT
+            + self._actuator_height(row)
+            + circuit_section.TOP_HEIGHT
+        )
+
+    def _valve_height(self, row: int) -> float:
+        """Height of the valves above the highest rail."""
+        functions = self._function_rows[row]
+        text_height = 4 + 7.6 * max(len(x.valve_texts) for x in functions)
+        required_height = 12 + max(max(x.height_below for x in functions), text_height)
+        return required_height + 4.0 * self._open_centres.line_count(row) + 2
+
+    def _actuator_height(self, row: int) -> float:
+        """Height of the actuators' middle above the valves."""
+        functions = self._function_rows[row]
+        rows = max(sum(h for _, h in circuit_section.valve_rows(x)) for x in functions)
+        return rows + 20 + (6 if self._open_centres.line_count(row) else 0)
+
+    def _row_height(self, row: int, rail_count: int) -> float:
+        item_row = row - len(self._function_rows) + 1
+        height_below = 18.0
+        if 0 <= item_row < len(self._item_rows):
+            height_below = (
+                _ITEM_DISTANCE + max(item.height for item in self._item_rows[item_row]) + 6
+            )
+        return self._height_above_rail(row) + _RAIL_SPACING * (rail_count - 1) + height_below
+
+    def _draw_row(
+        self,
+        canvas: CircuitCanvas,
+        row: int,
+        rail_heights: Mapping[str, float],
+        left: float,
+        top_rail: float,
+    ) -> None:
+        previous_wires = len(canvas.wires)
+        if row < len(self._function_rows):
+            functions = self._function_rows[row]
+            valve = top_rail + self._valve_height(row)
+            actuator = valve + SPOOL_HEIGHT + self._actuator_height(row)
+            spare_width = max(
+                self._content_width - len(functions) * circuit_section.SECTION_WIDTH, 0.0
+            )
+            first = left + (
+                spare_width / 2
+                if spare_width < circuit_section.SECTION_WIDTH
+                else 0.25 * spare_width
+            )
+            middles = [
+                first + (i + 0.5) * circuit_section.SECTION_WIDTH for i in range(len(functions))
+            ]
+            levels = self._open_centres.line_heights(row, valve)
+            centre_ends = {}
+            for function, x in zip(functions, middles, strict=True):
+                centre_ports = CircuitSection(
+                    canvas, function, x, valve, actuator, rail_heights, levels
+                ).draw()
+                if centre_ports is not None:
+                    centre_ends[function.joint] = x, *centre_ports
+            self._open_centres.draw(canvas, row, centre_ends, rail_heights, levels)
+        item_row = row - len(self._function_rows) + 1
+        if not 0 <= item_row < len(self._item_rows):
+            return
+        occupied_x = [w.start[0] for w in canvas.wires[previous_wires:] if w.start[0] == w.end[0]]
+        item_top = min(rail_heights.values(), default=top_rail) - _ITEM_DISTANCE
+        cursor = left
+        for item in self._item_rows[item_row]:
+            while any(
+                abs(cursor + position - other) < _MIN_WIRE_DISTANCE
+                for _, position in item.wires
+                for other in occupied_x
+            ):
+                cursor += 1.0
+            item.draw(canvas, cursor, item_top, rail_heights)
+            cursor += item.width
+
+    def _draw_rails(
+        self,
+        canvas: CircuitCanvas,
+        rail_heights_by_row: Sequence[Mapping[str, float]],
+        risers: Sequence[str],
+        left: float,
+    ) -> None:
+        for net in self._net_names:
+            signal = net.startswith(("LS ", "N "))
+            lane_index = risers.index(net) if net in risers else len(risers)
+            lane = left + 5.0 * lane_index
+            heights = [row[net] for row in rail_heights_by_row if net in row]
+            for y in heights:
+                wire_ends = [w.end[0] for w in canvas.wires if w.net == net and w.end[1] == y]
+                wire_ends += [w.start[0] for w in canvas.wires if w.net == net and w.start[1] == y]
+                for first, second in zip(
+                    [lane, *sorted(set(wire_ends))], sorted(set(wire_ends)), strict=False
+                ):
+                    canvas.draw_wire(net, (first, y), (second, y), is_signal=signal)
+                canvas.draw_text(left - 4, y, self._rail_labels[net], f"rail {net}", ha="right")
+                if lane > left:
+                    canvas.draw_line(
+                        [(left - 2, y), (lane, y)], linewidth=0.4, color="#8a8a8a", zorder=1
+                    )
+            for first, second in zip(heights, heights[1:], strict=False):
+                canvas.draw_wire(net, (lane, first), (lane, second), is_signal=signal)
+
+
+def _circuit_functions(machine: Machine, hydraulics: Hydraulics) -> list[CircuitFunction]:
+    connected_nodes = {node for x in hydraulics.elements.values() for node in (x.source, x.target)}
+    for valve in hydraulics.valves.values():
+        connected_nodes |= {valve.return_a, valve.return_b}
+    functions = []
+    for joint, cylinder in hydraulics.cylinders.items():
+        valve = hydraulics.valves[joint]
+        valves_of_supply = [x for x in hydraulics.valves.values() if x.supply == valve.supply]
+        supply, joint_index = hydraulics.pumps[valve.supply], machine.active.index(joint)
+        functions.append(
+            CircuitFunction(
+                joint, cylinder, valve, supply, machine.unit(joint) == "rad",
+                float(machine.upper[joint_index] - machine.lower[joint_index]),
+                frozenset(side for side in "ab" if f"{joint}.{side}" in connected_nodes),
+                supply.control == "load-sensing" or any(x.sharing for x in valves_of_supply),
+                len(valves_of_supply) > 1,
+            )
+        )  # fmt: skip
+    return functions
+
+
+def _split_into_rows(
+    functions: Sequence[CircuitFunction], count: int
+) -> list[list[CircuitFunction]]:
+    """Rows of nearly equal length, the longer ones first, with the nets of open centres."""
+    nets: dict[str, int] = {}
+    rows: list[list[CircuitFunction]] = []
+    remaining = iter(functions)
+    for k in range(count):
+        row = []
+        for _ in range(len(functions) // count + (k < len(functions) % count)):
+            function = next(remaining)
+            if function.valve.centre > 0:
+                supply = function.valve.supply
+                i = nets[supply] = nets.get(supply, -1) + 1
+                inlet_net = f"C {supply} {i}" if i else supply
+                function = replace(function, centre_nets=(inlet_net, f"C {supply} {i + 1}"))
+            row.append(function)
+        rows.append(row)
+    return rows
+
+
+def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[SupplyItem]]:
+    """Items in rows that are at most so wide; what must stay together is in the first."""
+    rows: list[list[SupplyItem]] = [[]]
+    for item in items:
+        used_width = sum(x.width for x in rows[-1])
+        if rows[-1] and not item.stays_in_row and used_width + item.width + 16 > max_width:
+            rows.append([])
+        rows[-1].append(item)
+    return rows
+
+
+def _rail_nets(
+    hydraulics: Hydraulics, functions: Sequence[CircuitFunction], centres: OpenCentreLines
+) -> list[str]:
+    """All nets that may have a rail, from the top."""
+    signals = [f"LS {name}" for name in hydraulics.pumps]
+    signals += [f"N {name}" for name in hydraulics.pumps]
+    nodes = [TANK_NODE, *hydraulics.pumps, *hydraulics.lines, *hydraulics.accumulators]
+    return [*signals, *centres.row_nets, *nodes,
+            *(f"{x.joint}.{side}" for x in functions for side in "ab")]  # fmt: skip
+
+
+def _rail_label(hydraulics: Hydraulics, net: str) -> str:
+    """What a rail is called."""
+    kind, _, name = net.partition(" ")
+    is_single_pump = len(hydraulics.pumps) == 1
+    label = net
+    if kind == "C" and name:
+        label = f"{name.split()[0]} centre"
+    elif kind in ("LS", "N") and name:
+        sign = {"LS": "LS", "N": "pN"}[kind]
+        label = sign if is_single_pump else f"{sign} {name}"
+    return escape_label(
+        label if len(label) <= _MAX_LABEL_LENGTH else f"{label[: _MAX_LABEL_LENGTH - 1]}…"
+    )

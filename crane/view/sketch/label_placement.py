@@ -1,0 +1,198 @@
+"""Where labels go: beside what they name, on nothing else."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
+from numpy.typing import NDArray
+
+from crane.common.samples import Array
+from crane.view.sketch.sketch_canvas import GREY, SketchCanvas
+
+_RING_GAPS = (2.0, 5.0, 9.0, 15.0, 23.0, 33.0, 45.0, 60.0)  # gaps to what is named [points]
+_LEADER_LINE_GAP = 12.0  # gap from which a thin line leads to the label [points]
+_ANGLES = np.linspace(0, 2 * np.pi, 32, endpoint=False) + np.pi / 4
+_MAX_SWEEPS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class SketchLabel:
+    """Words beside a point.
+
+    Attributes:
+        text: The words.
+        position: (2,) what they name [m].
+        radius: Of the symbol there [points].
+        gid: The text's name in the figure.
+    """
+
+    text: str
+    position: Array
+    radius: float
+    gid: str
+
+
+def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
+    """Put labels beside what they name, clear of each other and of all lines and symbols.
+
+    Candidates stand in rings around each point; each costs what it covers, its distance, and
+    nearness to other symbols. The label with the dearest best place chooses first, then all choose
+    again in turn.
+    """
+    axes, point = canvas.axes, canvas.point_size
+    figure = axes.figure
+    assert isinstance(figure, Figure)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    texts: list[Text] = []
+    boxes, costs = [], []
+    for label in labels:
+        text = axes.text(
+            float(label.position[0]),
+            float(label.position[1]),
+            label.text,
+            ha="center",
+            va="center",
+            fontsize=8.5,
+            zorder=9,
+            gid=label.gid,
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
+        )
+        text_extent = text.get_window_extent(renderer)
+        half_size = np.array([text_extent.width, text_extent.height]) / 2 * 72 / figure.dpi * point
+        texts.append(text)
+        candidates, gaps = _candidates(label, half_size, point)
+        boxes.append(candidates)
+        costs.append(_placement_costs(canvas, label, candidates, gaps))
+    chosen = _choose_candidates(boxes, costs, point)
+    for label, text, candidates, best_index in zip(labels, texts, boxes, chosen, strict=True):
+        lower, upper = candidates[best_index]
+        text.set_position(tuple((lower + upper) / 2))
+        nearest = np.clip(label.position, lower, upper)
+        if np.linalg.norm(nearest - label.position) > (label.radius + _LEADER_LINE_GAP) * point:
+            start = label.position + (nearest - label.position) * label.radius / _nonzero_length(
+                (nearest - label.position) / point
+            )
+            axes.plot(*np.array([start, nearest]).T, color=GREY, linewidth=0.6, zorder=8)
+
+
+def _candidates(label: SketchLabel, half_size: Array, point_size: float) -> tuple[Array, Array]:
+    """Boxes (k, 2, 2) as lowest and highest corners [m], and their gaps (k,) [points]."""
+    directions = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+    # a box whose nearest point lies in that direction: corners for slanted ones, sides for others
+    corner_directions = np.clip(1.6 * directions, -1, 1)
+    gaps = np.repeat(_RING_GAPS, len(_ANGLES))
+    distances = (label.radius + gaps)[:, None] * point_size
+    centres = label.position + np.tile(directions, (len(_RING_GAPS), 1)) * distances
+    centres = centres + np.tile(corner_directions, (len(_RING_GAPS), 1)) * half_size
+    return np.stack([centres - half_size, centres + half_size], axis=1), gaps
+
+
+def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gaps: Array) -> Array:
+    """(k,) what a label would cover and how far it would be, without other labels."""
+    point = canvas.point_size
+    lower, upper = boxes[:, 0] - 1.2 * point, boxes[:, 1] + 1.2 * point
+    cost = 0.14 * gaps
+    for segment in canvas.occupied_segments:
+        inside = _length_inside(segment, lower, upper) / point
+        cost = cost + np.where(inside > 0, 12 + 1.5 * inside, 0)
+    for centre, radius in canvas.occupied_discs:
+        distance = np.linalg.norm(np.clip(centre, lower, upper) - centre, axis=1) / point
+        cost = cost + np.where(distance < radius, 60.0, 0)
+        if (
+            np.abs(centre - label.position).max() > 1e-6 * point
+        ):  # nearer to another symbol than to its own
+            cost = cost + np.where(distance - radius < gaps + 2.0, 5.0, 0)
+    limits = np.array([canvas.axes.get_xlim(), canvas.axes.get_ylim()])
+    outside = (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1)
+    return cost + np.where(outside, 500.0, 0)
+
+
+def _costs_with_labels(
+    other_boxes: Sequence[Array], boxes: Array, cost: Array, point_size: float
+) -> Array:
+    """Costs (k,) of the boxes (k, 2, 2) of a label with other labels in their boxes (2, 2)."""
+    for lower, upper in other_boxes:
+        box_gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
+        cost = cost + np.where(box_gap < 4 * point_size, 1000.0, 0)
+    return cost
+
+
+def _choose_candidates(
+    boxes: Sequence[Array], costs: Sequence[Array], point_size: float
+) -> list[int]:
+    """Index of the candidate of each label."""
+    order = sorted(range(len(boxes)), key=lambda i: -float(costs[i].min()))
+    chosen: dict[int, int] = {}
+    for sweep in range(_MAX_SWEEPS):
+        previous = dict(chosen)
+        for i in order:
+            other_boxes = [boxes[j][best_index] for j, best_index in chosen.items() if j != i]
+            chosen[i] = int(
+                _costs_with_labels(other_boxes, boxes[i], costs[i], point_size).argmin()
+            )
+        if sweep and chosen == previous:
+            break
+    return [chosen[i] for i in range(len(boxes))]
+
+
+def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
+    """(k,) length of a line (2, 2) within boxes (k, 2), (k, 2)."""
+    start, direction = segment[0], segment[1] - segment[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first_parameters, second_parameters = (
+            (lower - start) / direction,
+            (upper - start) / direction,
+        )
+    entry, exit_parameter = (
+        np.fmin(first_parameters, second_parameters),
+        np.fmax(first_parameters, second_parameters),
+    )
+    is_parallel_outside = (direction == 0) & ((start < lower) | (start > upper))
+    entry = np.where(direction == 0, -np.inf, entry).max(axis=1)
+    exit_parameter = np.where(direction == 0, np.inf, exit_parameter).min(axis=1)
+    share = np.minimum(exit_parameter, 1.0) - np.maximum(entry, 0.0)
+    share = np.where(is_parallel_outside.any(axis=1), 0.0, np.maximum(share, 0.0))
+    return np.asarray(share * np.linalg.norm(direction))
+
+
+def _nonzero_length(vector: Array) -> float:
+    return max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def find_clear_point(
+    polygon: Array, segments: Sequence[Array], excluded_polygons: Sequence[Array]
+) -> tuple[Array, float]:
+    """A point (2,) within corners (k, 2), outside of others, and its distance to all lines [m]."""
+    lower, upper = polygon.min(axis=0), polygon.max(axis=0)
+    grid = np.stack(np.meshgrid(*np.linspace(lower, upper, 41).T), axis=-1).reshape(-1, 2)
+    grid = grid[_is_within_polygon(grid, polygon)]
+    for excluded_polygon in excluded_polygons:
+        if len(remaining := grid[np.logical_not(_is_within_polygon(grid, excluded_polygon))]):
+            grid = remaining
+    if not len(grid):
+        return polygon.mean(axis=0), 0.0
+    distance = np.full(len(grid), np.inf)
+    for start, end in segments:
+        direction = end - start
+        share = np.clip(
+            (grid - start) @ direction / max(float(direction @ direction), 1e-30), 0, 1
+        )
+        distance = np.minimum(
+            distance, np.linalg.norm(grid - start - share[:, None] * direction, axis=1)
+        )
+    return grid[distance.argmax()], float(distance.max())
+
+
+def _is_within_polygon(points: Array, corners: Array) -> NDArray[np.bool_]:
+    """(n,) whether points (n, 2) lie within a polygon (k, 2)."""
+    inside = np.zeros(len(points), dtype=bool)
+    x, y = points.T
+    for (a, b), (c, d) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        is_crossing = (b > y) != (d > y)
+        if b != d:
+            inside ^= is_crossing & (x < a + (y - b) * (c - a) / (d - b))
+    return inside

@@ -1,0 +1,265 @@
+"""A closed posture as pins, slides, bodies and loops in a plane."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.view.sketch.drawing_plane import DrawingPlane, joint_axes
+from crane.view.sketch.sketch_elements import (
+    SketchBody,
+    SketchCollar,
+    SketchMechanism,
+    SketchPin,
+    SketchSlide,
+)
+
+COINCIDENCE_TOLERANCE = 1e-9  # share of the drawing's size that is none
+_COLLAR_DISTANCE_SHARE = (
+    0.04  # share of the drawing's size within which a collar would hide beside a pin
+)
+_BARREL_LENGTH_SHARE = 0.82  # length of a barrel, as a share of the cylinder's shortest length
+_MIN_PIN_COSINE = 0.7  # cosine to the plane's normal above which an axis is drawn as a pin
+
+
+def project_mechanism(machine: Machine, q: Array, plane: DrawingPlane) -> SketchMechanism:
+    """The mechanism of a machine in a closed posture q (nq,), as a plane shows it."""
+    return _MechanismProjection(machine, q, plane).mechanism()
+
+
+class _MechanismProjection:
+    """Collects what a plane shows of a machine in one posture."""
+
+    def __init__(self, machine: Machine, q: Array, plane: DrawingPlane):
+        self.machine, self.plane, self.q = machine, plane, q
+        model = self.model = machine.model
+        data = self.data = model.createData()
+        pin.framesForwardKinematics(model, data, q)
+        self.origins = np.array([plane.project(placement.translation) for placement in data.oMi])
+        axes = joint_axes(machine, data)
+        self.axes, self.axis_cosines = plane.project(axes), np.abs(axes @ plane.normal)
+        self.parents = [int(parent) for parent in model.parents]
+        self.turns = [False] + [machine.unit(name) == "rad" for name in machine.joints]
+        chain_of = {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}
+        self.chains = [-1] + [chain_of.get(name, 0) for name in machine.joints]
+        self.tip_body, self.tip = 0, None
+        if machine.tip is not None:
+            frame = model.frames[machine.frame(machine.tip)]
+            self.tip_body = frame.parentJoint
+            self.tip = self._project_placement(self.tip_body, frame.placement)
+        self.tip_supports = set(model.supports[self.tip_body])
+        self.loop_frames = [
+            (int(joint), self._project_placement(joint, place))
+            for joint, place in machine.closure.equations.frames
+        ]
+        self.outer = self._find_outer_points()
+        everything = np.concatenate(
+            [np.array(body_points) for body_points in self.outer if body_points]
+        )
+        self.size = float(np.ptp(everything, axis=0).max()) or 1.0
+        self.points: list[list[Array]] = [[] for _ in self.parents]
+
+    def mechanism(self) -> SketchMechanism:
+        pins, collars = self._pins_and_collars()
+        for index, (joint, position) in enumerate(self.loop_frames):
+            self.points[joint].append(position)
+            if index % 2:
+                loop = self.machine.closure.equations.loops[index // 2]
+                pins.append(
+                    SketchPin(loop.name, self.loop_frames[index - 1][1], position, index // 2 + 1)
+                )
+        if self.tip is not None:
+            self.points[self.tip_body].append(self.tip)
+        slides = [
+            self._create_slide(i)
+            for i, is_revolute in enumerate(self.turns)
+            if i and not is_revolute
+        ]
+        bodies = [self._create_body(i) for i in range(1, len(self.parents))]
+        ground = [
+            (at, np.array([0.0, -1.0])) for at in _distinct_points(self.points[0], self.size)
+        ]
+        if self._has_base():
+            base_point, collar = self.outer[0][0], collars[0]
+            ground = [item for item in ground if np.abs(item[0] - collar.position).max() > 0]
+            upward_distance = collar.axis @ (self._farthest_point(1) - base_point)
+            ground.append((base_point, -np.sign(upward_distance or 1.0) * collar.axis))
+            if len(base_line := _distinct_points([base_point, collar.position], self.size)) > 1:
+                bodies.append(SketchBody(base_line, -1, False, base_point))
+        return SketchMechanism(
+            pins, collars, slides, bodies, ground, self._regions(), self.tip, self.size
+        )
+
+    def _project_placement(self, joint: int, placement: pin.SE3) -> Array:
+        return self.plane.project((self.data.oMi[joint] * placement).translation)
+
+    def _find_outer_points(self) -> list[list[Array]]:
+        """By body, where others hang on it: origins of joints, loops, the tip."""
+        outer_points: list[list[Array]] = [[] for _ in self.parents]
+        outer_points[0].append(
+            self.plane.project(np.zeros(3)) if self._has_base() else self.origins[1]
+        )
+        for joint, parent in enumerate(self.parents[1:], start=1):
+            if self.turns[joint]:
+                outer_points[parent].append(self.origins[joint])
+        for joint, position in self.loop_frames:
+            outer_points[joint].append(position)
+        if self.tip is not None:
+            outer_points[self.tip_body].append(self.tip)
+        return outer_points
+
+    def _farthest_point(self, joint: int) -> Array:
+        """The point of a body that lies farthest from its joint."""
+        position = self.origins[joint]
+        return max(
+            self.outer[joint], key=lambda x: float(np.abs(x - position).max()), default=position
+        )
+
+    def _has_base(self) -> bool:
+        """Whether the world's origin is where the machine stands: a turning axis goes through."""
+        first = self.origins[1]
+        axis = self.axes[1]
+        axis_offset = first - (first @ axis) * axis
+        return bool(
+            self.axis_cosines[1] < _MIN_PIN_COSINE
+            and np.linalg.norm(axis_offset)
+            < COINCIDENCE_TOLERANCE * self.machine.closure.characteristic_length
+        )
+
+    def _pins_and_collars(self) -> tuple[list[SketchPin], list[SketchCollar]]:
+        pins, collars = [], []
+        for joint in range(1, len(self.parents)):
+            if not self.turns[joint]:
+                continue
+            name, position = self.model.names[joint], self.origins[joint]
+            if self.axis_cosines[joint] >= _MIN_PIN_COSINE:
+                pins.append(SketchPin(name, position, position))
+            else:
+                axis = self.axes[joint] / np.linalg.norm(self.axes[joint])
+                position = self._collar_position(joint, axis)
+                collars.append(SketchCollar(name, position, axis))
+            self.points[self.parents[joint]].append(position)
+            self.points[joint].append(position)
+        return pins, collars
+
+    def _collar_position(self, joint: int, axis: Array) -> Array:
+        """The origin of a joint, or halfway along its axis where that hides beside a pin."""
+        position, parent = self.origins[joint], self.parents[joint]
+        pins = [*self.outer[joint], *([self.origins[parent]] if parent else [])]
+        previous_origin = self.origins[parent] if parent else self.outer[0][0]
+        axial_distances = [float((point - previous_origin) @ axis) for point in self.outer[joint]]
+        length = max(axial_distances, key=abs, default=0.0)
+        min_distance = _COLLAR_DISTANCE_SHARE * self.size
+        is_isolated = parent == 0 and not (joint == 1 and self._has_base())
+        if (
+            is_isolated
+            or abs(length) < min_distance
+            or all(np.linalg.norm(point - position) > min_distance for point in pins)
+        ):
+            return position
+        return position + (float((previous_origin - position) @ axis) + length / 2) * axis
+
+    def _create_slide(self, joint: int) -> SketchSlide:
+        """A prismatic joint between the inner end of its parent and the far end of its body."""
+        parent, position = self.parents[joint], self.origins[joint]
+        axis = self.axes[joint] / max(float(np.linalg.norm(self.axes[joint])), 1e-9)
+        outer = self.outer[joint] or [position]
+        column = self.model.joints[joint].idx_v
+        lower = float(self.machine.coordinates.lower[column])
+        upper = float(self.machine.coordinates.upper[column])
+        value = float(self.q[column])
+        chains = (self.chains[parent], self.chains[joint])
+        carries_tip, name = joint in self.tip_supports, self.model.names[joint]
+        if self.axis_cosines[joint] > _MIN_PIN_COSINE:  # it moves towards whoever looks
+            self.points[parent].append(position)
+            self.points[joint].append(position)
+            return SketchSlide(
+                name, position, position, position, position, *chains, carries_tip, is_rail=False
+            )
+        if parent == 0:
+            rail_half_length = 0.15 * self.size
+            offsets = (
+                [lower - value, upper - value]
+                if np.isfinite(upper - lower)
+                else [-rail_half_length, rail_half_length]
+            )
+            start, mouth = (position + offset * axis for offset in offsets)
+            self.points[joint] += [position]
+            return SketchSlide(
+                name,
+                start,
+                mouth,
+                position,
+                position,
+                chains[1],
+                chains[1],
+                carries_tip,
+                is_rail=True,
+            )
+        inner_coordinate = float((self.origins[parent] - position) @ axis)
+        end = max(
+            (float((x - position) @ axis) for x in outer), key=lambda s: abs(s - inner_coordinate)
+        )
+        sign, length = (1.0 if end >= inner_coordinate else -1.0), abs(end - inner_coordinate)
+        offsets = [sign * (limit - value) for limit in (lower, upper) if np.isfinite(limit)]
+        min_length = length + min(offsets) if offsets else 0.6 * length
+        max_length = length + max(offsets) if offsets else 1.4 * length
+        barrel = (
+            _BARREL_LENGTH_SHARE * min_length if min_length > 0.25 * max_length else 0.5 * length
+        )
+        inner_length = max(length - 0.9 * min_length, 0.0) + 0.05 * barrel
+        inner_length = min(inner_length, 0.94 * barrel)
+        start = position + inner_coordinate * axis
+        self.points[parent].append(start)
+        self.points[joint].append(position + end * axis)
+        return SketchSlide(
+            name,
+            start,
+            start + sign * barrel * axis,
+            start + sign * inner_length * axis,
+            position + end * axis,
+            *chains,
+            carries_tip,
+            is_rail=False,
+        )
+
+    def _create_body(self, joint: int) -> SketchBody:
+        centre_of_mass = self.data.oMi[joint].act(self.model.inertias[joint].lever)
+        return SketchBody(
+            _distinct_points(self.points[joint], self.size),
+            self.chains[joint],
+            joint in self.tip_supports,
+            self.plane.project(centre_of_mass),
+        )
+
+    def _regions(self) -> dict[int, Array]:
+        """Corners of what each loop encloses: its pin, then the pins on both ways back."""
+        regions = {}
+        for number in range(1, len(self.loop_frames) // 2 + 1):
+            (first_joint, position), (second_joint, _) = self.loop_frames[
+                2 * number - 2 : 2 * number
+            ]
+            paths = []
+            shared = set(self.model.supports[first_joint]) & set(self.model.supports[second_joint])
+            planar = True
+            for body in (second_joint, first_joint):
+                path = [j for j in reversed(list(self.model.supports[body])) if j not in shared]
+                planar &= all(self.axis_cosines[j] > 0.99 for j in path if self.turns[j])
+                paths.append([self.origins[j] for j in path if self.turns[j]])
+            corners = _distinct_points([position, *paths[0], *reversed(paths[1])], self.size)
+            if planar and len(corners) > 2:
+                regions[number] = corners
+        return regions
+
+
+def _distinct_points(points: Sequence[Array], size: float) -> Array:
+    """Points (k, 2) of a mechanism of some size without those that repeat an earlier one."""
+    distinct: list[Array] = []
+    for point in points:
+        if not any(
+            np.abs(point - other).max() < COINCIDENCE_TOLERANCE * size for other in distinct
+        ):
+            distinct.append(point)
+    return np.array(distinct).reshape(-1, 2)

@@ -1,0 +1,206 @@
+"""Lines and symbols of kinematic diagrams, in sizes that do not depend on the machine's."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
+from matplotlib.path import Path
+
+from crane.common.samples import Array
+from crane.view.plots.recording_figure import INK_COLOUR
+
+HullCorner = tuple[float, ...]
+
+GREY = "#8a8a8a"
+JOINT_MARKER: Any = {"marker": "o", "markersize": 6.5, "markerfacecolor": "white"}
+LOOP_MARKER: Any = {"marker": "o", "markersize": 10.0, "markerfacecolor": "white"}
+DOT_MARKER: Any = {"marker": "o", "markersize": 4.6, "markeredgewidth": 0.0}
+CENTRE_MARKER: Any = {"marker": "o", "markersize": 7.0, "markerfacecolor": "white"}
+QUARTER_MARKERS: list[Any] = [
+    {"marker": Path.wedge(start, start + 90), "markersize": 7.0, "markeredgewidth": 0.0}
+    for start in (0, 180)
+]
+TIP_MARKER: Any = {"marker": "+", "markersize": 17.0, "markeredgewidth": 1.3}
+
+
+class SketchCanvas:
+    """Draws onto axes in metres, with widths in points; remembers what labels must not cover.
+
+    Args:
+        axes: Axes of equal scales.
+        point_size: Length of a printer's point in the coordinates of the axes [m].
+
+    Attributes:
+        occupied_segments: Lines (2, 2) [m] that labels keep away from.
+        occupied_discs: Centres (2,) [m] and radii [points] of symbols that labels keep away from.
+    """
+
+    def __init__(self, axes: Axes, point_size: float):
+        self.axes, self.point_size = axes, point_size
+        self.occupied_segments: list[Array] = []
+        self.occupied_discs: list[tuple[Array, float]] = []
+
+    def draw_line(self, points: Array, colour: str, width: float, **options: Any) -> None:
+        """A line through points (k, 2) [m], its width in points."""
+        options = {"solid_capstyle": "round", "solid_joinstyle": "round"} | options
+        self.axes.plot(*points.T, color=colour, linewidth=width, **options)
+        self.occupied_segments += list(np.stack([points[:-1], points[1:]], axis=1))
+
+    def draw_polygon(
+        self, points: Array, colour: str, width: float, fill_opacity: float, z_order: float
+    ) -> None:
+        """A closed line around corners (k, 2) [m], filled with a tint of its colour."""
+        closed = np.vstack([points, points[:1]])
+        self.axes.add_patch(
+            Polygon(points, facecolor=colour, alpha=fill_opacity, linewidth=0, zorder=z_order)
+        )
+        self.draw_line(closed, colour, width, zorder=z_order)
+
+    def draw_box(
+        self, start: Array, end: Array, width: float, colour: str, z_order: float
+    ) -> None:
+        """A white rectangle about the line from start to end [m], its width in points."""
+        axis = (end - start) / max(float(np.linalg.norm(end - start)), 1e-12)
+        half_width = np.array([-axis[1], axis[0]]) * width / 2 * self.point_size
+        corners = np.array(
+            [start + half_width, end + half_width, end - half_width, start - half_width]
+        )
+        self.axes.add_patch(
+            Polygon(
+                corners,
+                facecolor="white",
+                edgecolor=colour,
+                linewidth=1.3,
+                joinstyle="round",
+                zorder=z_order,
+            )
+        )
+        closed = np.vstack([corners, corners[:1]])
+        self.occupied_segments += list(np.stack([closed[:-1], closed[1:]], axis=1))
+
+    def draw_joint(self, name: str, position: Array) -> None:
+        """A pin of the tree."""
+        self._draw_marker(position, 6.0, f"joint {name}", JOINT_MARKER)
+        self.occupied_discs.append((position, 4.0))
+
+    def draw_loop(self, name: str, position: Array, mate: Array) -> None:
+        """A pin that closes a loop: a ring where its first body has it, a dot for its second."""
+        self._draw_marker(position, 5.5, f"loop {name}", LOOP_MARKER)
+        self._draw_marker(mate, 6.5, f"loop {name} mate", DOT_MARKER)
+        self.occupied_discs.append((position, 6.0))
+
+    def draw_collar(self, name: str, position: Array, axis: Array) -> None:
+        """A joint that turns about a line in the plane, drawn with that line."""
+        axis_point = axis * self.point_size
+        self.draw_box(position - 7 * axis_point, position + 7 * axis_point, 11.0, INK_COLOUR, 4.5)
+        axis_line = np.array([position - 20 * axis_point, position + 20 * axis_point])
+        self.axes.plot(
+            *axis_line.T, color=INK_COLOUR, linewidth=0.8, linestyle=(0, (8, 2, 1.5, 2)), zorder=5
+        )
+        self._draw_marker(position, 4.0, f"joint {name}", DOT_MARKER | {"markersize": 0.1})
+        self.occupied_segments.append(axis_line)
+        self.occupied_discs.append((position, 7.0))
+
+    def draw_ground(
+        self, position: Array, down_direction: Array, ground_gap: float | None
+    ) -> None:
+        """What stands still: a support under a pin, or a hatched line below, so many points."""
+        lateral = np.array([-down_direction[1], down_direction[0]])
+        ground_point = (
+            position
+            + (11.0 if ground_gap is None else ground_gap) * self.point_size * down_direction
+        )
+        if ground_gap is None:
+            width = 7 * self.point_size * lateral
+            support = np.array([position, ground_point - width, ground_point + width])
+            self.axes.add_patch(
+                Polygon(support, facecolor="white", edgecolor=INK_COLOUR, linewidth=1.2, zorder=2)
+            )
+            self.occupied_segments += [support[[0, 1]], support[[0, 2]]]
+        self.draw_hatching(
+            ground_point - 15 * self.point_size * lateral,
+            ground_point + 15 * self.point_size * lateral,
+            down_direction,
+        )
+
+    def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
+        """A line from start to end [m], hatched on the side of the unit vector down."""
+        self.draw_line(np.array([start, end]), INK_COLOUR, 1.2, zorder=2)
+        direction = (end - start) / np.linalg.norm(end - start)
+        count = max(int(np.linalg.norm(end - start) / (5 * self.point_size)), 2)
+        for share in (np.arange(count) + 0.9) / count:
+            line_point = start + share * (end - start)
+            stroke = np.array(
+                [line_point, line_point + 6 * self.point_size * (down_direction - 0.8 * direction)]
+            )
+            self.axes.plot(*stroke.T, color=INK_COLOUR, linewidth=0.7, zorder=2)
+        offset = 3 * self.point_size * down_direction
+        self.occupied_segments.append(np.array([start + offset, end + offset]))
+        self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
+
+    def draw_centre_of_mass(self, position: Array) -> None:
+        """A circle with two black quarters."""
+        for z_order, style in zip((5.2, 5.3, 5.3), (CENTRE_MARKER, *QUARTER_MARKERS), strict=True):
+            self._draw_marker(position, z_order, "centre of mass", style)
+        self.occupied_discs.append((position, 4.5))
+
+    def draw_tip(self, position: Array) -> None:
+        """A cross whose arms stick out of whatever pin is there."""
+        self._draw_marker(position, 5.4, "tip", TIP_MARKER)
+        self.occupied_discs.append((position, 6.0))
+
+    def draw_number(self, number: int, position: Array) -> None:
+        """The number of a loop, within what it encloses."""
+        self.axes.text(
+            float(position[0]),
+            float(position[1]),
+            str(number),
+            ha="center",
+            va="center",
+            fontsize=7,
+            color="#555555",
+            zorder=7,
+            gid=f"number {number}",
+            bbox={
+                "boxstyle": "circle,pad=0.22", "facecolor": "white", "edgecolor": GREY,
+                "linewidth": 0.6,
+            },
+        )  # fmt: skip
+        self.occupied_discs.append((position, 7.5))
+
+    def _draw_marker(
+        self, position: Array, z_order: float, gid: str, style: dict[str, Any]
+    ) -> None:
+        self.axes.plot(*position[:, None], zorder=z_order, gid=gid, **marker_options(style))
+
+
+def marker_options(style: dict[str, Any]) -> dict[str, Any]:
+    """Options of a line that shows a symbol alone."""
+    default_style = {
+        "linestyle": "none",
+        "color": INK_COLOUR,
+        "markeredgecolor": INK_COLOUR,
+        "markeredgewidth": 1.2,
+    }
+    return default_style | style
+
+
+def convex_hull(points: Array) -> Array:
+    """Corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
+    ordered = sorted(map(tuple, points.tolist()))
+
+    def turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
+        (a, b), (c, d), (x, y) = one, two, three
+        return (c - a) * (y - b) - (d - b) * (x - a) > 0
+
+    def half(row: Sequence[HullCorner]) -> list[HullCorner]:
+        chain: list[HullCorner] = []
+        for corner in row:
+            while len(chain) > 1 and not turns_left(chain[-2], chain[-1], corner):
+                chain.pop()
+            chain.append(corner)
+        return chain[:-1]
+
+    return np.array(half(ordered) + half(ordered[::-1]) or ordered)

@@ -1,0 +1,366 @@
+"""The mechanism of a machine as a figure: what every text on it begins with."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+from numpy.typing import ArrayLike
+
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.view.plots.figure_text import escape_label
+from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
+from crane.view.sketch.drawing_plane import find_plane
+from crane.view.sketch.label_placement import SketchLabel, find_clear_point, place_labels
+from crane.view.sketch.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
+from crane.view.sketch.sketch_canvas import (
+    CENTRE_MARKER,
+    DOT_MARKER,
+    JOINT_MARKER,
+    LOOP_MARKER,
+    QUARTER_MARKERS,
+    SketchCanvas,
+    convex_hull,
+    marker_options,
+)
+from crane.view.sketch.sketch_elements import SketchBody, SketchMechanism, SketchPin, SketchSlide
+from crane.view.sketch.sketch_layout import create_sketch_layout, format_joint_symbol
+
+CHAIN_COLOURS = (
+    "#1f5fa8", "#d0661c", "#2f8050", "#8a4a9c", "#b03a48", "#2b8c9c", "#8c7a1e", "#5a5f66",
+)  # fmt: skip
+REGION_COLOURS = (
+    "#e4edf7",
+    "#fbeadb",
+    "#e2f1e4",
+    "#f0e6f4",
+    "#f9e4e6",
+    "#e0f0f3",
+    "#f3efd9",
+    "#ebecee",
+)
+GROUND_COLOUR, GHOST_COLOUR = "#777777", "#9a4d6f"
+_GHOST_DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 4)))
+_MIN_POLYGON_WIDTH = 7.0  # width below which a polygon is drawn as a line [points]
+_NUMBER_CLEARANCE = 9.0  # what the number of a loop needs around it [points]
+
+
+def sketch(
+    machine: Machine,
+    path: str | Path,
+    q_a: ArrayLike | None = None,
+    plane: str | None = None,
+    show_centres_of_mass: bool = False,
+    other_configurations: Sequence[Array] = (),
+) -> None:
+    """Write a sketch of the mechanism to a file.
+
+    Args:
+        machine: The machine.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        q_a: (n,) active coordinates within their limits [m], [rad]; home if not given.
+        plane: "xy", "xz" or "yz" to look along an axis of the world; the plane that the machine
+            moves in if not given.
+        show_centres_of_mass: Whether to mark the centres of mass.
+        other_configurations: Postures (nq,) to be drawn dashed behind it, such as other
+            assemblies.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+        InputError: Wrong shape or not finite, unknown view, or a machine that moves in no plane.
+        LimitError: A coordinate lies outside of its limits.
+        ClosureError: The loops cannot be closed there.
+    """
+    write_figure(
+        path,
+        lambda: sketch_figure(machine, q_a, plane, show_centres_of_mass, other_configurations),
+    )
+
+
+def sketch_figure(
+    machine: Machine,
+    q_a: ArrayLike | None = None,
+    plane: str | None = None,
+    show_centres_of_mass: bool = False,
+    other_configurations: Sequence[Array] = (),
+) -> Figure:
+    """The figure of a mechanism; see `sketch`.
+
+    Bodies are lines and polygons between their pins in the colours of the sub-chains, those that
+    carry the tip with wider lines. Pins of the tree are circles, pins that close a loop are rings
+    with a dot, joints about a line in the plane are boxes on that line, prismatic joints are
+    cylinders. Each loop has a number and a tint. Axes are equal, in metres.
+    """
+    if machine.coordinates.floating_base_columns:
+        columns = [at + i for at in machine.coordinates.floating_base_columns for i in range(6)]
+        lock_options = " ".join(
+            f"--lock {machine.joints[i]}={machine.home[i]:.6g}" for i in columns
+        )
+        raise InputError(f"'{machine.name}' floats, sketch it where it is held: {lock_options}")
+    q = machine.home
+    if q_a is not None:
+        q = machine.closure.solve(machine.check_limits(q_a))
+    drawing_plane = find_plane(machine, q, plane)
+    mechanism = project_mechanism(machine, q, drawing_plane)
+    ghosts = [project_mechanism(machine, other, drawing_plane) for other in other_configurations]
+    with mpl.rc_context(FIGURE_STYLE):
+        legend = _legend(machine, show_centres_of_mass) + [
+            (_ghost_line(i),) for i in range(len(ghosts))
+        ]
+        figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
+        _draw_regions(canvas, mechanism)
+        for i, ghost in enumerate(ghosts):
+            _draw_ghost(canvas, ghost, mechanism, i)
+        for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
+            _draw_body(canvas, body)
+        for slide in mechanism.slides:
+            _draw_slide(canvas, slide)
+        for position, down_direction in mechanism.ground:
+            canvas.draw_ground(
+                position, down_direction, _ground_gap(mechanism, position, down_direction)
+            )
+        for item in mechanism.collars:
+            canvas.draw_collar(item.name, item.position, item.axis)
+        if show_centres_of_mass:
+            _draw_centres(canvas, mechanism)
+        if mechanism.tip is not None:
+            canvas.draw_tip(mechanism.tip)
+        _draw_pins(canvas, mechanism)
+        _number_regions(canvas, mechanism)
+        place_labels(canvas, _create_labels(mechanism))
+    return figure
+
+
+def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, ...]]:
+    """One entry per sub-chain and per kind of symbol, each of lines on top of each other."""
+    entries: list[tuple[Line2D, ...]] = []
+    for i, chain in enumerate(machine.chains):
+        if not chain.joints:
+            continue  # nothing has its colour
+        colour = CHAIN_COLOURS[i % len(CHAIN_COLOURS)]
+        entries.append(
+            (Line2D([], [], color=colour, linewidth=3.0, label=escape_label(chain.name)),)
+        )
+    symbols: dict[str, list[Any]] = {"joint": [JOINT_MARKER], "loop": [LOOP_MARKER, DOT_MARKER]}
+    if show_centres_of_mass:
+        symbols["centre of mass"] = [CENTRE_MARKER, *QUARTER_MARKERS]
+    for name, styles in symbols.items():
+        if name != "loop" or machine.closure.equations.loops:
+            entries.append(
+                tuple(Line2D([], [], label=name, **marker_options(look)) for look in styles)
+            )
+    return entries
+
+
+def _ghost_line(index: int, points: Array | None = None) -> Line2D:
+    """A dashed line in the look of another assembly, without points that of the legend."""
+    x, y = np.zeros((2, 0)) if points is None else points.T
+    label = f"other assembly {index + 1}"
+    style = _GHOST_DASHES[index % len(_GHOST_DASHES)]
+    return Line2D(
+        x, y, color=GHOST_COLOUR, linewidth=1.1, linestyle=style, label=label, zorder=2.2
+    )
+
+
+def _draw_ghost(
+    canvas: SketchCanvas, ghost: SketchMechanism, home_mechanism: SketchMechanism, index: int
+) -> None:
+    """The lines of another assembly, of what is elsewhere than at home."""
+    outlines = [
+        (x.points, y.points) for x, y in zip(ghost.bodies, home_mechanism.bodies, strict=True)
+    ]
+    for ghost_slide, home_slide in zip(ghost.slides, home_mechanism.slides, strict=True):
+        outlines.append(
+            (
+                np.array([ghost_slide.start, ghost_slide.rod_outer_end]),
+                np.array([home_slide.start, home_slide.rod_outer_end]),
+            )
+        )
+    for ghost_points, home_points in outlines:
+        if (
+            len(ghost_points) < 2
+            or np.abs(ghost_points - home_points).max() < 1e-6 * home_mechanism.size
+        ):
+            continue
+        corners = convex_hull(ghost_points)
+        if len(corners) > 2:
+            corners = np.vstack([corners, corners[:1]])
+        line = _ghost_line(index, corners)
+        line.set_gid(f"assembly {index + 1}")
+        canvas.axes.add_line(line)
+
+
+def _draw_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
+    """A tint in what each loop encloses, the small ones above the large."""
+    for number, corners in sorted(
+        mechanism.regions.items(), key=lambda item: -_polygon_area(item[1])
+    ):
+        colour = REGION_COLOURS[(number - 1) % len(REGION_COLOURS)]
+        canvas.axes.add_patch(Polygon(corners, facecolor=colour, linewidth=0, zorder=1))
+
+
+def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
+    for number, corners in mechanism.regions.items():
+        smaller = [
+            other for i, other in mechanism.regions.items() if i != number
+            and _polygon_area(other) < _polygon_area(corners)
+        ]  # fmt: skip
+        lines = [
+            *canvas.occupied_segments,
+            *(np.array([position, position]) for position, _ in canvas.occupied_discs),
+        ]
+        lines += list(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+        number_position, clearance = find_clear_point(corners, lines, smaller)
+        if clearance > _NUMBER_CLEARANCE * canvas.point_size:
+            canvas.draw_number(number, number_position)
+
+
+def _ground_gap(
+    mechanism: SketchMechanism, position: Array, down_direction: Array
+) -> float | None:
+    """How far below a point the ground is [points]; None for a pin, which has a support."""
+    tolerance = COINCIDENCE_TOLERANCE * mechanism.size
+    if any(
+        np.abs(drawn_pin.position - position).max() < tolerance for drawn_pin in mechanism.pins
+    ):
+        return None
+    is_on_collar = any(
+        np.abs(item.position - position).max() < tolerance for item in mechanism.collars
+    )
+    return 7.0 if is_on_collar else 0.0
+
+
+def _draw_centres(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
+    for body in mechanism.bodies:
+        if body.chain >= 0:
+            canvas.draw_centre_of_mass(body.centre_of_mass)
+
+
+def _draw_pins(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
+    for drawn_pin in mechanism.pins:
+        if drawn_pin.loop_number:
+            canvas.draw_loop(drawn_pin.name, drawn_pin.position, drawn_pin.mate_position)
+        else:
+            canvas.draw_joint(drawn_pin.name, drawn_pin.position)
+
+
+def _draw_body(canvas: SketchCanvas, body: SketchBody) -> None:
+    colour = GROUND_COLOUR if body.chain < 0 else CHAIN_COLOURS[body.chain % len(CHAIN_COLOURS)]
+    z_order, points = 2.6 if body.carries_tip else 2.4, body.points
+    if len(points) < 2:
+        return
+    if _extent_across(points) >= _MIN_POLYGON_WIDTH * canvas.point_size:
+        canvas.draw_polygon(
+            convex_hull(points), colour, 2.6 if body.carries_tip else 1.8, 0.22, z_order
+        )
+        return
+    direction = np.linalg.svd(points - points.mean(axis=0))[2][0]
+    length = float(np.ptp(points @ direction)) / canvas.point_size
+    width = min(4.2 if body.carries_tip else 2.6, length / 2)
+    canvas.draw_line(points[np.argsort(points @ direction)], colour, width, zorder=z_order)
+
+
+def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
+    colour, rod_colour = (
+        CHAIN_COLOURS[i % len(CHAIN_COLOURS)] for i in (slide.barrel_chain, slide.rod_chain)
+    )
+    point, barrel = canvas.point_size, slide.mouth - slide.start
+    if not barrel.any():  # seen along its axis
+        half_width = np.array([5.0, 0.0]) * point
+        canvas.draw_box(slide.start - half_width, slide.start + half_width, 10.0, rod_colour, 3)
+        return
+    direction = barrel / np.linalg.norm(barrel)
+    if slide.is_rail:
+        down_direction = np.array([direction[1], -direction[0]])
+        down_direction = down_direction * (-1.0 if down_direction[1] > 0 else 1.0)
+        canvas.draw_hatching(
+            slide.start + 7 * point * down_direction,
+            slide.mouth + 7 * point * down_direction,
+            down_direction,
+        )
+        canvas.draw_box(
+            slide.rod_inner_end - 11 * point * direction,
+            slide.rod_inner_end + 11 * point * direction,
+            14,
+            rod_colour,
+            3,
+        )
+        return
+    width = 10.0 if slide.carries_tip else 8.0
+    canvas.draw_box(slide.start, slide.mouth, width, colour, 3)
+    canvas.draw_line(
+        np.array([slide.rod_inner_end, slide.rod_outer_end]),
+        rod_colour,
+        3.4 if slide.carries_tip else 2.2,
+        zorder=3.2,
+    )
+    piston_half = np.array([-direction[1], direction[0]]) * (width / 2 - 1.4) * point
+    piston = np.array([slide.rod_inner_end - piston_half, slide.rod_inner_end + piston_half])
+    canvas.axes.plot(*piston.T, color=rod_colour, linewidth=3.0, solid_capstyle="butt", zorder=3.3)
+
+
+def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
+    """One label per joint, loop and tip; joints at the same pin share one."""
+    labels = []
+    remaining = [shown for shown in mechanism.pins if not shown.loop_number]
+    while remaining:
+        tolerance = 0.002 * mechanism.size
+        coincident = [
+            other
+            for other in remaining
+            if np.abs(other.position - remaining[0].position).max() < tolerance
+        ]
+        text = ", ".join(format_joint_symbol(name) for name in _sorted_names(coincident))
+        labels.append(SketchLabel(text, remaining[0].position, 4.0, "label"))
+        remaining = [other for other in remaining if other not in coincident]
+    for drawn_pin in mechanism.pins:
+        if drawn_pin.loop_number:
+            number_text = (
+                chr(0x2460 + drawn_pin.loop_number - 1)
+                if drawn_pin.loop_number <= 20
+                else f"({drawn_pin.loop_number})"
+            )
+            labels.append(
+                SketchLabel(
+                    f"{number_text} {format_joint_symbol(drawn_pin.name)}",
+                    drawn_pin.position,
+                    6.0,
+                    "label",
+                )
+            )
+    labels += [
+        SketchLabel(format_joint_symbol(item.name), item.position, 8.0, "label")
+        for item in mechanism.collars
+    ]
+    for slide in mechanism.slides:
+        middle = slide.rod_inner_end if slide.is_rail else (slide.start + slide.mouth) / 2
+        labels.append(SketchLabel(format_joint_symbol(slide.name), middle, 6.0, "label"))
+    if mechanism.tip is not None:
+        labels.append(SketchLabel("tip", mechanism.tip, 7.0, "label tip"))
+    return labels
+
+
+def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
+    """Names with their numbers in order, q2 before q10."""
+    return sorted(
+        (drawn_pin.name for drawn_pin in pins),
+        key=lambda name: [(x.isdigit(), x.zfill(9)) for x in re.split(r"(\d+)", name)],
+    )
+
+
+def _extent_across(points: Array) -> float:
+    """Extent (m) of points (k, 2) across the line through them."""
+    normal = np.linalg.svd(points - points.mean(axis=0))[2][-1]
+    return float(np.ptp(points @ normal))
+
+
+def _polygon_area(corners: Array) -> float:
+    x, y = corners.T
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
