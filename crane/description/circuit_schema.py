@@ -175,8 +175,8 @@ _ONE_CYLINDER = "one cylinder of a sliding joint"
 CYLINDER = section_schema(
     "cylinder of",
     {
-        "area_a": NumberKey("area of chamber A, of all `count` cylinders together"),
-        "area_b": NumberKey("area of chamber B, of all `count` cylinders together"),
+        "area_a": NumberKey("$A_A$ of all `count` cylinders together"),
+        "area_b": NumberKey("$A_B$ of all `count` cylinders together"),
         "bore": NumberKey(f"diameter of the piston of {_ONE_CYLINDER}, instead of the areas", "m"),
         "rod": NumberKey(
             f"diameter of the rod of {_ONE_CYLINDER}, with `bore`", "m", minimum=0.0, default=0.0
@@ -185,8 +185,8 @@ CYLINDER = section_schema(
         "tube": NumberKey(
             "outer diameter of the tube, for [buckling](reactions.md#buckling); 0: not known"
         ),
-        "hose_a": NumberKey("dead volume of chamber A: hoses and fittings"),
-        "hose_b": NumberKey("dead volume of chamber B: hoses and fittings"),
+        "hose_a": NumberKey("$V_{hA}$: hoses and fittings"),
+        "hose_b": NumberKey("$V_{hB}$: hoses and fittings"),
         **_LOSS_KEYS,
         "cushion": NumberKey("length at both ends where the outflow is throttled; 0: none"),
         "cushion_coefficient": NumberKey("coefficient of the throttle at the very end"),
@@ -222,7 +222,9 @@ MOTOR = section_schema(
 )  # fmt: skip
 _SPOOL_KEYS: dict[str, Key] = {
     "neutral": NumberKey("signal of the middle position", "V"),
-    "full": NumberKey("signal of the full stroke", "V"),
+    "full": NumberKey(
+        "signal of $u = 1$; $u = (U - \\text{neutral}) / (\\text{full} - \\text{neutral})$", "V"
+    ),
     "dead_band": NumberKey("share of the stroke without flow"),
     "bandwidth": NumberKey("natural frequency of the spool; 0: follows at once"),
     "damping": NumberKey("damping ratio of the spool"),
@@ -250,18 +252,25 @@ VALVE = section_schema(
         "c4": _edge("edge from the supply to B"),
         "margin": NumberKey(
             "pressure drop that the compensator of a compensated valve keeps",
+            default_text="required for `compensated`",
             zero_error="'{key}' is 0, give the pressure drop that is kept",
         ),
         "flow": NumberKey(
-            "flow of a compensated valve at full stroke, instead of `c1` to `c4`", "m3/s",
+            "flow of a compensated valve at full stroke, instead of `c1` to `c4`; "
+            "$c_1 = c_4 = \\text{flow} / \\sqrt{\\text{margin}}$",
+            "m3/s",
             minimum=0.0, zero_error="'{key}' is 0, give the flow at full stroke",
         ),
         "meter_out": NumberKey(
-            "edges to the tank, with `flow`", _COEFFICIENT, minimum=0.0,
+            "$c_2 = c_3$, with `flow`", _COEFFICIENT, minimum=0.0,
             default_text="flow / √margin",
         ),
         **_SPOOL_KEYS,
-        "spool_b": SectionKey("second spool, of chamber B, with its own signal", section=SPOOL),
+        "spool_b": SectionKey(
+            "second spool, of chamber B, with a signal of its own; keys that are not given are "
+            "those of the first, `{}` for all ([two spools](hydraulics.md#two-spools-dead-time))",
+            section=SPOOL,
+        ),
         "centre": _edge("open centre at rest; 0: closed"),
         "demand": NumberKey("share of the flow that it asks of a pump with positive control"),
         "regeneration": NumberKey("check valve from B to A while A is fed; 0: none"),

@@ -1,11 +1,11 @@
 """The JSON Schema of machine files, by which editors complete and check them."""
 
-import math
+import json
+from pathlib import Path
 from typing import Any
 
 from crane.description.key_types import (
     REQUIRED,
-    FileKey,
     FlagKey,
     Key,
     ListKey,
@@ -20,105 +20,134 @@ from crane.description.key_types import (
 )
 from crane.description.machine_schema import EXTENDS_KEY, MACHINE
 
-SCHEMA_FILE = "machine_file.schema.json"
-_NUMBER_PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*$"  # PyYAML reads 2e5 as text
-_NULL = {"type": "null"}
+SCHEMA_PATH = Path(__file__).with_name("machine_file.schema.json")  # shipped with the package
+_NUMBER_PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*$"  # YAML 1.1 reads 2e5 as text
 
 
-def machine_file_schema() -> dict[str, Any]:
+def schema_text() -> str:
     """The JSON Schema (draft 2020-12) of machine files.
 
     A file with the key `extends` needs no other key, and may remove keys by empty values.
     """
-    return {
+    definitions = _Definitions()
+    schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Machine file of crane",
-        "if": {"type": "object", "required": [EXTENDS_KEY]},
-        "then": _section(MACHINE, is_partial=True),
-        "else": _section(MACHINE, is_partial=False),
-        "$defs": {"number": {"type": ["number", "string"], "pattern": _NUMBER_PATTERN}},
-    }
-
-
-def _section(section: SectionSchema, is_partial: bool) -> dict[str, Any]:
-    """A mapping with the keys of a section; partial ones need none."""
-    schema: dict[str, Any] = {
+        "title": "machine file of crane",
         "type": "object",
-        "properties": {name: _described(key, is_partial) for name, key in section.keys.items()},
-        "additionalProperties": False
-        if section.others is None
-        else _value(section.others, is_partial),
+        "if": {"type": "object", "required": [EXTENDS_KEY]},
+        "then": definitions.section("variant", MACHINE, is_partial=True),
+        "else": definitions.section("machine", MACHINE, is_partial=False),
+        "$defs": definitions.schemas,
     }
-    optional = {x for pair in section.exclusive for group in pair[:2] for x in group}
-    required = [
-        name
-        for name, key in section.keys.items()
-        if key.default is REQUIRED and name not in optional
-    ]
-    if required and not is_partial:
-        schema["required"] = required
-    excluded = [
-        {"not": {"required": [key, other]}}
-        for first, second, _ in section.exclusive
-        for key in first
-        for other in second
-    ]
-    return schema | ({"allOf": excluded} if excluded else {})
+    return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 
-def _described(key: Key, is_partial: bool) -> dict[str, Any]:
-    """The value of a key with its text, unit, usual range and default."""
-    description = key.text
-    if isinstance(key, NumberKey):
-        description += f" [{key.units}]" if key.units else ""
-        if key.plausible is not None:
-            description += f"; usual: {key.plausible.lower:g} to {key.plausible.upper:g}"
-    schema = _value(key, is_partial)
-    if is_partial or isinstance(key, SectionKey | MapKey | ListKey | NameListKey):
-        schema = {"anyOf": [schema, _NULL]} if is_partial or key.default is None else schema
-    schema = {"description": description} | schema
-    if isinstance(key.default, str | float | int) and key.default != "":
-        schema["default"] = key.default
-    return schema
+class _Definitions:
+    """Schemas of sections, each once.
+
+    Attributes:
+        schemas: By name.
+    """
+
+    def __init__(self) -> None:
+        self.schemas: dict[str, Any] = {
+            "number": {"type": ["number", "string"], "pattern": _NUMBER_PATTERN},
+            "number_or_none": {"type": ["number", "string", "null"], "pattern": _NUMBER_PATTERN},
+        }
+        self._names: dict[tuple[int, bool], str] = {}
+
+    def section(self, name: str, section: SectionSchema, is_partial: bool) -> dict[str, Any]:
+        """A reference to the schema of a section; a partial one requires no key."""
+        place = (id(section), is_partial)
+        if place not in self._names:
+            name += "_variant" * (is_partial and name != "variant")
+            while name in self.schemas:
+                name += "_"
+            self._names[place], self.schemas[name] = name, {}
+            self.schemas[name] = self._section(section, is_partial)
+        return {"$ref": f"#/$defs/{self._names[place]}"}
+
+    def _section(self, section: SectionSchema, is_partial: bool) -> dict[str, Any]:
+        exclusive = {x for pair in section.exclusive for group in pair[:2] for x in group}
+        required = [
+            name
+            for name, key in section.keys.items()
+            if key.default is REQUIRED and name not in exclusive and not is_partial
+        ]
+        others = section.others and self._value("", section.others, is_partial)
+        excluded = {
+            key: {"not": {"anyOf": [{"required": [other]} for other in second]}}
+            for first, second, _ in section.exclusive
+            for key in first
+        }
+        return {
+            "type": ["object", "null"],
+            "properties": {
+                name: self._described(name, key, is_partial) for name, key in section.keys.items()
+            },
+            "additionalProperties": others or False,
+            "required": required,
+            "dependentSchemas": excluded,
+        }
+
+    def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
+        """The value of a key with its text, unit, usual range and default."""
+        text = key.text
+        if isinstance(key, NumberKey) and key.units:
+            text += f" [{key.units}]"
+        if isinstance(key, NumberKey) and key.plausible is not None:
+            text += f", usual: {key.plausible.lower:g} to {key.plausible.upper:g}"
+        is_structure = isinstance(key, SectionKey | MapKey | ListKey)
+        value = self._value(name, key, is_partial)
+        if is_partial or (is_structure and key.default is None):
+            value = _nullable(value)
+        has_default = isinstance(key.default, str | float) and key.default != ""
+        return {"description": text, **value} | ({"default": key.default} if has_default else {})
+
+    def _value(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
+        """The values that a key may have."""
+        match key:
+            case SectionKey():
+                return self.section(name, key.section, is_partial) | {"type": "object"}
+            case MapKey():
+                item = self._value(name, key.item, is_partial or key.has_common_item)
+                item = _nullable(item) if is_partial else item
+                return {"type": "object", "additionalProperties": item}
+            case ListKey():
+                return {"type": "array", "items": self._value(name, key.item, False)}
+            case VariantKey():
+                return {"anyOf": [self._value(name, x, False) for x in key.types]}
+            case FlagKey():
+                return {"enum": [True, False, "yes", "no", "on", "off", "true", "false"]}
+            case NameListKey():
+                return _array({"type": "string"}, key.size) | {"uniqueItems": True}
+            case NumberListKey():
+                return _array(_number(key), key.size)
+            case RowListKey():
+                return _array(_array(_number(key), key.size), None)
+            case NumberKey():
+                return _number(key)
+        return {"enum": [*key.choices]} if key.choices else {"type": "string", "minLength": 1}
 
 
-def _value(key: Key, is_partial: bool) -> dict[str, Any]:
-    """The values that a key may have."""
-    match key:
-        case SectionKey():
-            return _section(key.section, is_partial)
-        case MapKey():
-            item = _value(key.item, is_partial or key.has_common_item)
-            item = {"anyOf": [item, _NULL]} if is_partial else item
-            return {"type": "object", "additionalProperties": item}
-        case ListKey():
-            return {"type": "array", "items": _value(key.item, is_partial=False)}
-        case VariantKey():
-            return {"anyOf": [_value(x, is_partial) for x in key.types]}
-        case FlagKey():
-            return {"enum": [True, False, "yes", "no", "on", "off", "true", "false"]}
-        case NameListKey():
-            return _array({"type": "string", "minLength": 1}, key.size) | {"uniqueItems": True}
-        case NumberListKey():
-            return _array(_number(key), key.size)
-        case RowListKey():
-            return _array(_array(_number(key), key.size), None)
-        case NumberKey():
-            return _number(key)
-        case FileKey():
-            return {"type": "string", "minLength": 1}
-    return {"enum": list(key.choices)} if key.choices else {"type": "string", "minLength": 1}
+def _nullable(value: dict[str, Any]) -> dict[str, Any]:
+    """The same values, or none at all; in the terms of the type, for clear errors."""
+    if "type" in value:
+        return value | {"type": [value["type"], "null"]}
+    if "enum" in value:
+        return value | {"enum": [*value["enum"], None]}
+    if "anyOf" in value:
+        return value | {"anyOf": [*value["anyOf"], {"type": "null"}]}
+    return value | {"$ref": "#/$defs/number_or_none"}
 
 
 def _number(key: NumberKey) -> dict[str, Any]:
-    schema: dict[str, Any] = {"$ref": "#/$defs/number"}
-    if key.is_positive or key.zero_error and key.minimum == 0:
-        schema["exclusiveMinimum"] = 0
-    elif key.minimum is not None and math.isfinite(key.minimum):
-        schema["minimum"] = key.minimum
-    return schema
+    bounds: dict[str, Any] = {} if key.minimum is None else {"minimum": key.minimum}
+    if key.is_positive or (key.zero_error and key.minimum == 0):
+        bounds = {"exclusiveMinimum": 0}
+    return {"$ref": "#/$defs/number", **bounds}
 
 
 def _array(items: dict[str, Any], size: int | None) -> dict[str, Any]:
-    bounds = {"minItems": 1} if size is None else {"minItems": size, "maxItems": size}
-    return {"type": "array", "items": items} | bounds
+    bounds = {} if size is None else {"minItems": size, "maxItems": size}
+    return {"type": "array", "items": items, **bounds}
