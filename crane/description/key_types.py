@@ -160,13 +160,8 @@ class SectionSchema:
         values = {}
         for name, key in self.keys.items():
             value = getattr(item, key.attribute or name, key.default)
-            if name in excluded or value in (key.default, None, ""):
-                continue
-            values[name] = (
-                key.section.values_of(value)
-                if isinstance(key, SectionKey)
-                else _plain_value(value)
-            )
+            if name not in excluded and value not in (key.default, None, "", (), {}):
+                values[name] = _plain_value(value, key)
         return values
 
 
@@ -224,8 +219,16 @@ def _completed(key: Key, name: str, entry: Any, component: str) -> Key:
     return dataclasses.replace(key, **changes)
 
 
-def _plain_value(value: Any) -> Any:
+def _plain_value(value: Any, key: Key) -> Any:
     """A value as YAML has it."""
+    if isinstance(key, SectionKey):
+        return key.section.values_of(value)
+    item = getattr(key, "item", key)
     if isinstance(value, Mapping):
-        return {name: _plain_value(item) for name, item in value.items()}
-    return [_plain_value(item) for item in value] if isinstance(value, list | tuple) else value
+        return {name: _plain_value(part, item) for name, part in value.items()}
+    if not isinstance(value, list | tuple):
+        return value
+    parts = [_plain_value(part, item) for part in value]
+    if isinstance(key, MapKey):  # objects that have the name
+        return {each.joint: part for each, part in zip(value, parts, strict=True)}
+    return parts

@@ -67,7 +67,13 @@ COUPLING = section_schema(
     "coupling",
     {
         "name": TextKey("name of the coupling, unique", default=REQUIRED),
-        "joints": MapKey("factors of two joints at least", _FACTOR, "joint", default=REQUIRED),
+        "joints": MapKey(
+            "factors of two joints at least",
+            _FACTOR,
+            "joint",
+            default=REQUIRED,
+            attribute="factors",
+        ),
         "offset": NumberKey("value of the sum", *_COORDINATE, default=0.0),
     },
 )
@@ -92,7 +98,10 @@ FRICTION = section_schema(
             "$v_{St}$, velocity over which stiction vanishes", "m/s", "rad/s", minimum=0.0,
             zero_error="'{key}' of {title} is 0, give a velocity",
         ),
-        "drives": FlagKey("whether an offset larger than its mean is meant", default=False),
+        "drives": FlagKey(
+            "whether an offset larger than its mean is meant", default=False,
+            attribute="is_driving",
+        ),
     },
     Friction,
 )  # fmt: skip
@@ -284,6 +293,7 @@ MACHINE = section_schema(
             default_text="none: fixed to the world",
         ),
         "loops": ListKey("joints that close the chains", SectionKey(section=LOOP)),
+        "couplings": ListKey("linear constraints of joints", SectionKey(section=COUPLING)),
         "active": NameListKey(
             "driven joints, in the order of $q_A$; more than degrees of freedom share the load",
             default_text="those of the best condition, with a warning",
@@ -314,13 +324,14 @@ MACHINE = section_schema(
         "soil": SectionKey("soil that cutters cut", section=SOIL),
         "cutters": ListKey("edges of blades and buckets", SectionKey(section=CUTTER)),
         "supports": NameListKey("links that it stands on", default_text="the contacts"),
-        "pins": MapKey("largest force that a pin bears", _PIN, "joint or loop"),
+        "pins": MapKey(
+            "largest force that a pin bears", _PIN, "joint or loop", attribute="pin_capacities"
+        ),
         "end_stops": MapKey("end stops", SectionKey(section=END_STOP), "joint"),
         "rotor_inertia": MapKey(
             "inertia of motors' rotors, seen from the joint",
             NumberKey("", "kg", "kg m2", minimum=0.0), "joint", default_text="0 each",
         ),
-        "couplings": ListKey("linear constraints of joints", SectionKey(section=COUPLING)),
         "tip": TextKey("frame that paths and plots are about; a link that moves"),
         "payload": SectionKey(
             "load that `payload.mass` puts on the tip", section=PAYLOAD,

@@ -6,7 +6,7 @@ import string
 import warnings
 from typing import Any
 
-from crane.common.errors import CraneWarning, suggest_names
+from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS, VALVE_TYPES
 from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
@@ -129,41 +129,34 @@ def circuit_locations(top: YamlSection) -> dict[str, str]:
     section = top.section("hydraulics")
     if section is None:
         return {}
-    locations = {f"supply {MAIN_PUMP}": section.source_location("supply")}
-    for key, kind in _NODE_SECTIONS.items():
-        outer = section.section(key)
-        if outer is not None:
-            locations |= {f"{kind} {name}": outer.source_location(name) for name in outer}
-    return locations
+    return {f"supply {MAIN_PUMP}": section.source_location("supply")} | {
+        f"{kind} {name}": location
+        for key, kind in _NODE_SECTIONS.items()
+        for name, location in section.item_locations(key).items()
+    }
 
 
-def _check_connections(section: YamlSection, hydraulics: Hydraulics) -> None:
+def _check_connections(section: YamlSection, circuit: Hydraulics) -> None:
     """Report nodes that nothing is connected to, and returns without a way to the tank."""
-    connected, drained_nodes = connected_nodes(hydraulics), nodes_draining_to_tank(hydraulics)
-    nodes = [(kind, key) for key, kind in _NODE_SECTIONS.items() if key in section]
-    for kind, key in nodes:
-        outer = section.section(key)
-        for name in outer or ():
-            assert outer is not None
-            if name in connected:
-                continue
-            hint = "'supply' of a valve or 'from'" if key == "supplies" else "'from' or 'to'"
-            problem = f"nothing is joined to the {kind} '{name}', name it as {hint} of an element"
-            report_error(outer.error_at(name, f"{problem}, or remove it"), harmless=True)
-    outer = section.section("lines")
-    for name in outer or ():
-        assert outer is not None
-        returning_joints = [
-            joint
-            for joint, valve in hydraulics.valves.items()
-            if name in (valve.return_a, valve.return_b)
+    problems = []
+    connected, drained_nodes = connected_nodes(circuit), nodes_draining_to_tank(circuit)
+    for key, kind in _NODE_SECTIONS.items():
+        hint = "'supply' of a valve or 'from'" if key == "supplies" else "'from' or 'to'"
+        problems += [
+            f"{location}: nothing is joined to the {kind} '{name}', name it as {hint} of an "
+            "element, or remove it"
+            for name, location in section.item_locations(key).items()
+            if name not in connected
         ]
-        if returning_joints and name not in drained_nodes:
-            problem = (
-                f"what {' and '.join(returning_joints)} give into the line '{name}' never gets "
-                f"to the tank, add an element from '{name}' to 'tank'"
+    for name, location in section.item_locations("lines").items():
+        returning = [x for x, y in circuit.valves.items() if name in (y.return_a, y.return_b)]
+        if returning and name not in drained_nodes:
+            problems.append(
+                f"{location}: what {' and '.join(returning)} give into the line '{name}' never "
+                f"gets to the tank, add an element from '{name}' to 'tank'"
             )
-            report_error(outer.error_at(name, problem), harmless=True)
+    for problem in problems:
+        report_error(DescriptionError(problem), harmless=True)
 
 
 def check_active_joint(joint: str, item: YamlSection, active: tuple[str, ...]) -> None:

@@ -5,7 +5,8 @@ from typing import Any
 
 from crane.common.errors import InputError
 from crane.description.estimation_settings import EstimationSettings, ParameterPrior, TermValues
-from crane.formats.machine_file.yaml_section import YamlSection, as_boolean, as_float
+from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_values import as_boolean, as_float
 from crane.machine import Machine
 
 _TERM_HINT = "on, off, a number or a list of numbers"

@@ -21,7 +21,7 @@ def read_friction(top: YamlSection, tree: TreeBuilder) -> dict[str, Friction]:
     def read_law(joint: str, item: YamlSection) -> Friction:
         tree.check_joint(joint, item.source_location())
         values = item.values()
-        is_drive_intended = values.pop("drives", False)
+        is_drive_intended = values.pop("is_driving", False)
         law = Friction(**values)
         if not is_drive_intended:
             _warn_about_drive(joint, law, item.source_location())

@@ -136,9 +136,9 @@ def _read_machine(path: Path) -> MachineSpec:
     locations = {key: top.source_location(key) for key in top} | source_locations(loops, couplings)
     home, home_locations = read_home(top, tree)
     locations |= home_locations
-    rotor_inertias: dict[str, float] = {}
-    with error_recovery(harmless=True):
-        rotor_inertias = top.value_map("rotor_inertia", YamlSection.number, tree.check_joint)
+    rotor_inertias = _read_or_default(
+        top.value_map, {}, "rotor_inertia", YamlSection.number, tree.check_joint
+    )
     friction |= _read_or_default(read_friction, {}, top, tree)
     forces = springs + _read_or_default(read_forces, (), top, tree)
     gas_springs = _read_or_default(read_gas_springs, (), top, tree)

@@ -11,34 +11,26 @@ from lxml import etree
 from crane.common.atomic_output import portable_file_name, replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
 from crane.description.circuit_schema import (
-    ACCUMULATOR,
     BORE_KEYS,
     CYLINDER,
-    ELEMENT,
-    ENGINE,
-    FIRST_PUMP,
-    LINE,
+    HYDRAULICS,
     MOTOR,
-    OIL,
     ORIFICE_KEYS,
-    PUMP,
     SPOOL,
     VALVE,
-    VALVE_CONTROL,
 )
 from crane.description.key_types import REQUIRED
 from crane.description.machine_schema import (
-    CONTROL,
-    END_STOP,
-    FORCE,
+    COUPLING,
     FRICTION,
-    GAS_SPRING,
-    ROPE,
+    LOOP,
+    MACHINE,
     SENSOR,
+    TASK,
+    VIA_POINT,
 )
 from crane.description.sensors import quantity_unit
-from crane.description.specification import Friction, Task, ViaPoint
-from crane.description.task_phases import Phase
+from crane.description.specification import Friction, Task
 from crane.formats.machine_file.estimation_section import estimation_data
 from crane.formats.machine_file.external_force_sections import external_force_data, load_data
 from crane.formats.machine_file.flow_curves import curve_data
@@ -261,53 +253,39 @@ class _ChainDivision:
 
 
 def _machine_data(machine: Machine) -> dict[str, Any]:
-    """The machine file, without chains and payload."""
-    data: dict[str, Any] = {"name": machine.name}
-    if machine.source:
-        data["source"] = machine.source
-    data["chains"] = []
+    """The machine file, with empty chains and without payload."""
     equations = machine.closure.equations
-    data["loops"] = [
-        {
-            "name": loop.name, "type": loop.type, "predecessor": loop.predecessor,
-            "successor": loop.successor, "axis": [float(x) for x in loop.axis],
-        }
-        for loop in equations.loops
-    ]  # fmt: skip
-    data["couplings"] = []
     for coupling in equations.couplings:
         if len(coupling.factors) < 2:
             raise InputError(
                 f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
                 "that joint instead"
             )
-        item = {"name": coupling.name, "joints": dict(coupling.factors)}
-        data["couplings"].append(item | ({"offset": coupling.offset} if coupling.offset else {}))
-    data["active"] = _active_data(machine)
-    data["free"] = list(machine.free)
-    data["home"] = dict(zip(machine.joints, machine.home.tolist(), strict=True))
-    data["friction"] = {joint: friction_data(law) for joint, law in machine.friction.items()}
-    data["forces"] = [FORCE.values_of(item) for item in machine.forces]
-    data["gas_springs"] = {item.joint: GAS_SPRING.values_of(item) for item in machine.gas_springs}
-    data["ropes"] = [ROPE.values_of(item) for item in machine.ropes]
-    data |= external_force_data(machine.external_forces)
-    data["supports"] = list(machine.supports)
-    data["pins"] = dict(machine.pin_capacities)
-    data["end_stops"] = {item.joint: END_STOP.values_of(item) for item in machine.end_stops}
-    data["rotor_inertia"] = rotor_inertias(machine)
-    data["drives"] = compound_drive_factors(machine)
-    data["tip"] = machine.tip
-    data["tasks"] = {name: _task_data(task) for name, task in machine.tasks.items()}
-    data["control"] = {joint: CONTROL.values_of(gains) for joint, gains in machine.control.items()}
-    data["identification"] = estimation_data(machine)
-    if machine.hydraulics is not None:
-        data["hydraulics"] = _hydraulics_data(machine.hydraulics)
-    data["sensors"] = {
-        name: SENSOR.values_of(sensor) or {"zero": 0.0}
-        for name, sensor in machine.sensors.items()
-        if quantity_unit(machine.tree, name) is not None  # a joint that is locked has none
+    data: dict[str, Any] = {
+        "chains": [],
+        "loops": [
+            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]}
+            for loop in equations.loops
+        ],
+        "couplings": [COUPLING.values_of(coupling) for coupling in equations.couplings],
+        "active": _active_data(machine),
+        "drives": compound_drive_factors(machine),
+        "home": dict(zip(machine.joints, machine.home.tolist(), strict=True)),
+        "friction": {joint: friction_data(law) for joint, law in machine.friction.items()},
+        **external_force_data(machine.external_forces),
+        "rotor_inertia": rotor_inertias(machine),
+        "payload": None,
+        "tasks": {name: _task_data(task) for name, task in machine.tasks.items()},
+        "hydraulics": machine.hydraulics and _hydraulics_data(machine.hydraulics),
+        "sensors": {
+            name: SENSOR.values_of(sensor) or {"zero": 0.0}
+            for name, sensor in machine.sensors.items()
+            if quantity_unit(machine.tree, name) is not None  # a joint that is locked has none
+        },
+        "identification": estimation_data(machine),
     }
-    return data
+    data |= MACHINE.values_of(machine, *data)
+    return {key: data[key] for key in MACHINE.keys if key in data}
 
 
 def _active_data(machine: Machine) -> list[str]:
@@ -321,65 +299,39 @@ def _active_data(machine: Machine) -> list[str]:
 
 def friction_data(law: Friction) -> dict[str, Any]:
     """The keys of a friction law in a machine file."""
-    return (FRICTION.values_of(law, "drives") or {"viscous": 0.0}) | (
-        {"drives": True} if law.is_driving else {}
-    )
+    return FRICTION.values_of(law) or {"viscous": 0.0}
 
 
 def _task_data(task: Task) -> dict[str, Any]:
-    data: dict[str, Any] = {"description": task.description} if task.description else {}
-    if not task.phases:
-        data["duration"] = task.duration
+    data = TASK.values_of(task, "via", "loads")
+    if task.via or task.phases:
+        del data["duration"]
     if task.loads:
         data["loads"] = [load_data(load) for load in task.loads]
-    if task.space == "joystick":
-        lever_data = {
+    if task.via:
+        data["via"] = [VIA_POINT.values_of(via) | dict(via.point) for via in task.via]
+    elif task.coefficients:
+        data[task.space] = {key: list(row) for key, row in task.coefficients.items()}
+    elif not task.phases:
+        data["joystick"] = {
             joint: [x for point in polygon for x in point]
             for joint, polygon in task.levers.items()
         }
-        start = {"start": dict(task.start)} if task.start else {}
-        if task.phases:
-            return (
-                data | {"phases": [_phase_data(x) for x in task.phases], "ramp": task.ramp} | start
-            )
-        return data | {"joystick": lever_data} | start
-    if task.via:
-        del data["duration"]
-        return data | {"via": [_via_data(via) for via in task.via]}
-    return data | {task.space: {key: list(row) for key, row in task.coefficients.items()}}
-
-
-def _phase_data(phase: Phase) -> dict[str, Any]:
-    data = {"name": phase.name, "levers": dict(phase.levers), "until": dict(phase.until)}
-    return data | {"within": phase.within}
-
-
-def _via_data(via: ViaPoint) -> dict[str, Any]:
-    rates = {"rates": dict(via.rates)} if via.rates else {}
-    return {"time": via.time, **via.point, **rates}
+    return data
 
 
 def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
-    motors = [joint for joint, item in circuit.cylinders.items() if item.motor]
-    data: dict[str, Any] = {
-        "supply": FIRST_PUMP.values_of(circuit.supply),
-        "oil": OIL.values_of(circuit.oil),
-        "cylinders": {
-            joint: CYLINDER.values_of(item, *BORE_KEYS)
-            for joint, item in circuit.cylinders.items()
-            if joint not in motors
-        },
-        "motors": {joint: _motor_data(circuit.cylinders[joint]) for joint in motors},
+    drives: dict[str, dict[str, Any]] = {"cylinders": {}, "motors": {}}
+    for joint, item in circuit.cylinders.items():
+        if item.motor:
+            drives["motors"][joint] = _motor_data(item)
+        else:
+            drives["cylinders"][joint] = CYLINDER.values_of(item, *BORE_KEYS)
+    data = HYDRAULICS.values_of(circuit, "cylinders", "valves") | {
+        **{key: value for key, value in drives.items() if value},
         "valves": {joint: _valve_data(valve) for joint, valve in circuit.valves.items()},
     }
-    if circuit.engine is not None:
-        data["engine"] = ENGINE.values_of(circuit.engine)
-    for key, schema in {
-        "supplies": PUMP, "lines": LINE, "accumulators": ACCUMULATOR, "elements": ELEMENT,
-        "control": VALVE_CONTROL,
-    }.items():  # fmt: skip
-        data[key] = {name: schema.values_of(x) for name, x in getattr(circuit, key).items()}
-    return {key: value for key, value in data.items() if value or key == "oil"}
+    return {key: data[key] for key in HYDRAULICS.keys if key in data}
 
 
 def _motor_data(motor: Cylinder) -> dict[str, Any]:

@@ -37,4 +37,4 @@ def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
         except InputError as error:
             raise item.error_at(None, f"'{name}': {error}") from None
 
-    return top.read_map("sensors", read_sensor, harmless=True)
+    return top.read_map("sensors", read_sensor)

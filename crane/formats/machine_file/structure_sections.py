@@ -181,7 +181,5 @@ def _read_floating(top: YamlSection) -> tuple[str, ...]:
 def read_home(top: YamlSection, tree: TreeBuilder) -> tuple[dict[str, float], dict[str, str]]:
     """Coordinates of the home configuration, and the file and line of each as "home JOINT"."""
     home = top.value_map("home", YamlSection.number, tree.check_joint)
-    section = top.section("home") if home else None
-    if section is None:
-        return home, {}
-    return home, {f"home {joint}": section.source_location(joint) for joint in home}
+    locations = top.item_locations("home") if home else {}
+    return home, {f"home {joint}": locations[joint] for joint in home}
