@@ -266,7 +266,10 @@ def test_defaults_are_usual(kind):
         if entry.name in parameter_names(kind) and isinstance(entry.default, float):
             for turning in (False, True):
                 text = implausible_value_text(
-                    entry.name, entry.default, turning, kind.__name__.lower()
+                    entry.name,
+                    entry.default,
+                    turning,
+                    kind.__name__.removeprefix("Circuit").lower(),
                 )
                 assert not text, (kind, entry.name)
 
