@@ -139,7 +139,8 @@ class SectionSchema:
         component: Name of its plausible ranges.
         others: Type of the values of all other keys; None where there must be none.
         exclusive: Pairs of groups of keys that exclude each other, and the error, with {key} and
-            {other}, the keys that are given, {title}, and values by their keys.
+            {other}, the keys that are given, {title}, and values by their keys; of two equal
+            groups one key may be given.
     """
 
     title: str

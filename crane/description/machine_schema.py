@@ -192,6 +192,10 @@ PHASE = section_schema(
         "within": NumberKey("longest duration", "s", default=REQUIRED),
     },
 )
+_UNPHASED = MOTION_KEYS[:-1]
+MOTIONS = ", ".join(f"'{key}'" for key in MOTION_KEYS)
+_CONTINUOUS_MOTIONS = ("tip", "active", "joystick")
+_SEVERAL_MOTIONS = f"{{title}} has more than one of {MOTIONS}, give one"
 TASK = section_schema(
     "task",
     {
@@ -223,6 +227,22 @@ TASK = section_schema(
         ),
         "loads": ListKey("external forces during the task", SectionKey(section=TASK_LOAD)),
     },
+    exclusive=(
+        (_UNPHASED, ("phases",), "{title} has phases and '{key}', give one of both"),
+        (
+            ("duration",), ("phases",),
+            "{title} ends when its last phase does, leave 'duration' out",
+        ),
+        (("ramp",), _UNPHASED, "{title} has no phases, leave 'ramp' to these"),
+        (_CONTINUOUS_MOTIONS, ("via",), _SEVERAL_MOTIONS),
+        (_CONTINUOUS_MOTIONS, _CONTINUOUS_MOTIONS, _SEVERAL_MOTIONS),
+        (("duration",), ("via",), "{title} ends at its last point, leave 'duration' out"),
+        (("start",), ("via",), "{title} starts at its first, leave 'start' out"),
+        (
+            ("start",), ("tip", "active"),
+            "{title} starts where its motion does, leave 'start' to levers",
+        ),
+    ),
 )  # fmt: skip
 CONTROL = section_schema(
     "control of",

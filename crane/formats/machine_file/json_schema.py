@@ -75,11 +75,11 @@ class _Definitions:
             if key.default is REQUIRED and name not in exclusive and not is_partial
         ]
         others = section.others and self._value("", section.others, is_partial)
-        excluded = {
-            key: {"not": {"anyOf": [{"required": [other]} for other in second]}}
-            for first, second, _ in section.exclusive
-            for key in first
-        }
+        excluded: dict[str, list[dict[str, Any]]] = {}
+        for first, second, _ in section.exclusive:
+            for key in first:
+                others_of_key = [{"required": [x]} for x in second if x != key]
+                excluded.setdefault(key, []).extend(others_of_key)
         return {
             "type": ["object", "null"],
             "properties": {
@@ -87,7 +87,7 @@ class _Definitions:
             },
             "additionalProperties": others or False,
             "required": required,
-            "dependentSchemas": excluded,
+            "dependentSchemas": {key: {"not": {"anyOf": x}} for key, x in excluded.items()},
         }
 
     def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:

@@ -4,14 +4,12 @@ import dataclasses
 from collections.abc import Sequence
 
 from crane.description.findings import UnknownNames, error_recovery
-from crane.description.machine_schema import MOTION_KEYS
+from crane.description.machine_schema import MOTIONS
 from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES, Task, ViaPoint
 from crane.description.task_phases import Phase
 from crane.formats.machine_file.external_force_sections import read_loads
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
-
-_MOTIONS = ", ".join(f"'{key}'" for key in MOTION_KEYS)
 
 
 def read_tasks(
@@ -31,14 +29,13 @@ def read_tasks(
 
     def read_task(name: str, item: YamlSection) -> Task:
         has_phases = "phases" in item
+        item.check_exclusive_keys()
         lever_key = "phases" if has_phases else "joystick"
         if lever_key in item and not valves:
             problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
             raise item.error_at(lever_key, problem)
         if has_phases:
             task = _read_phased_task(name, item, spaces, tree, home)
-        elif "ramp" in item:
-            raise item.error_at("ramp", f"task '{name}' has no phases, leave 'ramp' to these")
         else:
             read = _read_via_task if "via" in item else _read_task
             task = read(name, item, spaces, tip)
@@ -59,9 +56,8 @@ def _read_task(
         for space in spaces
         if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
     }
-    if len(motions) != 1:
-        count = "more than one" if motions else "none"
-        raise item.error_at(None, f"task '{name}' has {count} of {_MOTIONS}, give one")
+    if not motions:
+        raise item.error_at(None, f"task '{name}' has none of {MOTIONS}, give one")
     ((space, motion),) = motions.items()
     if space == "tip":
         _check_has_tip(name, item, "tip", tip)
@@ -71,9 +67,6 @@ def _read_task(
         levers = item.value_map(space, lambda part, joint: _read_lever(part, joint, duration))
         start = _read_start(name, item, spaces["active"])
         return Task(name, "", duration, space, {}, levers, start=start)
-    if "start" in item:
-        problem = f"task '{name}' starts where its motion does, leave 'start' to levers"
-        raise item.error_at("start", problem)
     coefficients = {}
     for coordinate in spaces[space]:
         with error_recovery():
@@ -99,12 +92,6 @@ def _read_via_task(
     name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
 ) -> Task:
     """A task through points, in the space of the coordinates that these name."""
-    for key in ("tip", "active", "joystick"):
-        if key in item:
-            raise item.error_at(key, f"task '{name}' has more than one of {_MOTIONS}, give one")
-    for key, why in {"duration": "ends at its last point", "start": "starts at its first"}.items():
-        if key in item:
-            raise item.error_at(key, f"task '{name}' {why}, leave '{key}' out")
     active, attitude = spaces["active"], tuple(x for group in ATTITUDE_COORDINATES for x in group)
     coordinate_names = active
     if not isinstance(active, UnknownNames):
@@ -232,13 +219,6 @@ def _read_phased_task(
     """A task of levers that are held until joints have reached their positions."""
     start_positions = _read_start(name, item, spaces["active"])
     valves = spaces["joystick"]
-    for key in MOTION_KEYS:
-        if key in item and key != "phases":
-            raise item.error_at(key, f"task '{name}' has phases and '{key}', give one of both")
-    if "duration" in item:
-        raise item.error_at(
-            "duration", f"task '{name}' ends when its last phase does, leave 'duration' out"
-        )
     limits = {x: (joint.limits.lower, joint.limits.upper) for x, joint in tree.joints.items()}
     positions = {  # what is beyond the limits is told at home
         joint: position

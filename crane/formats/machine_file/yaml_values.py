@@ -156,7 +156,7 @@ class YamlValues:
             DescriptionError: A value is not of its type, a key is missing, or two keys exclude
                 each other.
         """
-        self._check_exclusive_keys()
+        self.check_exclusive_keys()
         found = {}
         for name, key in self.schema.keys.items():
             reader = _READERS.get(type(key))
@@ -171,13 +171,15 @@ class YamlValues:
                     found[key.attribute or name] = value
         return found
 
-    def _check_exclusive_keys(self) -> None:
+    def check_exclusive_keys(self) -> None:
+        """Raise for two keys of which the schema allows one."""
         for first, second, problem in self.schema.exclusive:
             key = next((x for x in first if x in self._data), None)
-            other = next((x for x in second if x in self._data), None)
+            other = next((x for x in second if x in self._data and x != key), None)
             if key is not None and other is not None:
                 names = {"key": key, "other": other, "title": self.title}
-                raise self.error_at(key, problem.format_map(self._data | names))
+                place = None if first == second else key
+                raise self.error_at(place, problem.format_map(self._data | names))
 
     def text(self, key: str) -> Any:
         """A non-empty string, None where there may be none; empty where its error is reported."""
