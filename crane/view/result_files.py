@@ -22,6 +22,7 @@ from crane.recordings.run_folder import RECORDING, RECORDING_NPZ
 
 SUMMARY, FIGURE, PAGE = "summary.md", "figure.png", "view.html"
 REPORT, MACHINE_FOLDER = "report.html", "machine"
+_MACHINE = f"{MACHINE_FOLDER}/"
 
 
 def _text(result: Any, **_: object) -> str:
@@ -41,9 +42,9 @@ class ResultFiles:
         documents: Functions of `crane.view` that write a document, likewise.
         text: The summary of a result, with the options that concern it.
         more: Writes files that depend on options or on the result into a folder.
-        optional: Names or patterns of those files.
+        more_files: Names of those files. Those of an earlier result are removed.
         options: Names of the options of `text` and `more`.
-        stale: Patterns of further files of an earlier result in a folder.
+        stale: Patterns of further files of an earlier result, which are removed.
         motion: Machine and recording that a page plays; None as recording if nothing moves.
         notebook_figures: Functions whose figures a notebook shows instead of `figures`.
     """
@@ -54,7 +55,7 @@ class ResultFiles:
     documents: Mapping[str, str] = field(default_factory=dict)
     text: Callable[..., str] = _text
     more: Callable[..., None] | None = None
-    optional: tuple[str, ...] = ()
+    more_files: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     stale: Callable[[Any, Path], Sequence[str]] | None = None
     motion: Callable[[Any], tuple[Machine, Recording | None]] | None = None
@@ -74,7 +75,7 @@ def write_result(
     """Write a result into a folder, see `Result.write`."""
     files, folder = _checked_files(result, options), Path(folder)
     check_folder_is_writable(folder, overwrite)
-    stale = [*files.optional, *(files.stale(result, folder) if files.stale else ())]
+    stale = [*files.more_files, *(files.stale(result, folder) if files.stale else ())]
     with replace_folder(folder, overwrite, stale) as part:
         text = files.text(result, **options)
         if files.summary:
@@ -292,8 +293,6 @@ def _write_friction(result: Any, folder: Path, unit: str = "m") -> None:
     _write_figure(folder / "friction.png", "hydraulics_figures.friction_figure", result, unit)
 
 
-_RUN_FILES = (RECORDING, RECORDING_NPZ, FIGURE, PAGE)
-
 RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "Breakout": ResultFiles(summary="breakout.md"),
     "Calibration": ResultFiles(
@@ -301,6 +300,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"calibration.png": "calibration_figure.calibration_figure"},
         documents={REPORT: "page.calibration_page.write_calibration_report"},
         more=_write_calibrated_machine,
+        more_files=(_MACHINE,),
         stale=lambda result, folder: _machine_files(result.machine, folder),
     ),
     "Capacity": ResultFiles(
@@ -313,7 +313,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         documents={"capacity.html": "page.capacity_page.write_capacity_page"},
         text=_capacity_text,
         more=_write_capacity_derivatives,
-        optional=("slopes.csv",),
+        more_files=("slopes.csv",),
         options=("torques", "parameters"),
         notebook_figures=("capacity_figure.capacity_figure",),
     ),
@@ -321,19 +321,24 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary="comparison.md",
         text=_comparison_text,
         more=_write_comparison,
-        optional=(*_RUN_FILES, "comparison.png"),
+        more_files=(RECORDING, RECORDING_NPZ, SUMMARY, "comparison.png"),
+        stale=lambda *_: (FIGURE, PAGE),
         options=("npz",),
         notebook_figures=("comparison_figure.comparison_figure",),
     ),
     "CylinderFriction": ResultFiles(
-        summary="friction.txt", text=_text_with_unit, more=_write_friction, options=("unit",)
+        summary="friction.txt",
+        text=_text_with_unit,
+        more=_write_friction,
+        more_files=("friction.png",),
+        options=("unit",),
     ),
     "Design": ResultFiles(
         summary="design.md",
         tables={"solutions.csv": "to_csv"},
         figures={"design.png": "design_figure.design_figure"},
         more=_write_design,
-        optional=("before.png", "after.png"),
+        more_files=("before.png", "after.png", _MACHINE),
     ),
     "Excitation": ResultFiles(
         tables={"reference.csv": "to_csv", "coefficients.yaml": "to_yaml"},
@@ -342,6 +347,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "Identification": ResultFiles(
         tables={"parameters.csv": "to_csv"},
         more=_write_identification,
+        more_files=(REPORT, _MACHINE),
         options=("recordings", "validation"),
         stale=lambda result, folder: _machine_files(result.described_machine, folder),
         notebook_figures=("identification_figures.force_figures",),
@@ -351,7 +357,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         tables={"model.mat": "save", "model.npz": "save"},
         figures={"modes.png": "modes_figure.modes_figure"},
         more=_write_modes,
-        optional=("over.png", PAGE),
+        more_files=("over.png", PAGE),
         options=("models",),
         motion=lambda model: (model.machine, model.mode_animation()),
     ),
@@ -359,6 +365,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary="orifices.txt",
         text=_orifices_text,
         more=_write_orifices,
+        more_files=("orifices.png",),
         options=("unit", "validation"),
     ),
     "PowerBalance": ResultFiles(
@@ -379,7 +386,8 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         summary=SUMMARY,
         text=_recording_text,
         more=_write_recording,
-        optional=(*_RUN_FILES, "comparison.md", "comparison.png"),
+        more_files=(RECORDING, RECORDING_NPZ, FIGURE, PAGE),
+        stale=lambda *_: ("comparison.md", "comparison.png"),
         options=("npz", "views"),
         motion=_recorded_motion,
         notebook_figures=("recording_figure.recording_figure",),
@@ -402,7 +410,11 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         figures={"tool_force.png": "tool_force_figure.tool_force_figure"},
     ),
     "ValveCurve": ResultFiles(
-        summary="valve.txt", text=_text_with_unit, more=_write_valve, options=("unit",)
+        summary="valve.txt",
+        text=_text_with_unit,
+        more=_write_valve,
+        more_files=("valve.png",),
+        options=("unit",),
     ),
     "WorkingRange": ResultFiles(
         summary="working_range.md",
