@@ -81,7 +81,7 @@ def test_figures_of_a_machine_with_such_names(tmp_path):
         crane.study(machine.path, vary, [r"$\sw$"], [r"peak_$\bad$"], processes=1), figures[3]
     )
     channel = SimpleNamespace(
-        name=r"$\bad$", unit=r"$\u$", measured=time, simulated=time, rms=0.0, relative=0.0
+        name=r"$\bad$", unit=r"$\u$", measured=time, simulated=time, rms=0.0, relative_rms=0.0
     )
     comparison = SimpleNamespace(time=time, channels=[channel])
     write_figure(figures[4], lambda: comparison_figure(comparison))
