@@ -230,6 +230,11 @@ def test_help_is_one_screen_with_examples_that_run(tmp_path):
         assert done.returncode == 0, done.stderr
 
 
+def test_without_a_command_the_help_is_shown():
+    done = typed()
+    assert (done.returncode, done.stdout, done.stderr) == (2, typed("--help").stdout, "")
+
+
 def test_an_option_has_one_text_in_all_commands():
     """But for those whose meaning depends on the command."""
     texts, own = {}, {"--duration", "--method", "--out", "--period", "--step", "--task", "--vary"}

@@ -18,7 +18,6 @@ from crane.common.errors import InputError
 # Commands import what they need when they run, so that `crane --help` answers at once.
 
 app = typer.Typer(
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

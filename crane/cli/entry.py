@@ -77,7 +77,7 @@ def main() -> None:
     try:
         run = program(*arguments[:1])
         with activity_line(" ".join(["crane", *arguments[:1]])), use_load_options(strict=strict):
-            status = run(args=arguments, standalone_mode=False, prog_name="crane")
+            status = run(args=arguments or ["--help"], standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
         if sys.stdout is not None:  # it is where the shell has closed it
@@ -109,6 +109,8 @@ def main() -> None:
         shows = "the commands" if command == "crane" else "what it takes"
         line = format_one_line(" ".join(text.split()))
         _exit_with_error(f"{line} ({command} --help shows {shows})")
+    if not arguments:  # the help was shown, but nothing was done
+        sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 
 

@@ -426,12 +426,16 @@ def calibrate(
 ) -> None:
     """Fit parameters through simulations of valve signals."""
     from crane.identification.calibration.calibrate import calibrate as run
+    from crane.recordings.run_folder import recording_file
 
     fits, window = parse_fits(fit), parse_window(train)
     loaded = options.load(machine)
+    paths, held_out = (
+        [recording_file(x) for x in given or ()] for given in (recording, validation)
+    )
     with progress_bar("simulating") as progress:
         result = run(
-            loaded, recording, fits, train=window, validation=validation or (),
+            loaded, paths, fits, train=window, validation=held_out,
             columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
             progress=progress,
         )  # fmt: skip

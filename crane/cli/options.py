@@ -30,14 +30,14 @@ RecordingFile = Annotated[
     Path,
     typer.Argument(
         metavar="RECORDING",
-        help="A recording (CSV or npz) or the folder of a run; with forces or pressures.",
+        help="A recording (CSV or npz) or the folder of a run.",
     ),
 ]
 RecordingFiles = Annotated[
     list[Path],
     typer.Argument(
         metavar="RECORDING...",
-        help="Recordings (CSV or npz) or folders of runs; with forces or pressures.",
+        help="Recordings (CSV or npz) or folders of runs.",
     ),
 ]
 Task = Annotated[str | None, typer.Option(metavar="TASK", help="A task of the machine file.")]

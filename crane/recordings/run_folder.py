@@ -47,12 +47,7 @@ def read_run(
             coordinates and forces.
         DescriptionError: The machine that the file names is not found.
     """
-    path = Path(path)
-    if path.is_dir():
-        files = [path / x for x in (RECORDING, RECORDING_NPZ) if (path / x).is_file()]
-        if not files:
-            raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
-        path = files[0]
+    path = recording_file(path)
     if machine is not None:
         table = read_quantities(path, machine, columns, span)
         return complete_recording(machine, table, path, required_columns)
@@ -63,6 +58,21 @@ def read_run(
         table = quantities_from_readings(table, path, machine, span)
         return complete_recording(machine, table, path)
     return Recording.from_table(quantities_from_readings(table, path, None, span), path)
+
+
+def recording_file(path: str | Path) -> Path:
+    """The file of a recording: the path itself, or the file in the folder of a run.
+
+    Raises:
+        RecordingError: The folder has none.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return path
+    for file in (path / RECORDING, path / RECORDING_NPZ):
+        if file.is_file():
+            return file
+    raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
 
 
 def recorded_machine(path: str | Path, name: str) -> Machine:

@@ -106,7 +106,11 @@ class _TimePanel:
 
 
 def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
-    """Draw a figure into a file whose suffix is a known format; see `plot_recording`."""
+    """Draw a figure into a file; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
     if file_format not in FIGURE_FORMATS:
