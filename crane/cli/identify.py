@@ -263,6 +263,8 @@ def identify(
         settings = identify_options(tried_settings[0], settings)
     with progress_bar("identifying") as progress:
         result = estimate(loaded, inside, judges or None, progress=progress, **settings)
+    if result.validation is None:
+        names["validation"] = ""
     output.write(result, f"; see {output.out}/report.html", **names)
 
 
