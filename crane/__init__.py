@@ -125,6 +125,7 @@ __version__ = "0.2.0"
 LOADED = time.time()  # before any other file of the package was read
 
 from crane.common import one_line_repr as _shown  # noqa: E402
+from crane.common import result as _result  # noqa: E402
 
 _HOMES = {
     "crane.closure": "Closure",
@@ -325,7 +326,14 @@ def _watch_cells() -> None:
         show_cell_progress(shell)
 
 
+def _write_result(*arguments: Any, **options: Any) -> str:
+    from crane.view.result_files import write_result
+
+    return write_result(*arguments, **options)
+
+
 _shown.to_html = _to_html
+_result.write_result = _write_result
 _watch_cells()
 
 

@@ -15,6 +15,8 @@ from sphinx.util.docutils import SphinxRole
 
 import crane
 from crane.cli import program
+from crane.cli.entry import GROUPS
+from crane.view.result_files import RESULT_FILES
 
 HERE = Path(__file__).parent
 GENERATED = HERE / "generated"
@@ -101,6 +103,7 @@ def write() -> None:
     _write("api/errors.rst", _errors())
     _write("api/index.rst", _index(list(rooms)))
     _write("commands.md", _commands())
+    _write("results.md", _results())
     _write("examples.md", _examples())
 
 
@@ -189,12 +192,32 @@ def _title(text: str) -> str:
 
 
 def _commands() -> str:
+    """The commands by group, each with its arguments and options."""
     import typer
     from typer.cli import get_docs_for_click
 
     command = typer.main.get_command(program())
     context = typer.Context(command, info_name="crane")
-    return str(get_docs_for_click(obj=command, ctx=context, name="crane", title="Commands"))
+    parts = ["# Commands", "```text", command.get_help(context), "```"]
+    for group, names in GROUPS.items():
+        parts.append(f"## {group.capitalize()}")
+        for name in names.split():
+            text = get_docs_for_click(
+                obj=command.commands[name], ctx=context, name=name, call_prefix="crane", indent=2
+            )
+            parts.append(text.strip())
+    return "\n\n".join(parts) + "\n"
+
+
+def _results() -> str:
+    """A table of the files of each class of results."""
+    rows = ["| class | files | options |", "| --- | --- | --- |"]
+    for name, files in RESULT_FILES.items():
+        names = [*files.tables, *files.figures, *files.documents, *files.more_files]
+        cells = ([files.summary] * bool(files.summary) + names, files.options)
+        words = (", ".join(f"`{x}`" for x in cell) for cell in cells)
+        rows.append(f"| `{name}` | {' | '.join(words)} |")
+    return "\n".join(rows) + "\n"
 
 
 def _examples() -> str:

@@ -26,15 +26,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 
 import crane  # noqa: E402
-from crane.cli.runs import read_run  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402
 from crane.control import joystick, make_controller  # noqa: E402
 from crane.formats.check import check  # noqa: E402
 from crane.identification.mechanics.identify import identify  # noqa: E402
 from crane.motion.task_trajectories import task_trajectory  # noqa: E402
+from crane.recordings.run_folder import read_run  # noqa: E402
 from crane.simulation.recording_replay import replay  # noqa: E402
 from crane.view.page import report  # noqa: E402
-from crane.view.plots.recording_figure import plot_recording  # noqa: E402
+from crane.view.result_files import plot_result  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SECONDS, MEMORY = 20, 2 << 30  # of computing per case, bytes
@@ -405,8 +405,8 @@ def judge_recording(rng, which, file, folder):
     machine = MACHINES[which]
     written = folder / "run.png", folder / "run.html"
     uses = [
-        lambda: plot_recording(read_run(file, None), written[0]),
-        lambda: plot_recording(read_run(file, machine), written[0]),
+        lambda: plot_result(read_run(file, None), written[0]),
+        lambda: plot_result(read_run(file, machine), written[0]),
         lambda: report(machine, read_run(file, machine), written[1]),
     ]
     if which == 0:

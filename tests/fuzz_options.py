@@ -328,7 +328,9 @@ def begin(words, place):
     crane.view.live.live_server._take_requests = lambda *_: None  # serving ends at once
     show = entry._show_warning
     entry._show_warning = lambda message, category, *rest: (
-        show(message) if issubclass(category, CraneWarning) else entry.say(f"LEAK {message}")
+        show(message)
+        if issubclass(category, CraneWarning)
+        else entry.print_message(f"LEAK {message}")
     )
     status = 0
     try:

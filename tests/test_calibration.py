@@ -11,7 +11,6 @@ from hydraulic_rig import COMPENSATED, rig
 from typed import typed
 
 import crane
-from crane.cli.runs import write_calibration
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.description.parameter_changes import parameters
 from crane.description.sensors import Sensor
@@ -381,9 +380,9 @@ def test_a_machine_that_cannot_be_written_is_left_out_with_a_warning(
     def refused(*_):
         raise InputError("coupling 'c' holds x alone, lock that joint instead")
 
-    monkeypatch.setattr("crane.formats.write_machine", refused)
+    monkeypatch.setattr("crane.view.result_files.write_machine", refused)
     with pytest.warns(CraneWarning, match="the machine is not written, take the --set"):
-        write_calibration(tmp_path, fitted[2])
+        fitted[2].write(tmp_path)
     assert {x.name for x in tmp_path.iterdir()} == {
         "calibration.md", "calibration.png", "report.html"
     }  # fmt: skip
@@ -392,7 +391,7 @@ def test_a_machine_that_cannot_be_written_is_left_out_with_a_warning(
 def test_the_machine_says_how_well_its_numbers_are_known(fitted, tmp_path):
     """Beside each, in the lines where they stand; it loads as what was found, to the last bit."""
     _, _, found = fitted
-    write_calibration(tmp_path, found)
+    found.write(tmp_path)
     text = "".join(x.read_text() for x in (tmp_path / "machine").iterdir())
     for one in found.parameters:
         words = f"fitted ±{one.interval:.2g}, 95 %{one.remark and f', {one.remark}'} (was "
@@ -407,7 +406,7 @@ def test_the_machine_says_how_well_its_numbers_are_known(fitted, tmp_path):
 
 def test_the_page_says_what_was_found(fitted, tmp_path):
     _, _, found = fitted
-    write_calibration(tmp_path, found)
+    found.write(tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert "<script" not in page and "http" not in page and page.count("<img") == 7
     rows = re.findall(r"<tr[^>]*><td><code>([^<]*)</code></td>(.*?)</tr>", page)

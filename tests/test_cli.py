@@ -8,15 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from broken import DATA, MINI, copy_machine
 from typed import MAIN, typed
+from written import walked
 
 import crane
 from crane.cli import entry
-from crane.cli.commands import list_machines
+from crane.cli.describe import list_machines
 from crane.common.errors import InputError
 from crane.description import bundled_machines, example_robots
 from crane.view.plots.recording_figure import recording_figure
+
+SHARED = (  # options of blocks, in the order of every help
+    "--set", "--lock", "--packages", "--arg", "--active", "--free", "--floating", "--from",
+    "--until", "--columns", "--processes", "--scheduler", "--out", "--force",
+)  # fmt: skip
 
 
 def one_error(result) -> str:
@@ -203,17 +210,47 @@ def test_every_command_is_found_where_it_is():
         for command in app.registered_commands
         if command.callback.__module__.startswith("crane.cli.")
     }
-    names |= {group.name: "crane.cli.add" for group in app.registered_groups}
+    names |= {group.name: "crane.cli.describe" for group in app.registered_groups}
     told = {
-        name: f"crane.cli.{home}" for home, known in entry._HOMES.items() for name in known.split()
+        name: f"crane.cli.{group}"
+        for group, known in entry.GROUPS.items()
+        for name in known.split()
     }
     assert told == names
 
 
+def test_help_is_one_screen_with_examples_that_run(tmp_path):
+    lines = typed("--help").stdout.splitlines()
+    assert len(lines) <= 40 and max(map(len, lines)) <= 80
+    examples = [line.split("   ")[0].split()[1:] for line in lines if line.startswith("  crane ")]
+    assert len(examples) == 3
+    for words in examples:
+        words += ["--no-open"] if words[0] == "view" else []
+        done = typed(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+
+
+def test_without_a_command_the_help_is_shown():
+    done = typed()
+    assert (done.returncode, done.stdout, done.stderr) == (2, typed("--help").stdout, "")
+
+
+def test_an_option_has_one_text_in_all_commands():
+    """But for those whose meaning depends on the command."""
+    texts, own = {}, {"--duration", "--method", "--out", "--period", "--step", "--task", "--vary"}
+    for name, command in walked(typer.main.get_command(entry.program())):
+        options = {x.opts[0]: x.help for x in command.params if x.param_type_name == "option"}
+        assert [x for x in options if x in SHARED] == [x for x in SHARED if x in options], name
+        for option, text in options.items():
+            texts.setdefault(option, {}).setdefault(text, []).append(name)
+    assert {x for x, text in texts.items() if len(text) > 1} <= own, texts
+
+
 def test_version_and_units_in_help():
     assert typed("--version").stdout == f"crane {crane.__version__}\n"
-    text = " ".join(typed("simulate", "-h").stdout.split())
-    assert "In seconds; that of the task" in text and "recorded instants in seconds" in text
+    text = " ".join(typed("simulate", "-h").stdout.replace("│", " ").split())
+    assert re.search("--duration SECONDS Duration; that of the task", text)
+    assert re.search("--step SECONDS Step of the recorded samples", text)
 
 
 def test_a_hydraulic_machine_without_signals_stands_on_its_valves(tmp_path):
@@ -233,7 +270,7 @@ def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert (runs[0].tau == 0).all() and np.ptp(runs[0].q, axis=0).max() > 1e-5
     assert np.ptp(runs[1].q, axis=0).max() < 1e-9
     words = " ".join(typed("simulate", "-h").stdout.replace("│", " ").split())
-    assert "Without both it holds the home posture; if not given then, no drive acts" in words
+    assert "it holds the home configuration, and by default no controller acts" in words
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["info", "ur5_robot"], ["--version"]])

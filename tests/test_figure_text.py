@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 
 import crane
 from crane.recordings.recording import Recording
-from crane.view.plots.comparison_figure import plot_comparison
+from crane.view.plots.comparison_figure import comparison_figure
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.identification_figures import correlation_figure
-from crane.view.plots.recording_figure import joint_symbol, plot_recording
-from crane.view.plots.study_figure import plot_study
-from crane.view.plots.workspace_figure import plot_workspace
+from crane.view.plots.recording_figure import joint_symbol, write_figure
+from crane.view.result_files import plot_result
 from crane.view.sketch.sketch_figure import sketch
 from crane.view.sketch.sketch_layout import format_joint_symbol
 
@@ -75,16 +74,17 @@ def test_figures_of_a_machine_with_such_names(tmp_path):
         time, machine.active, one, one, one, {machine.active[0]: "rad"},
         machine=r"$\four$", task=r"$\sw$ \alpha$",
     )  # fmt: skip
-    plot_recording(recording, figures[1])
-    plot_workspace(crane.workspace(machine), figures[2])
+    plot_result(recording, figures[1])
+    plot_result(crane.workspace(machine), figures[2])
     vary = {f"friction.{machine.joints[0]}.coulomb": [0.3, 0.4]}
-    plot_study(
+    plot_result(
         crane.study(machine.path, vary, [r"$\sw$"], [r"peak_$\bad$"], processes=1), figures[3]
     )
     channel = SimpleNamespace(
         name=r"$\bad$", unit=r"$\u$", measured=time, simulated=time, rms=0.0, relative_rms=0.0
     )
-    plot_comparison(SimpleNamespace(time=time, channels=[channel]), figures[4])
+    comparison = SimpleNamespace(time=time, channels=[channel])
+    write_figure(figures[4], lambda: comparison_figure(comparison))
     assert all(figure.stat().st_size for figure in figures)
     picture_of_names = FigureCanvasAgg(correlation_figure(np.eye(2), [r"$\bad$.mass", "_b$c.m$x"]))
     picture_of_names.draw()

@@ -18,7 +18,6 @@ from scipy.interpolate import CubicSpline
 
 import crane
 from crane import cli
-from crane.cli.runs import read_run, write_identification
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.force_element_terms import ForceElementTerm
 from crane.identification.mechanics.friction_terms import friction_term
@@ -28,6 +27,7 @@ from crane.identification.mechanics.inertial_terms import InertialTerm, body_nam
 from crane.identification.mechanics.locked_body_division import divide_locked_bodies
 from crane.identification.mechanics.term_selection import default_terms
 from crane.identification.signals.signal_processing import Motion
+from crane.recordings.run_folder import read_run
 
 HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -242,7 +242,7 @@ def test_a_body_that_cannot_be_asks_for_feasible_ones(mini, found, tmp_path):
         str(caught.value),
     )
     with pytest.warns(CraneWarning, match="no machine files are written: .*") as told:
-        write_identification(tmp_path / "folder", parted)
+        parted.write(tmp_path / "folder")
     assert str(told[0].message) == (
         f"no machine files are written: {caught.value} (on the command line --feasible)"
     )

@@ -102,7 +102,7 @@ def test_old_or_new_wherever_it_is_killed(name, inputs, tmp_path):
 
     def run(folder=place):
         force = ["--force"] if name != "check" else []
-        with mock.patch("crane.cli.demo.MACHINES", (str(inputs / "swing.yaml"),)):
+        with mock.patch("crane.cli.simulate.DEMO_MACHINES", (str(inputs / "swing.yaml"),)):
             done = typed(*name.split(), *words, *force, cwd=folder)
         assert done.returncode == 0, done.stderr
 

@@ -10,9 +10,9 @@ import pytest
 from typed import typed
 
 import crane
-from crane.cli.runs import read_run, write_run
 from crane.common import scratch_arrays
 from crane.recordings.recording import Recording
+from crane.recordings.run_folder import read_run
 
 MEASURED = """
 import json, resource, sys
@@ -96,7 +96,7 @@ def test_a_run_as_npz_is_viewed_and_takes_the_place_of_a_csv(tmp_path):
     assert (recording.machine, recording.task, recording.ideal) == ("mini_forwarder", "lift", True)
     shown = typed("view", out, "--no-open")
     assert shown.returncode == 0 and (out / "view.html").is_file()
-    write_run(out, recording)
+    recording.write(out, overwrite=True)
     assert {path.name for path in out.iterdir()} == {"recording.csv", "summary.md"}
 
 

@@ -6,12 +6,12 @@ from motions import motion
 from work import passes
 
 import crane
-from crane.cli.runs import read_run
 from crane.dynamics import Dynamics
 from crane.identification.mechanics import force_delays
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.recordings import Recording
+from crane.recordings.run_folder import read_run
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 ASIDE = 2000  # samples at random postures for the base parameters, and at home, about

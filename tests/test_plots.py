@@ -9,7 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from crane.common.errors import OutputError
 from crane.recordings.recording import Recording
-from crane.view.plots.recording_figure import plot_recording, recording_figure
+from crane.view.plots.recording_figure import recording_figure
+from crane.view.result_files import plot_result
 
 SIGNATURES = {".png": b"\x89PNG\r\n", ".svg": b"<?xml", ".pdf": b"%PDF"}
 
@@ -207,17 +208,17 @@ def test_one_sample_can_be_seen():
 @pytest.mark.parametrize("suffix", SIGNATURES)
 def test_formats(tmp_path, recording, suffix):
     path = tmp_path / f"run{suffix}"
-    plot_recording(recording, path)
+    plot_result(recording, path)
     first = path.read_bytes()
     assert first.startswith(SIGNATURES[suffix])
-    plot_recording(recording, path)
+    plot_result(recording, path)
     assert path.read_bytes() == first
 
 
 @pytest.mark.parametrize("name", ["run.gif", "run", "run.png.txt"])
 def test_unknown_format_writes_nothing(tmp_path, recording, name):
     with pytest.raises(OutputError, match=r"end the name in \.png, \.svg or \.pdf"):
-        plot_recording(recording, tmp_path / name)
+        plot_result(recording, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -4,12 +4,17 @@ import re
 import numpy as np
 import pytest
 
-import crane.cli.demo
-from crane.cli.runs import check_folder, check_free, read_run, write_run
-from crane.common.atomic_output import portable_file_name, replace_folder
+import crane.cli.simulate
+from crane.common.atomic_output import (
+    check_file_is_writable,
+    check_folder_is_writable,
+    portable_file_name,
+    replace_folder,
+)
 from crane.common.errors import OutputError
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import recorded_machine_name, result_title
+from crane.recordings.run_folder import read_run
 
 
 @pytest.fixture
@@ -114,17 +119,20 @@ def test_folders_that_results_cannot_go_to(tmp_path, name, message):
     (tmp_path / "full" / "file").write_text("x")
     before = tree(tmp_path)
     with pytest.raises(OutputError, match=rf"^{re.escape(str(tmp_path / name))}: {message}"):
-        check_folder(tmp_path / name, force=False)
+        check_folder_is_writable(tmp_path / name, overwrite=False)
     assert tree(tmp_path) == before
-    check_folder(tmp_path / "full", force=True)
-    check_folder(tmp_path / "new" / "run", force=False)
+    check_folder_is_writable(tmp_path / "full", overwrite=True)
+    check_folder_is_writable(tmp_path / "new" / "run", overwrite=False)
     assert tree(tmp_path) == before
 
 
 def test_folders_that_may_not_be_written_to(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(os, "access", lambda path, mode: asked.append((path, mode)))
-    for check, place in ((check_folder, tmp_path / "a" / "b"), (check_free, tmp_path / "page")):
+    for check, place in (
+        (check_folder_is_writable, tmp_path / "a" / "b"),
+        (check_file_is_writable, tmp_path / "page"),
+    ):
         with pytest.raises(OutputError, match=rf"the folder {tmp_path} may not be written to"):
             check(place, False)
     assert asked == [(tmp_path, os.W_OK | os.X_OK)] * 2
@@ -141,10 +149,10 @@ def test_files_that_results_cannot_go_to(tmp_path):
         ("x" * 300, True, "cannot be written"),
     ):
         with pytest.raises(OutputError, match=message):
-            check_free(tmp_path / name, force)
-    check_free(tmp_path / "file", True)
-    check_free(tmp_path / "new", False)
-    check_free(tmp_path / "none" / "page", False)
+            check_file_is_writable(tmp_path / name, force)
+    check_file_is_writable(tmp_path / "file", True)
+    check_file_is_writable(tmp_path / "new", False)
+    check_file_is_writable(tmp_path / "none" / "page", False)
     assert not (tmp_path / "none").exists()
 
 
@@ -152,7 +160,7 @@ def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recordin
     old = "figure.png", "view.html", "comparison.md", "comparison.png"
     for name in ("recording.csv", "notes.txt", *old):
         (tmp_path / name).write_text("old")
-    text = write_run(tmp_path, recording)
+    text = recording.write(tmp_path, overwrite=True)
     assert set(tree(tmp_path)) == {"recording.csv", "summary.md", "notes.txt"}
     assert (tmp_path / "summary.md").read_text() == text
     assert text.startswith(f"# {result_title(recorded_machine_name(recording), recording.task)}\n")
@@ -161,14 +169,20 @@ def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recordin
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OutputError("no room")])
 def test_demo_that_stops_leaves_nothing(tmp_path, monkeypatch, error, recording):
-    def stop(folder, machine, recording):
-        if folder.name == "return":  # the second task
+    drawn = []
+
+    def stop(recording, folder):
+        drawn.append(folder)
+        if len(drawn) == 2:  # the second task
             raise error
 
-    monkeypatch.setattr(crane.cli.demo, "simulate", lambda *_, **__: recording)
-    monkeypatch.setattr(crane.cli.demo, "write_views", stop)
-    with pytest.raises(BaseException, match="no room|^$"):
-        crane.cli.demo.run_demo(tmp_path / "demo", lambda share: None)
+    monkeypatch.setattr("crane.simulation.simulate", lambda *_, **__: recording)
+    monkeypatch.setattr("crane.view.result_files._write_views", stop)
+    with (
+        pytest.raises(BaseException, match="no room|^$"),
+        replace_folder(tmp_path / "demo") as part,
+    ):
+        crane.cli.simulate.write_demo(part, lambda share: None)
     assert list(tmp_path.iterdir()) == []
 
 

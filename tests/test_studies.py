@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import crane
-from crane.cli.ranges import ranges
+from crane.cli.parsing import parse_grids, parse_ranges
 from crane.common.errors import ClosureError, InputError
 from crane.studies import measures
 from crane.studies.measures import measure_strokes
-from crane.view.plots.study_figure import plot_study
+from crane.view.result_files import plot_result
 
 pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
 PIN = {"link3_G.x": np.linspace(0.08, 0.11, 4), "link3_G.y": [-0.01, 0.0]}
@@ -149,13 +149,13 @@ def test_table_and_picture(pins, tmp_path):
     assert lines[2] == "# note: range is counted on 31 values of each of 2 strokes"
     assert lines[3].startswith("link3_G.x [m],link3_G.y [m],peak_q1 [N m],")
     assert "* " in pins.to_text() and "cannot be measured" in pins.to_text()
-    plot_study(pins, tmp_path / "map.png")
+    plot_result(pins, tmp_path / "map.png")
     for vary, draws in (
         ({"payload.mass": [0.0, 0.1, 0.2]}, None),
         ({"payload.mass": (0.0, 0.2), "link7.mass": (0.1, 0.2)}, 4),
     ):
         study = crane.study("mini_forwarder", vary, ["lift"], ["peak_X1"], draws=draws)
-        plot_study(study, tmp_path / f"{len(vary)}.svg")
+        plot_result(study, tmp_path / f"{len(vary)}.svg")
     assert len(list(tmp_path.glob("*.svg"))) == 2
 
 
@@ -204,15 +204,15 @@ def test_hydraulics_change_no_forces_of_a_given_motion(name):
 )
 def test_what_cannot_be_varied(text, draws, message):
     with pytest.raises(InputError) as caught:
-        ranges([text], draws)
+        parse_grids([text]) if draws is None else parse_ranges([text])
     assert message in str(caught.value)
 
 
 def test_ranges():
-    assert ranges(["a.x=0:1:3"])["a.x"] == pytest.approx([0, 0.5, 1])
-    assert ranges(["a=-1~2e-1"], 4)["a"] == pytest.approx([-1, 0.2])
+    assert parse_grids(["a.x=0:1:3"])["a.x"] == pytest.approx([0, 0.5, 1])
+    assert parse_ranges(["a=-1~2e-1"])["a"] == pytest.approx([-1, 0.2])
     with pytest.raises(InputError, match="varied twice"):
-        ranges(["a=0:1:3", "a=0:1:3"])
+        parse_grids(["a=0:1:3", "a=0:1:3"])
 
 
 def test_a_cluster_needs_dask_and_a_scheduler(monkeypatch):

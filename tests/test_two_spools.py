@@ -14,7 +14,7 @@ from test_circuit_transients import VALVE, C, G, clip, compare, cylinder, root
 import crane
 from crane.common.errors import CraneError
 from crane.control import ValveSignals
-from crane.view.plots.recording_figure import plot_recording
+from crane.view.result_files import plot_result
 
 TANK, SUPPLY = 1e5, 9.25e6
 C1, C2, C3, C4 = (ORIFICE[name] for name in ("c1", "c2", "c3", "c4"))
@@ -180,7 +180,7 @@ def test_a_task_of_levers_goes_with_its_joints(tmp_path):
             crane.sketch_circuit(machine, path)
         else:
             run = crane.simulate(machine, crane.joystick(machine, "lower"), duration=0.05)
-            plot_recording(run, path)
+            plot_result(run, path)
         assert path.stat().st_size > 1000
 
 

@@ -9,17 +9,17 @@ PROGRAM = """
 import sys
 import time
 from crane.cli import entry
-from crane.cli import waiting as terminal
 from crane.common import progress
-from crane.cli.shared import app, progress_bar
-from crane.formats import machine_loading
+from crane.cli import terminal
+from crane.cli.command import app
+from crane.cli.terminal import progress_bar
 
 progress.REPORT_DELAY, progress.REPORT_INTERVAL = float(sys.argv.pop()), 0.05
 
 @app.command()
 def wait(seconds: float, bar: bool = False, served: bool = False):
     if served:
-        with terminal.shown():
+        with terminal.hide_activity_line():
             time.sleep(seconds)
         return
     if bar:

@@ -13,7 +13,7 @@ from test_open_loops import five_bar
 
 import crane
 from crane.cli import program
-from crane.cli.simulate import control_of, under_task
+from crane.cli.simulate import add_task_loads, task_control
 
 DATA = Path(__file__).parent / "data"
 _HOIST = [
@@ -79,15 +79,15 @@ def writing():
     """Names of the commands that take a place to write to, or write into what they read."""
     return {
         name
-        for name, command in _walked(typer.main.get_command(program()))
+        for name, command in walked(typer.main.get_command(program()))
         if {one.name for one in command.params} & {"out", "force", "write_home"}
     }
 
 
-def _walked(command, words=()):
+def walked(command, words=()):
     for name, inner in command.commands.items():
         if hasattr(inner, "commands"):
-            yield from _walked(inner, (*words, name))
+            yield from walked(inner, (*words, name))
         else:
             yield " ".join((*words, name)), inner
 
@@ -107,8 +107,10 @@ def read(folder):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         mini = crane.load("mini_forwarder")
-        control = control_of(mini, "lift", None)
-        crane.simulate(under_task(mini, "lift"), control, step=0.01).to_csv(folder / "mini.csv")
+        control = task_control(mini, "lift", None)
+        crane.simulate(add_task_loads(mini, "lift"), control, step=0.01).to_csv(
+            folder / "mini.csv"
+        )
         crane.simulate(crane.load(folder / "four_bar.yaml"), duration=0.01).to_csv(
             folder / "run.csv"
         )

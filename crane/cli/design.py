@@ -1,72 +1,105 @@
-"""The command that finds numbers of a machine: design."""
+"""Commands that vary parameters: study, design."""
 
-import os
 from typing import Annotated
 
 import typer
 
-from crane.cli.shared import (
-    BY_COMMAND,
-    Change,
-    Force,
-    LoadFrame,
-    LoadRule,
-    Lock,
+from crane.cli.command import command
+from crane.cli.options import (
+    Frame,
     MachineName,
-    Out,
-    OwnMeasures,
-    Processes,
-    Require,
-    Scheduler,
-    app,
-    load,
-    progress_bar,
+    OutputFolder,
+    ParallelOptions,
+    ParameterOptions,
+    Requirements,
+    Rule,
+    Seed,
+    Tasks,
+    UserMeasures,
 )
+from crane.cli.parsing import parse_grids, parse_ranges
+from crane.cli.terminal import progress_bar
 
 
-@app.command()
+@command()
+def study(
+    machine: MachineName,
+    options: ParameterOptions,
+    parallel: ParallelOptions,
+    output: OutputFolder,
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=VALUES",
+            help="A parameter and its values start:stop:count, or with --draws its range "
+            "low~high; may be repeated.",
+        ),
+    ],
+    task: Tasks = None,
+    measure: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EXPRESSION",
+            help="A measure, as peak_X2 or load(4, 0) / mass; may be repeated; all by default.",
+        ),
+    ] = None,
+    require: Requirements = None,
+    measures: UserMeasures = None,
+    frame: Frame = None,
+    rule: Rule = "none",
+    draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Compute measures of variants, on a grid or at random."""
+    from crane.studies import study as compute
+
+    axes = parse_grids(vary) if draws is None else parse_ranges(vary)
+    with progress_bar("computing variants") as progress:
+        result = compute(
+            options.load(machine), axes, task, measure, require=require or (),
+            user_measures=measures, frame=frame, rule=rule, draws=draws, seed=seed,
+            progress=progress, **parallel.arguments(),
+        )  # fmt: skip
+    output.write(result)
+
+
+@command()
 def design(
     machine: MachineName,
+    options: ParameterOptions,
+    parallel: ParallelOptions,
+    output: OutputFolder,
     vary: Annotated[
-        list[str], typer.Option(metavar="NAME=LOW~HIGH", help="A number and its range.")
+        list[str],
+        typer.Option(metavar="NAME=LOW~HIGH", help="A parameter and its range; may be repeated."),
     ],
-    out: Out = BY_COMMAND,
     minimise: Annotated[
-        list[str] | None, typer.Option(metavar="EXPRESSION", help="What shall be the least.")
+        list[str] | None,
+        typer.Option(metavar="EXPRESSION", help="An objective to minimise; may be repeated."),
     ] = None,
     maximise: Annotated[
-        list[str] | None, typer.Option(metavar="EXPRESSION", help="What shall be the largest.")
+        list[str] | None,
+        typer.Option(metavar="EXPRESSION", help="An objective to maximise; may be repeated."),
     ] = None,
-    require: Require = None,
-    measures: OwnMeasures = None,
-    frame: LoadFrame = None,
-    rule: LoadRule = "none",
-    task: Annotated[
-        list[str] | None, typer.Option(help="A task for forces and energy; all if not given.")
-    ] = None,
-    starts: Annotated[int, typer.Option(help="Number of searches.")] = 10,
-    points: Annotated[int, typer.Option(help="Of the front, with several goals.")] = 15,
-    seed: Annotated[int, typer.Option(help="Of the starts.")] = 0,
-    processes: Processes = None,
-    scheduler: Scheduler = None,
-    change: Change = None,
-    lock: Lock = None,
-    force: Force = False,
+    require: Requirements = None,
+    measures: UserMeasures = None,
+    frame: Frame = None,
+    rule: Rule = "none",
+    task: Tasks = None,
+    starts: Annotated[int, typer.Option(help="Number of local searches.")] = 10,
+    points: Annotated[
+        int, typer.Option(help="Points of the Pareto front of several objectives.")
+    ] = 15,
+    seed: Seed = 0,
 ) -> None:
-    """Find the numbers of a machine that are best for loads, forces or measures of your own."""
-    from crane.cli.ranges import drawn
-    from crane.cli.runs import check_folder, write_design
-    from crane.studies.design import design as run
+    """Optimize parameters for objectives and constraints."""
+    from crane.studies.design import design as compute
 
-    check_folder(out, force)
-    loaded = load(machine, lock, change)
+    loaded = options.load(machine)
     with progress_bar("searching") as progress:
-        found = run(
-            loaded, drawn(vary), minimise=minimise or (), maximise=maximise or (),
+        result = compute(
+            loaded, parse_ranges(vary), minimise=minimise or (), maximise=maximise or (),
             require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
-            starts=starts, points=points, seed=seed, scheduler=scheduler,
-            processes=(os.cpu_count() or 1) if processes is None else processes,
-            progress=progress,
+            starts=starts, points=points, seed=seed, progress=progress, **parallel.arguments(),
         )  # fmt: skip
-    write_design(out, found, force)
-    print(f"{found.to_markdown()}\nwritten to {out}")
+    output.write(result)

@@ -1,4 +1,4 @@
-"""The program: options of all commands, and what becomes of errors."""
+"""The program: its commands by group, its help, and what happens to errors."""
 
 import gc
 import io
@@ -6,56 +6,68 @@ import os
 import sys
 import warnings
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 import crane
-from crane.cli.shared import INTERRUPTED, app, say
-from crane.cli.waiting import watched
+from crane.cli.command import app
+from crane.cli.terminal import INTERRUPTED, activity_line, print_message
 from crane.common.errors import CraneError, CraneWarning, format_one_line
 from crane.common.package_search import use_load_options
 
-_SPARING = 20_000  # objects between collections: nearly all that starting makes is there to stay
+_GC_THRESHOLD = 20_000  # objects between collections: nearly all that starting makes stays
 
-_HOMES = {  # modules of this room, in the order of `crane --help`, and the commands in each
-    "add": "add",
-    "breakout": "breakout",
-    "calibrate": "calibrate",
-    "capacity": "capacity",
-    "check": "check",
-    "circuit": "circuit",
-    "commands": "list info view plot demo",
-    "convert": "convert import",
-    "design": "design",
-    "excite": "excite",
-    "identify": "identify payload",
-    "live": "live",
-    "modes": "modes",
-    "pictures": "sketch",
-    "power": "power",
-    "schema": "schema",
-    "sensitivities": "sensitivities",
-    "simulate": "simulate",
-    "stability": "stability",
-    "study": "study",
-    "sway": "sway",
-    "working_range": "working-range",
-    "workspace": "workspace",
+GROUPS = {  # modules of this room and their commands, in the order of use
+    "describe": "list info check add",
+    "simulate": "demo simulate sway modes sensitivities",
+    "identify": "excite identify payload circuit calibrate",
+    "rate": "workspace working-range breakout capacity stability power",
+    "design": "study design",
+    "show": "view plot sketch live",
+    "exchange": "convert import schema",
 }
+_HELP = """\
+Simulate, identify, rate and design machines with closed kinematic chains.
+
+  crane info patu655                            describe a bundled machine
+  crane simulate mini_forwarder --task lift     simulate a task of it
+  crane view simulate                           show the run in a browser
+
+{commands}
+
+crane COMMAND --help shows arguments and options. --version shows the version.
+All commands take --strict (refuse inertias that no body has) and --debug.
+"""
+
+
+class _Program(TyperGroup):
+    """The commands, with a help of one screen."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help: examples, then all commands by group."""
+        lines = []
+        for group, names in GROUPS.items():
+            title = group
+            for name in names.split():
+                text = (self.commands[name].help or "").partition("\n")[0].rstrip(".")
+                lines.append(f"{title:9} {name:14} {text}")
+                title = ""
+        formatter.write(_HELP.format(commands="\n".join(lines)))
 
 
 def program(command: str = "") -> typer.Typer:
     """The program with the command of that name at least, or with all where none has it."""
-    homes = [home for home, names in _HOMES.items() if command in names.split()]
-    for home in homes or _HOMES:
+    homes = [group for group, names in GROUPS.items() if command in names.split()]
+    for home in homes or GROUPS:
         import_module(f"crane.cli.{home}")
     return app
 
 
 def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
-    gc.set_threshold(_SPARING)
+    gc.set_threshold(_GC_THRESHOLD)
     arguments = [word for word in sys.argv[1:] if word not in ("--debug", "--strict")]
     debug, strict = (word in sys.argv[1:] for word in ("--debug", "--strict"))
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text
@@ -64,8 +76,8 @@ def main() -> None:
     warnings.simplefilter("once", CraneWarning)
     try:
         run = program(*arguments[:1])
-        with watched(" ".join(["crane", *arguments[:1]])), use_load_options(strict=strict):
-            status = run(args=arguments, standalone_mode=False, prog_name="crane")
+        with activity_line(" ".join(["crane", *arguments[:1]])), use_load_options(strict=strict):
+            status = run(args=arguments or ["--help"], standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
         if sys.stdout is not None:  # it is where the shell has closed it
@@ -73,45 +85,47 @@ def main() -> None:
     except CraneError as error:
         if debug:
             raise
-        say(f"error: {error}")
-        sys.exit(2)
+        _exit_with_error(str(error))
     except KeyboardInterrupt:
-        say("error: interrupted, nothing was written")
+        print_message("error: interrupted, nothing was written")
         sys.exit(INTERRUPTED)
     except OSError as error:
         if debug:
             raise
         _abandon_output()
-        if isinstance(error, BrokenPipeError):  # whoever read it has seen enough
+        if isinstance(error, BrokenPipeError):  # the reader has closed the pipe
             sys.exit(1)
-        place = error.filename or "output"
-        reason = error.strerror or error
-        say(f"error: {format_one_line(f'{place}: {reason}')}, check the place and try again")
-        sys.exit(2)
+        place, reason = error.filename or "output", error.strerror or error
+        text = format_one_line(f"{place}: {reason}")
+        _exit_with_error(f"{text}, check the place and try again")
     except Exception as error:
-        # the command line parser's own errors, whose class is not public
+        # errors of the command line parser, whose class is not public
         message = getattr(error, "format_message", None)
         if debug or message is None:
             raise
-        if text := message():
-            context = getattr(error, "ctx", None)
-            command = getattr(context, "command_path", "crane")
-            shows = "the commands" if command == "crane" else "what it takes"
-            say(
-                f"error: {format_one_line(' '.join(text.split()))} ({command} --help shows "
-                f"{shows})"
-            )
+        if not (text := message()):  # the help was shown
+            sys.exit(2)
+        command = getattr(getattr(error, "ctx", None), "command_path", "crane")
+        shows = "the commands" if command == "crane" else "what it takes"
+        line = format_one_line(" ".join(text.split()))
+        _exit_with_error(f"{line} ({command} --help shows {shows})")
+    if not arguments:  # the help was shown, but nothing was done
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _exit_with_error(text: str) -> None:
+    print_message(f"error: {text}")
+    sys.exit(2)
+
+
+def _show_version(is_given: bool) -> None:
+    if is_given:
         print(f"crane {crane.__version__}")
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(cls=_Program)
 def _options(
     version: Annotated[
         bool,
@@ -120,17 +134,14 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Machines with closed kinematic chains: simulate, identify and show.
-
-    Every command takes --strict, which refuses inertias that no body has, and --debug.
-    """
+    """Machines with closed kinematic chains: simulate, identify and show."""
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    say(f"warning: {format_one_line(str(message))}")
+    print_message(f"warning: {format_one_line(str(message))}")
 
 
 def _abandon_output() -> None:
-    """Let the interpreter end without a word on what could not be written."""
+    """Let the interpreter end without errors about output that cannot be written."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

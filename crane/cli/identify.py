@@ -1,90 +1,214 @@
-"""Commands that find parameters from strokes and forces: identify, payload."""
+"""Commands that estimate parameters: excite, identify, payload, circuit, calibrate."""
 
-import dataclasses
 import warnings
 from collections.abc import Iterator, Sequence
-from math import inf
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from crane.cli.shared import (
-    BY_COMMAND,
-    Columns,
-    Force,
-    From,
-    Lock,
+from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.options import (
+    ComparedColumns,
+    Fit,
+    Frame,
     MachineName,
     Method,
-    Out,
+    OptionalFit,
+    OptionalOutputFolder,
+    OutputFolder,
+    ParameterOptions,
     RecordingFile,
-    Recordings,
-    Train,
+    RecordingFiles,
+    RecordingOptions,
+    Seed,
+    TrainingWindow,
     Trust,
-    Until,
     Validation,
-    app,
-    by_joint,
-    load,
-    progress_bar,
-    span_of,
-    status,
-    window,
 )
-from crane.common.errors import CraneWarning, InputError, RecordingError
+from crane.cli.parsing import (
+    parse_fits,
+    parse_names,
+    parse_priors,
+    parse_terms,
+    parse_trials,
+    parse_values,
+    parse_window,
+)
+from crane.cli.terminal import progress_bar, status
+from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
 
 if TYPE_CHECKING:
-    from crane.description.estimation_settings import ParameterPrior, TermValues
+    from crane.common.result import Result
     from crane.identification.signals.signal_processing import Motion
     from crane.machine import Machine
     from crane.recordings.recording import Recording
 
-_FEWEST = 50  # samples of a part that is held out
-_TERM = "NAME, NAME=NUMBERS or NAME=off, as in q1.presliding=1e-4"
-_TRY = "each NAME=VALUES once, as bandwidth=2,5,10 or bodies=1%,10%"
-_PRIOR = "NAME=STD, as in bodies=10%, q1.viscous=50 or q1.viscous=200+-50, a share, or none"
+_MIN_HELD_OUT_SAMPLES = 50
+_CIRCUIT_MODELS = ("orifices", "valve", "friction")
 
 
-@app.command()
-def identify(
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions(OptionBlock):
+    """A periodic excitation motion."""
+
+    panel = "Options of a motion"
+    period: Annotated[float, typer.Option(metavar="SECONDS", help="Period of the motion.")] = 10.0
+    harmonics: Annotated[int, typer.Option(help="Harmonics of the motion.")] = 5
+    periods: Annotated[int, typer.Option(help="Number of steady periods.")] = 3
+    acceleration: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT=VALUE", help="Largest acceleration of a joint; may be repeated."
+        ),
+    ] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `crane.excite` by name."""
+        return {
+            "period": self.period, "harmonics": self.harmonics, "periods": self.periods,
+            "acceleration": parse_values("--acceleration", self.acceleration),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignalOptions(OptionBlock):
+    """Valve signals for calibration."""
+
+    panel = "Options of valve signals (with --fit)"
+    duration: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Duration of the signals.")
+    ] = 20.0
+    sensors: ComparedColumns = None
+    rate: Annotated[
+        float, typer.Option(help="Largest rate of the signals, in spool strokes per second.")
+    ] = 2.0
+    margin: Annotated[
+        float, typer.Option(metavar="SHARE", help="Share of a stroke kept free at both ends.")
+    ] = 0.1
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `crane.excite_valves` by name."""
+        return {
+            "duration": self.duration, "sensors": parse_names(self.sensors), "rate": self.rate,
+            "margin": self.margin,
+        }  # fmt: skip
+
+
+@command()
+def excite(
     machine: MachineName,
-    recording: Recordings,
-    out: Out = BY_COMMAND,
-    train: Train = None,
-    validation: Validation = None,
-    columns: Columns = None,
-    since: From = None,
-    until: Until = None,
-    method: Method = "wls",
+    motion: MotionOptions,
+    signals: SignalOptions,
+    options: ParameterOptions,
+    output: OutputFolder,
+    fit: OptionalFit = None,
+    criterion: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="logdet or condition, of the information or regressor matrix."
+        ),
+    ] = "logdet",
+    seed: Seed = 0,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="Standard deviation of the force of a joint, 1 % of its limit by default; with "
+            "--fit, of a column; may be repeated.",
+        ),
+    ] = None,
+    step: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Step of the written samples.")
+    ] = 0.01,
+) -> None:
+    """Design an excitation: a motion or valve signals.
+
+    A motion determines base parameters best; valve signals, with --fit, the parameters that
+    calibrate fits.
+    """
+    from crane.description.machine_lookup import command_line_arguments
+    from crane.identification.excitation.periodic_excitation import excite as design_motion
+    from crane.identification.excitation.signal_excitation import excite_valves
+
+    if fit is None:
+        signals.refuse("only goes with --fit, name parameters to fit or leave it out")
+    else:
+        motion.refuse("does not go with --fit, leave it out")
+    fits = None if fit is None else parse_fits(fit)
+    deviations = parse_values("--noise", noise)
+    common: dict[str, Any] = {
+        "criterion": criterion,
+        "noise": deviations,
+        "step": step,
+        "seed": seed,
+    }
+    loaded = options.load(machine)
+    result: Result
+    with progress_bar("optimising") as progress:
+        if fits is None:
+            result = design_motion(loaded, **motion.arguments(), **common, progress=progress)
+            note = f"see it with: crane view {output.out}/reference.csv"
+        else:
+            result = excite_valves(
+                loaded, fits, **signals.arguments(), **common, progress=progress
+            )
+            same = command_line_arguments(
+                machine, changes=loaded.parameter_changes, lock=loaded.locked_joints
+            )
+            inputs = f"--inputs {output.out}/signals.csv"
+            note = f"play it with: crane simulate {same} {inputs} --out run"
+    output.write(result, f"; {note}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(OptionBlock):
+    """The model that is identified."""
+
+    panel = "Model options"
     term: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME[=NUMBERS]",
             help="A term of the model, as q*.rotor_inertia, q1.presliding=1e-4, q5+q6.viscous; "
-            "NAME=off leaves it out.",
+            "NAME=off leaves it out; may be repeated.",
         ),
-    ] = None,
+    ] = None
     prior: Annotated[
         list[str] | None,
         typer.Option(
             metavar="[NAME=]STD",
-            help="What is known before: a share of all that is described, as 0.3; or by name, as "
-            "bodies=10%, q1.viscous=200+-50; none: nothing.",
+            help="Prior standard deviation: of all parameters as a share, as 0.3; or by name, as "
+            "bodies=10%, q1.viscous=200+-50; none: no prior; may be repeated.",
         ),
-    ] = None,
+    ] = None
     feasible: Annotated[
-        bool, typer.Option("--feasible", help="Only bodies and friction that can exist.")
-    ] = False,
+        bool, typer.Option("--feasible", help="Require physically feasible parameters.")
+    ] = False
+
+
+@command()
+def identify(
+    machine: MachineName,
+    recording: RecordingFiles,
+    model: ModelOptions,
+    options: ParameterOptions,
+    reading: RecordingOptions,
+    output: OutputFolder,
+    train: TrainingWindow = None,
+    validation: Validation = None,
+    method: Method = "wls",
     bandwidth: Annotated[
         float | None,
-        typer.Option(metavar="HZ", help="Of the low-pass; by the motion if not given."),
+        typer.Option(metavar="HZ", help="Passband of the filter; by the motion by default."),
     ] = None,
     slow: Annotated[
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
-            help="Velocity below which its rows are left out, in m/s or rad/s.",
+            help="Velocity in m/s or rad/s below which samples of a joint are left out; may be "
+            "repeated.",
         ),
     ] = None,
     tried: Annotated[
@@ -92,167 +216,102 @@ def identify(
         typer.Option(
             "--try",
             metavar="NAME=VALUES",
-            help="Values of which cross-validation in the training chooses one, as bandwidth=5,10 "
-            "or, of a prior, bodies=1%,10%.",
+            help="Values of which cross-validation of the training data chooses one, as "
+            "bandwidth=5,10 or, of a prior, bodies=1%,10%; may be repeated.",
         ),
     ] = None,
-    lock: Lock = None,
     trust: Trust = False,
-    force: Force = False,
 ) -> None:
-    """Find a machine's parameters from recordings, and how well they predict."""
-    from crane.cli.runs import check_folder, write_identification
+    """Estimate inertial parameters and joint friction.
+
+    The recordings have coordinates and forces. Held-out data validate the estimate.
+    """
     from crane.common.samples import as_number
     from crane.identification.mechanics.cross_validation import (
         cross_validate,
         format_trials,
         identify_options,
     )
-    from crane.identification.mechanics.identify import identify as run
+    from crane.identification.mechanics.identify import identify as estimate
     from crane.identification.mechanics.write_identified import check_rewritable
 
-    check_folder(out, force)
-    fitted, changes, known = window(train), terms(term), priors(prior)
-    span = span_of(since, until)
-    slowest, grid = by_joint("--slow", slow), values_tried(tried)
-    loaded = load(machine, lock)
-    if known is None:
-        estimation = dataclasses.replace(loaded.estimation, prior={})
-        loaded = loaded.replace(estimation=estimation)
-    if feasible:
+    window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
+    slowest, trials = parse_values("--slow", slow), parse_trials(tried)
+    loaded = options.load(machine)
+    if priors is None:
+        loaded = loaded.replace(estimation=replace(loaded.estimation, prior={}))
+    if model.feasible:
         check_rewritable(loaded)
-    learned, outside = _divided(_read(recording, loaded, columns, span), fitted)
-    judges: list[Recording | Motion] = [*_moving(loaded, outside, trust)]
+    inside, outside = _split(_read(recording, loaded, reading), window)
+    judges: list[Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
-        warnings.warn(
-            f"nothing of use lies outside of --train {train}, so nothing judges",
-            CraneWarning,
-            stacklevel=1,
-        )
-    rest = "the rest" if judges else ""
-    judges += _read(validation or [], loaded, columns)
+        text = f"nothing of use lies outside of --train {train}, so nothing judges"
+        warnings.warn(text, CraneWarning, stacklevel=1)
+    names = _recording_names(recording, validation, train, bool(judges))
+    judges += _read(validation or [], loaded, RecordingOptions(columns=reading.columns))
     if bandwidth is not None:
-        shortest = max(min(float(x.time[-1] - x.time[0]) for x in learned), 1e-3)
+        shortest = max(min(float(x.time[-1] - x.time[0]) for x in inside), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", greater_than=5 / shortest)
-    options: dict[str, Any] = {
-        "method": method, "prior": known, "feasible": feasible, "terms": changes,
+    settings: dict[str, Any] = {
+        "method": method, "prior": priors, "feasible": model.feasible, "terms": terms,
         "bandwidth": bandwidth, "slow": slowest, "trust": trust,
     }  # fmt: skip
-    if grid:
+    if trials:
         with progress_bar("cross-validating") as progress:
-            trials = cross_validate(loaded, learned, grid, progress, **options)
-        print(f"{format_trials(trials)}\n")
-        options = identify_options(trials[0], options)
+            tried_settings = cross_validate(loaded, inside, trials, progress, **settings)
+        print(f"{format_trials(tried_settings)}\n")
+        settings = identify_options(tried_settings[0], settings)
     with progress_bar("identifying") as progress:
-        result = run(loaded, learned, judges or None, progress=progress, **options)
-    with status("writing the report"):
-        named = [", ".join(path.name for path in paths or ()) for paths in (recording, validation)]
-        if train is not None:
-            named = [f"{named[0]}, {train} s", ", ".join(filter(None, [rest, named[1]]))]
-        if result.validation is None:
-            named[1] = ""
-        write_identification(out, result, named[0], named[1], force)
-    print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
+        result = estimate(loaded, inside, judges or None, progress=progress, **settings)
+    if result.validation is None:
+        names["validation"] = ""
+    output.write(result, f"; see {output.out}/report.html", **names)
 
 
-def terms(words: Sequence[str] | None) -> "dict[str, TermValues | None]":
-    """Terms by name: their numbers, None of those that are off.
-
-    Raises:
-        InputError: Something else is written, or a name twice.
-    """
-    found: dict[str, TermValues | None] = {}
-    for word in words or ():
-        name, equals, text = word.partition("=")
-        try:
-            is_word = not equals or text in ("on", "off")
-            numbers = () if is_word else tuple(map(float, text.split(",")))
-        except ValueError:
-            raise InputError(f"--term is '{word}', write {_TERM}") from None
-        if name in found:
-            raise InputError(f"--term names '{name}' twice, give it once")
-        found[name] = None if text == "off" else numbers
-    return found
-
-
-def priors(words: Sequence[str] | None) -> "dict[str, ParameterPrior] | None":
-    """What is known by name, "*" of a share without one; None of `none`.
-
-    Raises:
-        InputError: Something else is written, or a name twice.
-    """
-    from crane.description.estimation_settings import ParameterPrior
-
-    found: dict[str, ParameterPrior] = {}
-    if words and list(words) == ["none"]:
-        return None
-    for word in words or ():
-        name, equals, text = word.rpartition("=")
-        name = name.strip() if equals else "*"
-        try:
-            known = ParameterPrior.parse(text)
-        except InputError:
-            raise InputError(f"--prior is '{word}', write {_PRIOR}") from None
-        if name in found:
-            raise InputError(f"--prior says two things of '{name}', give one")
-        found[name] = known if equals else dataclasses.replace(known, relative=True)
-    return found
-
-
-def values_tried(words: Sequence[str] | None) -> "dict[str, list[float | ParameterPrior]]":
-    """Values by name: bandwidths, or what is known of parameters.
-
-    Raises:
-        InputError: Something else is written, or a name twice.
-    """
-    from crane.description.estimation_settings import ParameterPrior
-
-    found: dict[str, list[float | ParameterPrior]] = {}
-    for word in words or ():
-        name, _, text = word.rpartition("=")
-        name = name.strip()
-        try:
-            one = float if name == "bandwidth" else ParameterPrior.parse
-            values = [one(each) for each in text.split(",")]
-        except (ValueError, InputError):
-            name = ""
-        if not name or name in found:
-            raise InputError(f"--try is '{word}', write {_TRY}")
-        found[name] = values
-    return found
+def _recording_names(
+    recordings: Sequence[Path], validation: Sequence[Path] | None, train: str | None, rest: bool
+) -> dict[str, str]:
+    """Names of training and held-out data, for the report; `rest`: that outside of --train."""
+    trained, held_out = (
+        ", ".join(x.name for x in paths or ()) for paths in (recordings, validation)
+    )
+    if train is not None:
+        trained = f"{trained}, {train} s"
+        held_out = ", ".join(filter(None, ["the rest" if rest else "", held_out]))
+    return {"recordings": trained, "validation": held_out}
 
 
 def _read(
     paths: Sequence[Path],
     machine: "Machine",
-    columns: Path | None,
-    span: "tuple[float, float]" = (-inf, inf),
+    reading: RecordingOptions,
+    needs: Sequence[Sequence[str]] = (),
 ) -> "list[Recording]":
-    from crane.cli.runs import read_run
-
-    found = []
+    recordings = []
     for path in paths:
         with status(f"reading {path.name}"):
-            found.append(read_run(path, machine, columns, span))
-    return found
+            recordings.append(reading.read(path, machine, needs))
+    return recordings
 
 
-def _divided(
-    recordings: "list[Recording]", span: tuple[float, float]
+def _split(
+    recordings: "list[Recording]", window: tuple[float, float]
 ) -> "tuple[list[Recording], list[Recording]]":
-    """What lies within a window [s], and what of use lies before and after it."""
-    inside = [recording.between(*span) for recording in recordings]
+    """The parts of recordings inside a window [s], and those outside with enough samples."""
+    inside = [recording.between(*window) for recording in recordings]
     outside = [
         recording.at(part)
         for recording in recordings
-        for part in (recording.time < span[0], recording.time > span[1])
-        if part.sum() >= _FEWEST
+        for part in (recording.time < window[0], recording.time > window[1])
+        if part.sum() >= _MIN_HELD_OUT_SAMPLES
     ]
     return inside, outside
 
 
-def _moving(machine: "Machine", recordings: "list[Recording]", trust: bool) -> "Iterator[Motion]":
-    """Motions of those that can be judged by; of others it is told why they cannot."""
+def _usable_motions(
+    machine: "Machine", recordings: "list[Recording]", trust: bool
+) -> "Iterator[Motion]":
+    """Motions of recordings; with a warning about each that cannot be used."""
     from crane.identification.mechanics.smoothed_motion import smoothed_motion
 
     for recording in recordings:
@@ -264,26 +323,122 @@ def _moving(machine: "Machine", recordings: "list[Recording]", trust: bool) -> "
             warnings.warn(text, CraneWarning, stacklevel=1)
 
 
-@app.command()
+@command()
 def payload(
     machine: MachineName,
     recording: RecordingFile,
-    columns: Columns = None,
-    since: From = None,
-    until: Until = None,
-    frame: Annotated[
-        str | None, typer.Option(help="Link that carries the load; the tip if not given.")
-    ] = None,
+    options: ParameterOptions,
+    reading: RecordingOptions,
+    frame: Frame = None,
     method: Method = "wls",
-    lock: Lock = None,
     trust: Trust = False,
 ) -> None:
-    """Estimate mass and centre of mass of what a machine carries from a recording."""
+    """Estimate mass and centre of mass of the payload."""
     from crane.identification.mechanics.identify_payload import identify_payload
 
-    span = span_of(since, until)
-    loaded = load(machine, lock)
-    (carried,) = _read([recording], loaded, columns, span)
+    loaded = options.load(machine)
+    (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
         estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
     print(estimate.to_text(), end="")
+
+
+@command()
+def circuit(
+    machine: MachineName,
+    recording: RecordingFiles,
+    options: ParameterOptions,
+    reading: RecordingOptions,
+    output: OptionalOutputFolder,
+    joint: Annotated[
+        str, typer.Option(metavar="JOINT", help="The joint that the cylinder drives.")
+    ],
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="MODEL",
+            help="orifices (bulk modulus and c1 to c4), valve (neutral signal and dead band of a "
+            "compensated valve), or friction.",
+        ),
+    ] = "orifices",
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METHOD", help="Method for orifices: weak (the default), chambers or ls."
+        ),
+    ] = None,
+    period: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS", help="Period of a periodic motion to average, for orifices."
+        ),
+    ] = None,
+    validation: Validation = None,
+) -> None:
+    """Estimate orifices, valve or friction of a cylinder.
+
+    The recordings have valve signals and pressures. Bulk modulus is estimated with the orifices.
+    """
+    from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
+    from crane.identification.hydraulics.cylinder_signals import required_channels
+    from crane.identification.hydraulics.orifice_coefficients import identify_orifices
+    from crane.identification.hydraulics.valve_curve import identify_valve
+
+    if model not in _CIRCUIT_MODELS:
+        raise InputError(f"model '{model}' is unknown, {suggest_names(_CIRCUIT_MODELS, model)}")
+    if model != "orifices":
+        given = {"--method": method, "--period": period, "--validation": validation or None}
+        refuse_options(given, "is for --model orifices, leave it out")
+        if len(recording) > 1:
+            raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
+    loaded = options.load(machine)
+    if joint not in loaded.active:
+        raise InputError(
+            f"'{joint}' is not an active joint, {suggest_names(loaded.active, joint)}"
+        )
+    needs = required_channels(joint) if model == "orifices" else []
+    if model == "valve":
+        needs.append((f"voltage_{joint}",))
+    runs = _read(recording, loaded, reading, needs)
+    held_out = _read(validation or [], loaded, RecordingOptions(columns=reading.columns), needs)
+    result: Result
+    options_of_write: dict[str, Any] = {"unit": loaded.unit(joint)}
+    with status("identifying"):
+        if model == "valve":
+            result = identify_valve(loaded, runs[0], joint)
+        elif model == "friction":
+            result = identify_cylinder_friction(loaded, runs[0], joint)
+        else:
+            result = identify_orifices(loaded, runs, joint, method or "weak", period=period)
+            options_of_write["validation"] = [result.predict(x, period) for x in held_out]
+    output.write(result, **options_of_write)
+
+
+@command()
+def calibrate(
+    machine: MachineName,
+    recording: RecordingFiles,
+    options: ParameterOptions,
+    reading: RecordingOptions,
+    output: OptionalOutputFolder,
+    fit: Fit,
+    train: TrainingWindow = None,
+    validation: Validation = None,
+    sensors: ComparedColumns = None,
+) -> None:
+    """Fit parameters through simulations of valve signals."""
+    from crane.identification.calibration.calibrate import calibrate as run
+    from crane.recordings.run_folder import recording_file
+
+    fits, window = parse_fits(fit), parse_window(train)
+    loaded = options.load(machine)
+    paths, held_out = (
+        [recording_file(x) for x in given or ()] for given in (recording, validation)
+    )
+    with progress_bar("simulating") as progress:
+        result = run(
+            loaded, paths, fits, train=window, validation=held_out,
+            columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
+            progress=progress,
+        )  # fmt: skip
+    output.write(result, f"; see {output.out}/report.html")

@@ -1,171 +1,239 @@
-"""The command that simulates a machine."""
+"""Commands that compute motions: demo, simulate, sway, modes, sensitivities."""
 
 import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.loads import Load, loads_of
-from crane.cli.shared import (
-    BY_COMMAND,
-    INTERRUPTED,
-    Active,
-    Argument,
-    Change,
-    Columns,
-    Floating,
-    Force,
-    Free,
-    From,
-    Lock,
+from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.options import (
+    ChangeOptions,
+    Configuration,
     MachineName,
-    Out,
-    Packages,
-    Until,
-    app,
-    load,
-    progress_bar,
-    say,
-    span_of,
+    MachineOptions,
+    OptionalOutputFolder,
+    OutputFolder,
+    Outputs,
+    ParameterOptions,
+    Parameters,
+    RecordingOptions,
+    Task,
 )
+from crane.cli.parsing import (
+    parse_configuration,
+    parse_grids,
+    parse_loads,
+    parse_names,
+    parse_numbers,
+)
+from crane.cli.terminal import INTERRUPTED, print_message, progress_bar, status
 from crane.common.errors import CraneError, InputError, SimulationError, suggest_names
 
 if TYPE_CHECKING:
+    from crane.common.result import Result
     from crane.control import Controller, ValveCommand
     from crane.machine import Machine
     from crane.motion import Trajectory
+    from crane.simulation import Progress
+
+    Control = Controller | ValveCommand
+
+DEMO_MACHINES = "mini_forwarder", "excavator"
+_SIMULATED_SHARE = 0.3  # of the time of a task of the demonstration; drawing takes the rest
+
+ControllerName = Annotated[
+    str | None,
+    typer.Option(
+        "--controller",
+        metavar="NAME",
+        help="pi, computed-torque, valve-pd, valve-feedforward or tip-velocity; by default that "
+        "of the machine's gains, else computed-torque. Without a task and a path it holds the "
+        "home configuration, and by default no controller acts: drive forces are zero, valves "
+        "have their neutral signals.",
+    ),
+]
+Duration = Annotated[
+    float | None,
+    typer.Option(metavar="SECONDS", help="Duration; that of the task or path by default."),
+]
+Step = Annotated[float, typer.Option(metavar="SECONDS", help="Step of the recorded samples.")]
 
 
-@app.command()
-def simulate(
-    machine: MachineName,
-    out: Out = BY_COMMAND,
-    task: Annotated[str | None, typer.Option(help="A task of the machine.")] = None,
-    controller: Annotated[
-        str | None,
-        typer.Option(
-            help="pi, computed-torque, valve-pd, valve-feedforward, tip-velocity; along a task or "
-            "path, if not given, the one that the machine has gains for, else computed-torque. "
-            "Without both it holds the home posture; if not given then, no drive acts: forces "
-            "are zero, valves at their neutral signals."
-        ),
-    ] = None,
-    sway: Annotated[
-        str | None,
-        typer.Option(
-            metavar="METHOD",
-            help="Change the task's reference so that what hangs does not sway after it: flat, "
-            "zv, zvd; none only lets it hang still at the start. Through valves goes with "
-            "--controller valve-feedforward.",
-        ),
-    ] = None,
+@command()
+def demo(output: OutputFolder) -> None:
+    """Simulate and show all tasks of two bundled machines."""
+    from crane.common.atomic_output import replace_folder
+    from crane.view.result_files import FIGURE, PAGE
+
+    with progress_bar("simulating") as progress, replace_folder(output.out, output.force) as part:
+        text = write_demo(part, progress)
+    folder = output.out
+    print(f"{text}\nfigures:    {folder}/*/{FIGURE}")
+    print(f"animations: {folder}/*/{PAGE} (open them in a browser)")
+
+
+def write_demo(folder: Path, progress: "Progress") -> str:
+    """Simulate the tasks of the demonstration, and write a folder of each into a folder.
+
+    Returns:
+        The summaries of all tasks, Markdown.
+    """
+    from crane.formats import load
+    from crane.simulation import simulate as run
+    from crane.view.result_files import SUMMARY
+
+    tasks = [(machine, task) for machine in map(load, DEMO_MACHINES) for task in machine.tasks]
+    texts = []
+    for i, (machine, task) in enumerate(tasks):
+
+        def report(share: float, done: int = i) -> None:
+            progress((done + _SIMULATED_SHARE * share) / len(tasks))
+
+        control = task_control(machine, task, None)
+        recording = run(add_task_loads(machine, task), control, label=task, progress=report)
+        texts.append(recording.write(folder / task, views=True))
+    progress(1.0)
+    text = "\n".join(texts)
+    (folder / SUMMARY).write_text(text, encoding="utf-8")
+    return text
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions(OptionBlock):
+    """The motion that is simulated."""
+
+    panel = "Motion options"
+    task: Task = None
     path: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A motion to follow in the place of a task: time and the driven joints, or x, y, "
-            "z of the tip, and inclination or roll, pitch, yaw of its frame.",
+            help="A motion to follow instead of a task: time and the active joints, or x, y, z "
+            "of the tip, and inclination or roll, pitch, yaw of its frame.",
         ),
-    ] = None,
+    ] = None
+    controller: ControllerName = None
+    sway: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METHOD",
+            help="Suppress sway after the motion: flat, zv or zvd; none only starts it with the "
+            "load at rest. With valves, add --controller valve-feedforward.",
+        ),
+    ] = None
+    duration: Duration = None
+
+    def control(self, machine: "Machine", step: float) -> "tuple[Control | None, float | None]":
+        """Controller and duration [s] of the motion, as `task_control` and `task_duration`."""
+        from crane.motion.path_reader import read_path
+
+        if self.path is None:
+            control = task_control(machine, self.task, self.controller, self.sway)
+            return control, task_duration(machine, self.task, self.duration)
+        refuse_options({"--task": self.task}, "does not go with --path, leave one out")
+        reference, duration = read_path(machine, self.path), self.duration
+        if duration is None and step > 0:
+            duration = math.ceil(reference.duration / step - 1e-9) * step  # whole steps
+        return tracking_control(machine, reference, self.controller, self.sway), duration
+
+    def label(self, machine: "Machine", control: "Control | None") -> str:
+        """Name of the motion in the recording."""
+        uncontrolled = "free motion" if machine.hydraulics is None else "valves at rest"
+        path = None if self.path is None else self.path.stem
+        return self.task or path or ("hold" if control else uncontrolled)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntegrationOptions(OptionBlock):
+    """How a motion is integrated."""
+
+    panel = "Integration options"
+    method: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METHOD",
+            help="Integration method: DOP853 (the default), Radau (stiff), BDF or LSODA of "
+            "scipy, with error control; rosenbrock, for circuits; rk4, with --step as step size.",
+        ),
+    ] = None
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Relative error of a step in the method's error control, as 1e-8."),
+    ] = None
+
+
+@command()
+def simulate(
+    machine: MachineName,
+    motion: MotionOptions,
+    integration: IntegrationOptions,
+    options: MachineOptions,
+    reading: RecordingOptions,
+    output: OutputFolder,
     inputs: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Measured valve signals to replay, and to compare with what else was measured.",
+            help="A recording whose valve signals are replayed, and whose other columns are "
+            "compared with the simulation.",
         ),
     ] = None,
-    duration: Annotated[
-        float | None,
-        typer.Option(help="In seconds; that of the task or path if not given."),
+    load: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FRAME=WRENCH",
+            help="An external force: FX,FY,FZ in N, followed by MX,MY,MZ in N m if needed, or a "
+            "CSV file with columns time, force_x ... moment_z; FRAME@frame=... turns with the "
+            "frame; may be repeated.",
+        ),
     ] = None,
-    step: Annotated[float, typer.Option(help="Between recorded instants in seconds.")] = 1e-3,
+    step: Step = 1e-3,
     npz: Annotated[
         bool,
         typer.Option(
-            "--npz", help="Record as npz, of a long run: under half of a CSV, and read at once."
+            "--npz", help="Write the recording as npz: smaller than CSV, and faster to read."
         ),
     ] = False,
-    columns: Columns = None,
-    since: From = None,
-    until: Until = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            help="DOP853, if not given, or Radau for what is stiff: their steps are as long as "
-            "their error allows, and recorded every --step; rosenbrock, of circuits; rk4, with "
-            "this step; BDF, LSODA of scipy."
-        ),
-    ] = None,
-    tolerance: Annotated[
-        float | None, typer.Option(help="Error of a step per size of the state, such as 1e-8.")
-    ] = None,
-    load_: Load = None,
-    change: Change = None,
-    lock: Lock = None,
-    active: Active = None,
-    free: Free = None,
-    floating: Floating = False,
-    packages: Packages = None,
-    argument: Argument = None,
-    force: Force = False,
 ) -> None:
-    """Simulate a task, a path, measured inputs, or the home posture, held or let go."""
-    from crane.cli.runs import check_folder, write_run
-    from crane.motion.path_reader import read_path
-    from crane.simulation import simulate as run
+    """Simulate a task, a path, or measured valve signals.
 
-    check_folder(out, force)
-    loaded = load(machine, lock, change, active, free, floating, packages, argument)
-    loaded = under_task(loaded, task).with_external_forces(*loads_of(load_))
+    Without these it simulates the home configuration, held by a controller or released.
+    """
+    from crane.simulation import simulate as run
+    from crane.simulation.recording_replay import replay
+
+    loaded = add_task_loads(options.load(machine), motion.task)
+    loaded = loaded.with_external_forces(*parse_loads(load))
+    result: Result
     if inputs is not None:
-        named = {"--task": task, "--path": path, "--controller": controller, "--sway": sway}
-        given = [option for option, value in named.items() if value is not None]
-        if given:
-            raise InputError(f"{given[0]} does not go with --inputs, leave one out")
-        if duration is not None:
-            raise InputError("--duration does not go with --inputs, the file ends by itself")
-        for option, value in {"--method": method, "--tolerance": tolerance}.items():
-            if value is not None:
-                raise InputError(f"{option} does not go with --inputs, leave it out")
-        _replay(loaded, inputs, out, step, npz, columns, span_of(since, until), force)
-        return
-    of_inputs = {"--columns": columns, "--from": since, "--until": until}
-    for option in [option for option, given in of_inputs.items() if given is not None]:
-        raise InputError(f"{option} is for --inputs, leave it out")
-    if path is not None and task is not None:
-        raise InputError("--task does not go with --path, leave one out")
-    control: Controller | ValveCommand | None
-    if path is not None:
-        reference = read_path(loaded, path)
-        control = follower_of(loaded, reference, controller, sway)
-        if duration is None and step > 0:
-            duration = math.ceil(reference.duration / step - 1e-9) * step  # whole steps
+        for block in (motion, integration):
+            block.refuse("does not go with --inputs, leave it out")
+        with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
+            _, result = replay(loaded, inputs, step, progress, reading.columns, reading.span)
     else:
-        control = control_of(loaded, task, controller, sway)
-        duration = duration_of(loaded, task, duration)
-    left = "free motion" if loaded.hydraulics is None else "valves at rest"
-    label = task or (path.stem if path else "hold" if control else left)
-    with kept_in(out, npz, force), progress_bar("simulating") as progress:
-        recording = run(
-            loaded, control, duration=duration, step=step, label=label, method=method,
-            tolerance=tolerance, progress=progress,
-        )  # fmt: skip
-    print(write_run(out, recording, npz, force), end="")
-    print(f"\nwritten to {out}; see it with: crane view {out}")
+        reading.refuse("is for --inputs, leave it out")
+        control, duration = motion.control(loaded, step)
+        label = motion.label(loaded, control)
+        with _write_stopped_run(output, npz), progress_bar("simulating") as progress:
+            result = run(
+                loaded, control, duration=duration, step=step, label=label,
+                method=integration.method, tolerance=integration.tolerance, progress=progress,
+            )  # fmt: skip
+    output.write(result, f"; see it with: crane view {output.out}", npz=npz)
 
 
 @contextmanager
-def kept_in(folder: Path, npz: bool, force: bool) -> Iterator[None]:
-    """Write what there is of a run that is stopped in the block, by an error or by its user.
+def _write_stopped_run(output: OutputFolder, npz: bool) -> Iterator[None]:
+    """Write the run until it is stopped in the block, by an error or by the user.
 
     Raises:
-        CraneError: What stopped it, with where what there is of it lies.
+        CraneError: The error, with the folder of the run.
     """
-    from crane.cli.runs import write_run
     from crane.simulation import InterruptedRun
 
     try:
@@ -174,18 +242,18 @@ def kept_in(folder: Path, npz: bool, force: bool) -> Iterator[None]:
         recording = getattr(stop, "recording", None)
         if recording is None:
             raise
-        write_run(folder, recording, npz, force)
-        told = f"{stop}; the run until t = {recording.time[-1]:.6g} s is in {folder}"
+        recording.write(output.out, output.force, npz=npz)
+        text = f"{stop}; the run until t = {recording.time[-1]:.6g} s is in {output.out}"
         if isinstance(stop, CraneError):
-            raise SimulationError(told) from stop
-        say(told)
+            raise SimulationError(text) from stop
+        print_message(text)
         sys.exit(INTERRUPTED)
 
 
-def control_of(
-    machine: "Machine", task: str | None, name: str | None, sway: str | None = None
-) -> "Controller | ValveCommand | None":
-    """What drives a machine along a task, by a controller's name and a method of `suppress_sway`.
+def task_control(
+    machine: "Machine", task: str | None, controller: str | None, sway: str | None = None
+) -> "Control | None":
+    """The controller of a task, by the controller's name and a method of `suppress_sway`.
 
     Raises:
         InputError: There is no such task or controller.
@@ -195,49 +263,47 @@ def control_of(
     from crane.motion.trajectory import point_to_point
 
     if task is None:
-        if sway is not None:
-            raise InputError("--sway changes a reference, name a --task or a --path")
-        if name is None:
+        refuse_options({"--sway": sway}, "changes a reference, name a --task or a --path")
+        if controller is None:
             return None
         home = machine.home[machine.closure.active]
-        return make_controller(name, machine, point_to_point(home, home, 1.0))
+        return make_controller(controller, machine, point_to_point(home, home, 1.0))
     if task not in machine.tasks:
         raise InputError(
             f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
         )
     if machine.tasks[task].space == "joystick":
-        if name is not None:
-            raise InputError(f"task '{task}' moves levers, leave --controller out")
-        if sway is not None:
-            raise InputError(f"task '{task}' moves levers, leave --sway out")
+        for option, value in {"--controller": controller, "--sway": sway}.items():
+            if value is not None:
+                raise InputError(f"task '{task}' moves levers, leave {option} out")
         return joystick(machine, task)
-    return follower_of(machine, task_trajectory(machine, task), name, sway)
+    return tracking_control(machine, task_trajectory(machine, task), controller, sway)
 
 
-def follower_of(
-    machine: "Machine", reference: "Trajectory", name: str | None, sway: str | None = None
-) -> "Controller | ValveCommand":
-    """What drives a machine along a reference, see `control_of`."""
+def tracking_control(
+    machine: "Machine", reference: "Trajectory", controller: str | None, sway: str | None = None
+) -> "Control":
+    """The controller that tracks a reference, see `task_control`."""
     from crane.control import default_controller_name, make_controller
     from crane.motion.sway import suppress_sway
 
     if sway is not None:
         reference = suppress_sway(machine, reference, sway)
-    return make_controller(name or default_controller_name(machine), machine, reference)
+    return make_controller(controller or default_controller_name(machine), machine, reference)
 
 
-def under_task(machine: "Machine", task: str | None) -> "Machine":
-    """A machine under what acts from outside while a task is done; others tell of unknown ones."""
+def add_task_loads(machine: "Machine", task: str | None) -> "Machine":
+    """The machine with the external forces of a task; unchanged if there is no such task."""
     if task is None or task not in machine.tasks:
         return machine
     return machine.with_external_forces(*machine.tasks[task].loads)
 
 
-def duration_of(machine: "Machine", task: str | None, duration: float | None) -> float | None:
-    """How long a simulation takes [s], None of what ends by itself.
+def task_duration(machine: "Machine", task: str | None, duration: float | None) -> float | None:
+    """Duration [s] of a simulation; None if it ends by itself.
 
     Raises:
-        InputError: Nothing tells.
+        InputError: There is neither a task nor a duration.
     """
     if duration is not None:
         return duration
@@ -247,20 +313,93 @@ def duration_of(machine: "Machine", task: str | None, duration: float | None) ->
     return None if machine.tasks[task].phases else machine.tasks[task].duration
 
 
-def _replay(
-    machine: "Machine",
-    inputs: Path,
-    out: Path,
-    step: float,
-    npz: bool,
-    columns: Path | None,
-    span: tuple[float, float],
-    force: bool,
+@command()
+def sway(
+    machine: MachineName,
+    options: ChangeOptions,
+    task: Annotated[
+        str, typer.Option(metavar="TASK", help="A task of the machine file, from rest to rest.")
+    ],
+    payload: Annotated[
+        str, typer.Option(metavar="KG,...", help="Masses of the payload.")
+    ] = "0,100,200,300,400,500",
+    damping: Annotated[
+        float, typer.Option(help="Damping ratio of the feedback of sway; 0 for none.")
+    ] = 0.2,
 ) -> None:
-    from crane.cli.runs import write_comparison
-    from crane.simulation.recording_replay import replay
+    """Compare methods that suppress the sway of a load."""
+    from crane.studies import sway_study
 
-    with kept_in(out, npz, force), progress_bar("simulating") as progress:
-        recording, comparison = replay(machine, inputs, step, progress, columns, span)
-    print(write_comparison(out, recording, comparison, npz, force), end="")
-    print(f"\nwritten to {out}; see it with: crane view {out}")
+    masses = parse_numbers(payload.split(","), f"--payload {payload}: give masses as 0,200,500")
+    with progress_bar("simulating") as progress:
+        result = sway_study(machine, task, masses, damping, options.changed_values(), progress)
+    print(result.to_text())
+
+
+@command()
+def modes(
+    machine: MachineName,
+    options: MachineOptions,
+    output: OptionalOutputFolder,
+    at: Configuration = None,
+    velocity: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JOINT=VALUE,...",
+            help="Active velocities in m/s or rad/s, which open valves; zero by default.",
+        ),
+    ] = None,
+    drive: Annotated[
+        str | None,
+        typer.Option(
+            metavar="INPUTS", help="valves or forces; valves by default if there are any."
+        ),
+    ] = None,
+    outputs: Outputs = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUES",
+            help="A joint or parameter and its values start:stop:count, over which modes are "
+            "drawn; may be repeated.",
+        ),
+    ] = None,
+) -> None:
+    """Compute frequencies, damping and shapes of modes."""
+    from crane.simulation.linear import linear_models, linearize
+
+    axes = parse_grids(vary)
+    loaded = options.load(machine)
+    q_a, v_a = parse_configuration("--at", at), parse_configuration("--velocity", velocity)
+    with status("linearizing"):
+        model = linearize(loaded, q_a, velocity=v_a, drive=drive, outputs=parse_names(outputs))
+    models = []
+    if axes:
+        with progress_bar("linearizing") as progress:
+            models = linear_models(loaded, axes, q_a, drive=drive, progress=progress)
+    output.write(model, models=models)
+
+
+@command()
+def sensitivities(
+    machine: MachineName,
+    options: ParameterOptions,
+    output: OptionalOutputFolder,
+    by: Parameters,
+    task: Task = None,
+    controller: ControllerName = None,
+    duration: Duration = None,
+    step: Step = 1e-3,
+    outputs: Outputs = None,
+) -> None:
+    """Compute derivatives of a motion by parameters."""
+    from crane.simulation.sensitivity import sensitivities as run
+
+    loaded = add_task_loads(options.load(machine), task)
+    control = task_control(loaded, task, controller)
+    with progress_bar("simulating") as progress:
+        result = run(
+            loaded, control, duration=task_duration(loaded, task, duration), step=step,
+            parameters=by, outputs=parse_names(outputs), progress=progress,
+        )  # fmt: skip
+    output.write(result)

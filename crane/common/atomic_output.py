@@ -138,12 +138,12 @@ def _temporary_output_folder(
         raise _cannot_be_written_error(Path(folder), error) from error
 
 
-def check_file_is_writable(path: Path) -> None:
+def check_file_is_writable(path: Path, overwrite: bool = True) -> None:
     """See that a file can be written, before it is computed.
 
     Raises:
-        OutputError: Its folder can be neither written to nor made, or something other than a plain
-            file is in the way.
+        OutputError: Its folder can be neither written to nor made, something other than a plain
+            file is in the way, or the file exists and `overwrite` is False.
     """
     try:
         if path.is_dir():
@@ -153,20 +153,32 @@ def check_file_is_writable(path: Path) -> None:
     except OSError as error:  # a name longer than any file's, a folder that may not be entered
         raise _cannot_be_written_error(path, error) from None
     _check_writable(path.parent)
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already, choose another name or add --force")
 
 
-def check_folder_is_writable(folder: Path) -> None:
+def check_folder_is_writable(folder: Path, overwrite: bool = True) -> None:
     """See that a folder can be made or filled, before its files are computed.
 
     What killed processes left over of it is removed.
 
     Raises:
-        OutputError: A file is in the way, or the nearest folder may not be written to.
+        OutputError: A file is in the way, the nearest folder may not be written to, or the folder
+            holds something and `overwrite` is False.
     """
     _check_writable(folder)
     target = Path(os.path.realpath(folder))
     temporary_files.remove_leftovers(_first_missing(target))
     temporary_files.remove_leftovers(target, _nearest_existing(target))
+    if overwrite or not folder.is_dir():
+        return
+    try:
+        is_empty = not any(folder.iterdir())
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(f"{folder}: cannot be read ({reason}), choose another") from None
+    if not is_empty:
+        raise OutputError(f"{folder}: is not empty, choose another folder or add --force")
 
 
 def portable_file_name(text: str) -> str:

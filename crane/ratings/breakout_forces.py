@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_quantity
 from crane.dynamics.statics import StaticsEvaluator
@@ -67,7 +67,7 @@ class BreakoutForce(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Breakout(OneLineRepr):
+class Breakout(Result):
     """Break-out forces.
 
     Attributes:

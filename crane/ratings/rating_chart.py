@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import InputError
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array, as_number, as_sample
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.machine import Machine
@@ -35,7 +35,7 @@ _MAX_CELLS = 400  # cells along one axis
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RatingChart(OneLineRepr):
+class RatingChart(Result):
     """What is largest over reach and height.
 
     Attributes:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import InputError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import as_number
 from crane.dynamics.statics import StaticsEvaluator
 from crane.machine import Machine
@@ -22,7 +22,7 @@ _WORKSPACE_SAMPLES = 4000  # postures
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class WorkingRange(OneLineRepr):
+class WorkingRange(Result):
     """How far a machine works.
 
     Attributes:

@@ -32,7 +32,8 @@ from numpy.typing import ArrayLike
 
 from crane.common import scratch_arrays
 from crane.common.errors import InputError, RecordingError, prefix_location, suggest_names
-from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.one_line_repr import format_count
+from crane.common.result import Result
 from crane.common.samples import Array, as_number, as_seed
 from crane.description.machine_lookup import without_changes
 from crane.description.sensors import FORCE_SUFFIX as FORCE_SUFFIX
@@ -53,7 +54,7 @@ _MAX_LISTED = 40  # names in a message
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recording(OneLineRepr):
+class Recording(Result):
     """Samples of N instants of a machine with n active joints.
 
     The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time

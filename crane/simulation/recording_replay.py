@@ -16,6 +16,7 @@ from crane.common.errors import (
 )
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
+from crane.common.result import Result
 from crane.common.samples import Array, as_number
 from crane.control import ValveDrive, ValveSignals
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
@@ -76,16 +77,18 @@ class ChannelComparison(OneLineRepr):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Comparison(OneLineRepr):
+class Comparison(Result):
     """A recording beside the simulation of the same inputs.
 
     Attributes:
         time: Instants (N,) [s] from the start.
         channels: What both hold.
+        recording: The simulation, which `write` writes, too; None if it is not at hand.
     """
 
     time: Array
     channels: tuple[ChannelComparison, ...]
+    recording: Recording | None = None
 
     def _one_line(self) -> str:
         """How long, and what is compared."""
@@ -188,7 +191,7 @@ def compare_channels(machine: Machine, table: Table, recording: Recording) -> Co
             names, read_simulation(machine, recording, names).T, strict=True
         )
     ]
-    return Comparison(time[inside], tuple(channels))
+    return Comparison(time[inside], tuple(channels), recording)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.codegen import Program, Tape
 from crane.common.errors import RecordingError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_quantity
 from crane.control import ValveDrive, ValveSignals
@@ -60,7 +60,7 @@ _TABLE_HEADING = ("item", "energy [kJ]", "share", "back [kJ]", "mean [kW]", "pea
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PowerBalance(OneLineRepr):
+class PowerBalance(Result):
     """Power of every part of a circuit over time, and energies over the recording.
 
     Parts are called OWNER.WHAT, the owner being a pump, joint, line, accumulator, element or the

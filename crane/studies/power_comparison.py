@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array, as_number
 from crane.common.units import format_quantity
 from crane.hydraulics.power_balance import SHAFT_POWER
@@ -21,7 +21,7 @@ _MIN_TABLE_SHARE = 1e-3  # share of the largest run's energy that a table tells
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PowerComparison(OneLineRepr):
+class PowerComparison(Result):
     """Power accounts of runs that do the same work, in another time or on another system.
 
     Attributes:

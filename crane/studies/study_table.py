@@ -9,14 +9,14 @@ import numpy as np
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 
 _MAXIMIZED_MEASURES = ("reach", "range", "highest")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Study(OneLineRepr):
+class Study(Result):
     """Measures of V variants of a machine.
 
     Attributes:

@@ -1,21 +1,19 @@
 """What a notebook shows of an object: one line, its page, its figures, and its words as tables.
 
-Results know their words (`to_markdown` or `to_text`); which figures are theirs stands here. All is
-in the HTML itself, nothing is loaded from anywhere.
+Results know their text (`to_markdown` or `to_text`), `crane.view.result_files` their figures. The
+HTML holds all of it, nothing is loaded from anywhere.
 """
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from html import escape
-from importlib import import_module
 from typing import Any
 
 import matplotlib as mpl
 from markdown_it import MarkdownIt
 
 from crane.common.errors import CraneError
-from crane.formats import load_from_expression
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import summarize
@@ -24,35 +22,13 @@ from crane.view.page.html_document import html_table
 from crane.view.page.report_page import report_html
 from crane.view.plots.image_tags import image_tag, svg_tag
 from crane.view.plots.recording_figure import FIGURE_STYLE
+from crane.view.result_files import figure_function, notebook_figures, result_files
 from crane.view.sketch.sketch_figure import sketch_figure
 
 _FRAME_SHARE = (
     0.06  # of the frames and spans of a page: a notebook keeps all its outputs in one file
 )
 _MAX_FIGURES = 8
-_FIGURES: Mapping[str, tuple[str, ...]] = {  # by class, in `crane.view.plots`
-    "Calibration": ("calibration_figure.calibration_figure",),
-    "Capacity": ("capacity_figure.capacity_figure",),
-    "Comparison": ("comparison_figure.comparison_figure",),
-    "Design": ("design_figure.design_figure",),
-    "Excitation": ("excitation_figure.excitation_figure",),
-    "Identification": ("identification_figures.force_figures",),
-    "LinearModel": ("modes_figure.modes_figure",),
-    "PowerBalance": ("sankey_diagram.sankey_figure", "power_figure.power_figure"),
-    "PowerComparison": ("power_comparison_figure.power_comparison_figure",),
-    "Recording": ("recording_figure.recording_figure",),
-    "Sensitivities": ("sensitivities_figure.sensitivities_figure",),
-    "SignalExcitation": ("excitation_figure.signals_figure",),
-    "Study": ("study_figure.study_figure",),
-    "ToolForce": ("tool_force_figure.tool_force_figure",),
-    "WorkingRange": ("working_range_figure.working_range_figure",),
-    "Workspace": ("workspace_figure.workspace_figure",),
-}
-# What moves, and how.
-_MOTIONS: Mapping[str, Callable[[Any], tuple[Machine, Recording | None]]] = {
-    "LinearModel": lambda model: (model.machine, model.motion()),
-    "Recording": lambda recording: (load_from_expression(recording.machine), recording),
-}
 # Colours are those of whatever notebook it stands in, light or dark; pictures are on white.
 _CSS = """
 .crane-shown { max-width: 72rem; font-size: 13px; line-height: 1.45; }
@@ -88,21 +64,15 @@ def to_html(value: Any) -> str | None:
     return f'<div class="crane-shown"><style>{_CSS}</style>{line}{"".join(parts)}</div>'
 
 
-def _lookup_by_class(value: Any, by_class: Mapping[str, Any]) -> Any:
-    """What is said of an object's class, or of the nearest that it inherits from."""
-    return next(
-        (by_class[x.__name__] for x in type(value).__mro__ if x.__name__ in by_class), None
-    )
-
-
 def _motion_frame(value: Any) -> Iterator[str]:
     """The page that plays its motion, in a frame that nothing gets out of."""
-    if (motion_of := _lookup_by_class(value, _MOTIONS)) is None:
+    files = result_files(value)
+    if files is None or files.motion is None:
         return
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # said when the machine was loaded first
-            machine, motion = motion_of(value)
+            machine, motion = files.motion(value)
             if motion is None:
                 return
             text = report_html(machine, motion, frame_share=_FRAME_SHARE)
@@ -118,9 +88,8 @@ def _figure_images(value: Any) -> Iterator[str]:
         with mpl.rc_context(FIGURE_STYLE):
             if isinstance(value, Machine):
                 yield svg_tag(sketch_figure(value), f"sketch of {value.name}")
-            for name in _lookup_by_class(value, _FIGURES) or ():
-                module, _, function = name.partition(".")
-                result = getattr(import_module(f"crane.view.plots.{module}"), function)(value)
+            for name in notebook_figures(value):
+                result = figure_function(name)(value)
                 figures = result if isinstance(result, list) else [result]
                 yield from (image_tag(figure, repr(value)) for figure in figures[:_MAX_FIGURES])
     except CraneError as error:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.identification.calibration.calibration_problem import noise_std
@@ -132,7 +133,7 @@ class CalibrationChannel(OneLineRepr):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(OneLineRepr):
+class Calibration(Result):
     """A machine fitted to recordings.
 
     Attributes:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
+from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.text_tables import format_table
 from crane.common.threads import with_single_threaded_blas
@@ -55,7 +55,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Excitation(OneLineRepr):
+class Excitation(Result):
     """A reference to identify a machine with.
 
     Attributes:

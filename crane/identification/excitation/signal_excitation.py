@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import InputError, suggest_names
-from crane.common.one_line_repr import OneLineRepr, format_count
+from crane.common.one_line_repr import format_count
 from crane.common.progress import progress_reporter
+from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.text_tables import format_table
 from crane.common.threads import with_single_threaded_blas
@@ -34,7 +35,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SignalExcitation(OneLineRepr):
+class SignalExcitation(Result):
     """Signals of valves to calibrate a machine with.
 
     Attributes:

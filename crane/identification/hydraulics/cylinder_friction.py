@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description import Friction
@@ -38,7 +38,7 @@ _STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CylinderFriction(OneLineRepr):
+class CylinderFriction(Result):
     """Friction of one joint.
 
     Attributes:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
@@ -54,7 +54,7 @@ _UNIDENTIFIABLE_REASONS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OrificeCoefficients(OneLineRepr):
+class OrificeCoefficients(Result):
     """X of one cylinder.
 
     Attributes:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import RecordingError
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
@@ -35,7 +35,7 @@ _MIN_SIGNAL_SPREAD = 0.05  # of the signal's range, by which levels of one direc
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ValveCurve(OneLineRepr):
+class ValveCurve(Result):
     """Steady speed over signal.
 
     Attributes:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
-from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.text_tables import format_table
 from crane.identification.estimation.estimators import Estimate
@@ -26,7 +26,7 @@ _MAX_SHOWN = 3  # directions that a table names
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification(OneLineRepr):
+class Identification(Result):
     """Parameters of a machine from a recording.
 
     Attributes:

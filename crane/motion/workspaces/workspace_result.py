@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.one_line_repr import OneLineRepr
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.machine import Machine
 from crane.motion.workspaces.coverage_raster import CoverageRaster
@@ -70,7 +71,7 @@ class StrokeMap(OneLineRepr):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Workspace(OneLineRepr):
+class Workspace(Result):
     """Closed postures all over the strokes of a machine.
 
     Attributes:

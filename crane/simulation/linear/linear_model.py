@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import OutputError
-from crane.common.one_line_repr import OneLineRepr, format_count, shorten_to_line
+from crane.common.one_line_repr import format_count, shorten_to_line
 from crane.common.optional_libraries import import_optional_library
+from crane.common.result import Result
 from crane.common.samples import Array, as_sample
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -52,7 +53,7 @@ class Mode(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearModel(OneLineRepr):
+class LinearModel(Result):
     """x' = A x + B u, y = C x + D u, deviations from an operating point.
 
     Attributes:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.control import Controller, ValveCommand
@@ -35,7 +35,7 @@ ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensitivities(OneLineRepr):
+class Sensitivities(Result):
     """A motion, and its derivatives by numbers.
 
     Attributes:

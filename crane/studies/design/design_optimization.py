@@ -14,6 +14,7 @@ from scipy.stats import qmc
 from crane.common.errors import CraneError, CraneWarning, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
+from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_seed
 from crane.formats import load
 from crane.formats.machine_loading import MachineVariants
@@ -108,7 +109,7 @@ class DesignSolution(OneLineRepr):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Design(OneLineRepr):
+class Design(Result):
     """The best numbers that were found.
 
     Attributes:

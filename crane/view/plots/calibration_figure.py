@@ -1,7 +1,5 @@
 """A calibration as one picture: every channel measured, and simulated before and after."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,24 +14,10 @@ from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
-    write_figure,
 )
 
 HELD_OUT_COLOUR = "#f1efe8"
 _MAX_PANELS = 18  # panels
-
-
-def plot_calibration(calibration: Calibration, path: str | Path) -> None:
-    """Write the picture of a calibration to a file.
-
-    Args:
-        calibration: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: calibration_figure(calibration))
 
 
 def calibration_figure(calibration: Calibration) -> Figure:

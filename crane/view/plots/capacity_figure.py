@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -21,7 +20,7 @@ from crane.ratings import Capacity
 from crane.ratings.capacity_report import slew_labels
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 from crane.view.sketch.machine_outline import MachineOutline, machine_outline
 
 FACTOR_COLOURS = (
@@ -43,19 +42,6 @@ _MAX_CONTOURS, _CONTOUR_QUANTILES = (
     (0.05, 0.9),
 )  # contours at most, and between which quantiles of the loads
 _ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
-
-
-def plot_capacity(chart: Capacity, path: str | Path) -> None:
-    """Write the picture of rated loads to a file.
-
-    Args:
-        chart: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: capacity_figure(chart))
 
 
 def capacity_figure(chart: Capacity) -> Figure:

@@ -1,7 +1,6 @@
 """Rated loads on one page to print: charts, what they hold for, and the table."""
 
 import textwrap
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -18,7 +17,7 @@ from crane.view.plots.capacity_figure import (
     factor_colours,
 )
 from crane.view.plots.figure_text import escape_label, escape_text
-from crane.view.plots.recording_figure import FAINT_COLOUR, FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.plots.recording_figure import FAINT_COLOUR, FIGURE_STYLE, INK_COLOUR
 
 _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     11.69,
@@ -29,19 +28,6 @@ _LINE_HEIGHT = 0.152  # between lines [inch]
 _TEXT_SIZE, _CELL_TEXT_SIZE = 7.5, 7.5  # sizes of letters [points]
 _FACTS_WIDTH = 3.5  # width of what stands beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
-
-
-def plot_capacity_sheet(chart: Capacity, path: str | Path) -> None:
-    """Write rated loads as one A4 page on its side.
-
-    Args:
-        chart: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: capacity_sheet_figure(chart))
 
 
 def capacity_sheet_figure(chart: Capacity) -> Figure:
@@ -73,7 +59,7 @@ def _write_text(
     text: str,
     colour: str = INK_COLOUR,
     size: float = _TEXT_SIZE,
-    **options: object,
+    **options: Any,
 ) -> None:
     """A line of text at a place [inch]."""
     escaped_text = escape_text(text)

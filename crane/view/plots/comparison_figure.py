@@ -1,7 +1,5 @@
 """Measured beside simulated channels as one figure."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -9,19 +7,10 @@ from crane.common.errors import InputError
 from crane.common.units import display_unit
 from crane.simulation.recording_replay import Comparison
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import DASHED_STYLE, RECORDED_COLOUR, write_figure
+from crane.view.plots.recording_figure import DASHED_STYLE, RECORDED_COLOUR
 
 _MAX_COLUMNS = 3
 _MAX_POINTS = 4000  # instants that a line needs
-
-
-def plot_comparison(comparison: Comparison, path: str | Path) -> None:
-    """Write the figure of a comparison: measured lines, dashed what the model says.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-    write_figure(path, lambda: comparison_figure(comparison))
 
 
 def comparison_figure(comparison: Comparison) -> Figure:

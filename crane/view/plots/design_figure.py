@@ -1,7 +1,5 @@
 """Designs as a picture: the front of two goals, or where numbers ended, and how much it helped."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,21 +10,7 @@ from crane.view.plots.recording_figure import (
     DASHED_STYLE,
     FIGURE_STYLE,
     RECORDED_COLOUR,
-    write_figure,
 )
-
-
-def plot_design(result: Design, path: str | Path) -> None:
-    """Write the picture of a design to a file.
-
-    Args:
-        result: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: design_figure(result))
 
 
 def design_figure(result: Design) -> Figure:

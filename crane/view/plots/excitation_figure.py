@@ -1,7 +1,6 @@
 """What excites a machine as one figure: a reference and its limits, or signals of valves."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -20,19 +19,9 @@ from crane.view.plots.recording_figure import (
     FAINT_COLOUR,
     FIGURE_STYLE,
     RECORDED_COLOUR,
-    write_figure,
 )
 
 _MAX_POINTS = 2000  # instants that a line needs
-
-
-def plot_excitation(excitation: Excitation, path: str | Path) -> None:
-    """Write the figure of a reference.
-
-    Raises:
-        OutputError: The suffix is none of png, svg, pdf, or the file cannot be written.
-    """
-    write_figure(path, lambda: excitation_figure(excitation))
 
 
 def excitation_figure(excitation: Excitation) -> Figure:
@@ -83,15 +72,6 @@ def _draw_joint(
         axes.margins(x=0.0)
     joint_axes[0].set_title(escape_label(joint))
     joint_axes[-1].set_xlabel("time [s]")
-
-
-def plot_signals(excitation: SignalExcitation, path: str | Path) -> None:
-    """Write the figure of valve signals.
-
-    Raises:
-        OutputError: The suffix is none of png, svg, pdf, or the file cannot be written.
-    """
-    write_figure(path, lambda: signals_figure(excitation))
 
 
 def signals_figure(excitation: SignalExcitation) -> Figure:

@@ -1,7 +1,6 @@
 """Linear models as pictures: poles and frequency responses, and modes over strokes and loads."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -17,7 +16,6 @@ from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
-    write_figure,
 )
 
 _CURVE_COLOURS = (
@@ -34,30 +32,6 @@ _FREQUENCY_COUNT = 600  # frequencies of a response
 _MAX_INPUT_PANELS = 6  # panels of inputs
 _MIN_MODAL_ASSURANCE = 0.2  # modal assurance of a mode that goes on
 _MIN_RESPONSE_SHARE = 1e-6  # share of the largest response that is not drawn
-
-
-def plot_modes(model: LinearModel, path: str | Path) -> None:
-    """Write poles and frequency responses of a linear model to a file.
-
-    Args:
-        model: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: modes_figure(model))
-
-
-def plot_parameter_modes(
-    models: Sequence[tuple[dict[str, float], LinearModel]], path: str | Path
-) -> None:
-    """Write frequency and damping of what rings over what was varied, see `linear_models`.
-
-    Raises:
-        OutputError: The suffix is not .png, .svg or .pdf, or the file cannot be written.
-    """
-    write_figure(path, lambda: parameter_modes_figure(models))
 
 
 def modes_figure(model: LinearModel) -> Figure:

@@ -1,7 +1,5 @@
 """Power accounts of several runs beside each other: bars of energy, and power over time."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,7 +9,7 @@ from crane.hydraulics.power_balance import SHAFT_POWER
 from crane.studies.hydraulic_power_balance import POWER_CLASSES
 from crane.studies.power_comparison import PowerComparison
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 
 _RUN_COLOURS = (
     "#1f5fa8",
@@ -25,11 +23,6 @@ _RUN_COLOURS = (
 )
 _BAR_HEIGHT, _GROUP_GAP = 0.14, 0.12  # of a bar, between groups of them [inch]
 _MIN_BAR_SHARE = 1e-3  # share of the largest run's energy that has a bar
-
-
-def plot_power_comparison(comparison: PowerComparison, path: str | Path) -> None:
-    """Write the picture to a file; see `plot_power`."""
-    write_figure(path, lambda: power_comparison_figure(comparison))
 
 
 def power_comparison_figure(comparison: PowerComparison) -> Figure:

@@ -1,7 +1,6 @@
 """The power account of a run over time: what goes where, stacked under what the shafts give."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -20,7 +19,7 @@ from crane.studies.hydraulic_power_balance import (
     part_owner,
 )
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 
 _CLASS_PALETTE = (
     "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
@@ -38,19 +37,6 @@ _OWNER_COLOURS = (
     "#9a6b3f",
 )
 _MAX_POINTS = 1500  # points of a stack
-
-
-def plot_power(balance: PowerBalance, path: str | Path) -> None:
-    """Write the picture to a file.
-
-    Args:
-        balance: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: power_figure(balance))
 
 
 def power_figure(balance: PowerBalance) -> Figure:

@@ -105,21 +105,12 @@ class _TimePanel:
             yield label, values if self.reference is None else self.reference - values
 
 
-def plot_recording(recording: Recording, path: str | Path) -> None:
-    """Write the figure of a recording to a file.
-
-    Args:
-        recording: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
+    """Draw a figure into a file; its suffix .png, .svg or .pdf chooses the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
     """
-    write_figure(path, lambda: recording_figure(recording))
-
-
-def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
-    """Draw a figure into a file whose suffix is a known format; see `plot_recording`."""
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
     if file_format not in FIGURE_FORMATS:

@@ -1,7 +1,6 @@
 """Where a run's energy went, as ribbons as wide as it is much: a Sankey diagram."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -23,7 +22,7 @@ from crane.studies.hydraulic_power_balance import (
 )
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.power_figure import CLASS_COLOURS
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 
 _TOTAL_HEIGHT = 4.2  # of all that is given [inch]
 _LABEL_HEIGHT, _LABEL_GAP, _GROUP_GAP = (
@@ -83,19 +82,6 @@ class _SankeyGroup:
     def total_energy(self) -> float:
         """Energy of all its items [J]."""
         return sum(item.energy for item in self.ribbons)
-
-
-def plot_sankey(balance: PowerBalance, path: str | Path) -> None:
-    """Write the picture to a file.
-
-    Args:
-        balance: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: sankey_figure(balance))
 
 
 def sankey_figure(balance: PowerBalance) -> Figure:

@@ -1,7 +1,5 @@
 """Sensitivities as one picture: what a small change of each number does to each output."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,22 +9,9 @@ from crane.description.machine_lookup import CHANGES_SEPARATOR
 from crane.recordings.recording_summary import result_title
 from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
+from crane.view.plots.recording_figure import FIGURE_STYLE
 
 _MAX_PANELS = 18  # panels
-
-
-def plot_sensitivities(sensitivities: Sensitivities, path: str | Path) -> None:
-    """Write the picture to a file.
-
-    Args:
-        sensitivities: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: sensitivities_figure(sensitivities))
 
 
 def sensitivities_figure(sensitivities: Sensitivities) -> Figure:

@@ -18,7 +18,6 @@ from crane.view.plots.recording_figure import (
     DASHED_STYLE,
     FIGURE_STYLE,
     RECORDED_COLOUR,
-    write_figure,
 )
 
 _MAX_PANELS = 12  # measures of one picture
@@ -26,19 +25,6 @@ _MAX_SCATTER_ROWS = 6
 _MAX_COLUMNS = 3
 _TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
 _INFEASIBLE_COLOUR = "#d9d9d9"
-
-
-def plot_study(study: Study, path: str | Path) -> None:
-    """Write the picture of a study to a file.
-
-    Args:
-        study: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: study_figure(study))
 
 
 def study_figure(study: Study) -> Figure:

@@ -1,7 +1,5 @@
 """Tool forces over the reach: how large, which way, and what ends them."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +12,7 @@ from crane.common.samples import Array
 from crane.ratings.tool_forces import ToolForce
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 
 _FACTOR_COLOURS = (
     "#1f5fa8",
@@ -31,19 +29,6 @@ _FACTOR_COLOURS = (
     "#333333",
 )
 _MAX_ARROWS = 12  # along the larger side
-
-
-def plot_tool_force(chart: ToolForce, path: str | Path) -> None:
-    """Write the picture of tool forces to a file.
-
-    Args:
-        chart: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: tool_force_figure(chart))
 
 
 def tool_force_figure(chart: ToolForce) -> Figure:

@@ -1,7 +1,6 @@
 """A working range as brochures draw it: the lip's reach, the machine, and dimension lines."""
 
 import string
-from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -18,26 +17,12 @@ from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
-    write_figure,
 )
 from crane.view.plots.workspace_figure import skeleton_lines
 
 _REGION_COLOUR, _SOIL_COLOUR, _LINE_COLOUR = "#e3ecf6", "#8a6d4b", "#666666"
 _LINE_GAP_SHARE = 0.055  # between dimension lines, of the drawing's larger extent
 _VERTICAL_WORDS = ("depth", "height")  # words of what is measured upright
-
-
-def plot_working_range(result: WorkingRange, path: str | Path) -> None:
-    """Write the picture of a working range to a file.
-
-    Args:
-        result: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: working_range_figure(result))
 
 
 def working_range_figure(result: WorkingRange) -> Figure:

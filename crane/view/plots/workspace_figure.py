@@ -1,7 +1,5 @@
 """A workspace as one picture: what the tip reaches, and which strokes close."""
 
-from pathlib import Path
-
 import matplotlib as mpl
 import numpy as np
 import pinocchio as pin
@@ -23,7 +21,6 @@ from crane.view.plots.recording_figure import (
     INK_COLOUR,
     RECORDED_COLOUR,
     joint_symbol,
-    write_figure,
 )
 
 _REGION_COLOUR, _GRID_COLOUR, _OPEN_COLOUR = "#e3ecf6", "#a9c3e0", "#d9d9d9"
@@ -41,19 +38,6 @@ _MAX_SHOWN_CONDITION = 30.0  # condition at which colours end
 _MIN_SHOWN_CONDITION = 1.2  # condition up to which a drive has nothing to show
 _CONDITION_TICKS = (1, 1.1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7, 10, 15, 20, 30)
 _GRID_LINE_COUNT = 10  # of the grid, per stroke
-
-
-def plot_workspace(reachable_space: Workspace, path: str | Path) -> None:
-    """Write the picture of a workspace to a file.
-
-    Args:
-        reachable_space: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-
-    Raises:
-        OutputError: The suffix is another one, or the file cannot be written.
-    """
-    write_figure(path, lambda: workspace_figure(reachable_space))
 
 
 def workspace_figure(reachable_space: Workspace) -> Figure:

@@ -1,0 +1,193 @@
+"""Commands that describe machines: list, info, check, add."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crane.cli.command import app, command
+from crane.cli.options import (
+    AssemblyOptions,
+    MachineName,
+    OutputFile,
+    PackageOptions,
+)
+from crane.common.errors import InputError
+from crane.common.package_search import NEAREST_ASSEMBLY
+
+if TYPE_CHECKING:
+    from crane.machine import Machine
+
+
+@command("list")
+def list_machines(
+    robots: Annotated[
+        bool, typer.Option("--robots", help="List the robots of example-robot-data instead.")
+    ] = False,
+) -> None:
+    """List the bundled machines."""
+    from crane.common.one_line_repr import format_count
+    from crane.description import bundled_machines, example_robots
+    from crane.description.machine_lookup import machine_summary
+
+    others = example_robots()
+    if robots:
+        if not others:
+            raise InputError("there are no robots here, install example-robot-data")
+        print("Robots of example-robot-data, open chains; some are refused by the strict reading:")
+        print("\n".join(f"  {name}" for name in others))
+        return
+    machines = bundled_machines()
+    width = max(map(len, machines))
+    print("Bundled machines; crane info NAME says more of one:")
+    for name, path in machines.items():
+        print(f"  {name:{width}}  {machine_summary(path)}")
+    if others:
+        number = format_count(len(others), "robot")
+        print(f"{number} of example-robot-data can be named likewise: crane list --robots")
+
+
+@command()
+def info(
+    machine: MachineName,
+    assembly: AssemblyOptions,
+    pattern: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[PATTERN]",
+            help="List joints, frames, columns and parameters whose names contain this text, or "
+            "match it where it has * or ?.",
+        ),
+    ] = None,
+    parameters: Annotated[
+        bool,
+        typer.Option(
+            "--parameters",
+            "--names",
+            help="List the parameters that --set, --vary and --fit take, with their values.",
+        ),
+    ] = False,
+) -> None:
+    """Show joints, loops, forces and parameters of a machine."""
+    from crane.formats import load
+
+    if parameters or pattern is not None:
+        _print_names(machine, assembly, pattern)
+        return
+    for line in _describe(load(machine, **assembly.assembly())):
+        print(line)
+
+
+def _print_names(machine: str, assembly: AssemblyOptions, pattern: str | None) -> None:
+    from crane.common.package_search import check_package_folders, use_load_options
+    from crane.description import parameters
+    from crane.description.name_search import names_by_kind, search_names
+    from crane.formats import read_machine_spec
+
+    files = assembly.package_values()
+    with use_load_options(check_package_folders(files["packages"]), files["arguments"]):
+        spec = read_machine_spec(machine)
+    names = {"parameter": {name: f"{x:.6g}" for name, x in parameters(spec).items()}}
+    if pattern is not None:
+        names = search_names(names_by_kind(spec), pattern)
+    width = max((len(name) for values in names.values() for name in values), default=0)
+    for kind, values in names.items():
+        before = f"{kind:<11}" * (pattern is not None)
+        for name, text in values.items():
+            print(f"{before}{name:{width}}  {text}".rstrip())
+
+
+def _describe(machine: "Machine") -> Iterator[str]:
+    """Facts of a machine, each followed by the rows of its table without empty cells."""
+    from crane.view.machine_facts import machine_facts
+
+    facts = list(machine_facts(machine))
+    width = max(10, 1 + max((len(row[0]) for fact in facts for row in fact.rows), default=0))
+    yield machine.name
+    for fact in facts:
+        yield f"  {fact.name:<12}{fact.text}"
+        for row in fact.rows:
+            cells = zip(fact.heading[1:], row[1:], strict=True)
+            words = ", ".join(f"{head} {cell}".strip() for head, cell in cells if cell)
+            yield f"    {row[0]:<{width}}{words}"
+
+
+@command()
+def check(
+    machine: MachineName,
+    assembly: AssemblyOptions,
+    write_home: Annotated[
+        bool,
+        typer.Option(
+            "--write-home", help="Write the closed home configuration into the machine file."
+        ),
+    ] = False,
+) -> None:
+    """Check the description of a machine for errors.
+
+    The exit status is 0 without findings, 1 with warnings only, 2 with errors.
+    """
+    from crane.formats import write_home as write
+    from crane.formats.check import check as check_machine
+
+    values = assembly.assembly()
+    driven = values["active"], values["free"]
+    packages, arguments = values["packages"], values["arguments"]
+    options = {**arguments, NEAREST_ASSEMBLY: True} if write_home else arguments
+    report = check_machine(machine, *driven, assembly.floating, packages, options)
+    if write_home and not report.errors:
+        print(f"home written to {write(machine, *driven, packages, arguments)}")
+        report = check_machine(machine, *driven, assembly.floating, packages, arguments)
+    print(report)
+    raise typer.Exit(report.status)
+
+
+add = typer.Typer(no_args_is_help=True, help="Add a cylinder or loop joints to a description.")
+app.add_typer(add, name="add")
+
+
+@command(registry=add)
+def cylinder(
+    machine: MachineName,
+    output: OutputFile,
+    between: Annotated[
+        tuple[str, str],
+        typer.Option(
+            metavar="FRAME FRAME",
+            help="Attachment points of barrel and rod: LINK, or LINK:x,y,z in m.",
+        ),
+    ],
+    bore: Annotated[float, typer.Option(metavar="M", help="Diameter of the piston in m.")],
+    rod: Annotated[float, typer.Option(metavar="M", help="Diameter of the rod in m.")],
+    stroke: Annotated[float, typer.Option(metavar="M", help="Stroke in m.")],
+    name: Annotated[
+        str, typer.Option(help="Name of the cylinder and of its stroke.")
+    ] = "cylinder",
+    dead_length: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M",
+            help="Length between the pins when retracted in m; stroke and four bores by default.",
+        ),
+    ] = None,
+) -> None:
+    """Add a hydraulic cylinder of steel between two points.
+
+    The cylinder becomes the actuator in place of the joint that it turns.
+    """
+    from crane.formats.additions import add_cylinder
+
+    print(
+        add_cylinder(
+            machine, between, bore, rod, stroke,
+            name=name, dead_length=dead_length, out=output.out, force=output.force,
+        )
+    )  # fmt: skip
+
+
+@command(registry=add)
+def loops(machine: MachineName, packages: PackageOptions, output: OutputFile) -> None:
+    """Add the loop joints that `crane check` proposes."""
+    from crane.formats.additions import add_loops
+
+    print(add_loops(machine, out=output.out, force=output.force, **packages.package_values()))

@@ -1,0 +1,121 @@
+"""Commands on files: convert for machines, import for recordings, schema for editors."""
+
+import warnings
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from crane.cli.command import command
+from crane.cli.options import (
+    MachineName,
+    MachineOptions,
+    OverwriteOptions,
+    RequiredOutputFile,
+    TimeOptions,
+)
+from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
+from crane.common.errors import CraneError, CraneWarning, InputError, suggest_names
+
+_FORMATS = ("urdf+", "urdf", "mjcf", "machine")
+_SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
+
+
+@command()
+def convert(
+    machine: MachineName,
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="A .urdf or .xml file, or the folder of a machine file."
+        ),
+    ],
+    options: MachineOptions,
+    output: OverwriteOptions,
+    to: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FORMAT",
+            help="urdf+ (one URDF with its loops), urdf (loops cut), mjcf or machine; by the "
+            "suffix of OUT by default.",
+        ),
+    ] = None,
+) -> None:
+    """Convert a machine to URDF, MJCF or a machine file."""
+    from crane.common.atomic_output import replace_file
+    from crane.formats import robot_description, write_machine, write_mjcf, write_urdf_plus
+
+    kind = _output_format(out, to)
+    check = check_folder_is_writable if kind == "machine" else check_file_is_writable
+    check(out, output.force)
+    loaded, written = options.load(machine), out
+    if kind == "machine":
+        written = write_machine(loaded, out, overwrite=output.force)
+    elif kind == "urdf":
+        with replace_file(out) as temporary_file:
+            temporary_file.write_text(robot_description(loaded), encoding="utf-8")
+    else:
+        (write_urdf_plus if kind == "urdf+" else write_mjcf)(loaded, out)
+    print(f"written to {written}")
+
+
+def _output_format(out: Path, to: str | None) -> str:
+    """The format of --to, or of the suffix of a path.
+
+    Raises:
+        InputError: It is unknown, or does not go with the path.
+    """
+    suffix = out.suffix.lower()
+    kind = to or _SUFFIXES.get(suffix, "machine")
+    if kind not in _FORMATS:
+        raise InputError(f"--to is '{kind}', {suggest_names(_FORMATS, kind)}")
+    if kind == "machine" and suffix in {*_SUFFIXES, ".yaml", ".yml"}:
+        raise InputError(f"{out}: a machine file comes with its URDFs, give the name of a folder")
+    if to is None and suffix and suffix not in _SUFFIXES:
+        raise InputError(
+            f"{out}: {suffix} is not written, give a .urdf or .xml file, or a folder; where the "
+            "folder shall have this name, --to machine"
+        )
+    return kind
+
+
+@command("import")
+def import_log(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="A CSV or npz file of another program.")
+    ],
+    columns: Annotated[
+        Path,
+        typer.Argument(
+            metavar="COLUMNS", help="A text file with a line per column of the recording."
+        ),
+    ],
+    window: TimeOptions,
+    output: RequiredOutputFile,
+) -> None:
+    """Convert a log of another program to a recording."""
+    from crane.formats import load_from_expression
+    from crane.recordings import timeseries
+    from crane.recordings.logs import read_log_columns
+    from crane.recordings.recording_reader import read_sensor_readings, select_time_span
+
+    if output.out.suffix.lower() != ".csv":
+        raise InputError(f"{output.out}: a recording is written as .csv, name it so")
+    check_file_is_writable(output.out, output.force)
+    machine, name = None, read_log_columns(columns)[0].get("machine", "")
+    try:
+        machine = load_from_expression(name) if name else None
+    except CraneError as error:
+        text = f"{columns}: names of columns are not checked, its machine cannot be read: {error}"
+        warnings.warn(text, CraneWarning, stacklevel=2)
+    table = select_time_span(read_sensor_readings(log, machine, columns), window.span, log)
+    timeseries.write_table(output.out, table)
+    print(f"{len(table.values)} samples of {len(table.units)} columns written to {output.out}")
+
+
+@command()
+def schema() -> None:
+    """Print the JSON Schema of machine files."""
+    from crane.formats.machine_file.json_schema import schema_text
+
+    print(schema_text(), end="")

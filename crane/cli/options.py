@@ -1,0 +1,424 @@
+"""Arguments and options that several commands share, each declared once."""
+
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from crane.cli.command import OptionBlock
+from crane.cli.parsing import parse_arguments, parse_names, parse_values
+from crane.cli.terminal import status
+from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
+from crane.common.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from crane.common.result import Result
+    from crane.machine import Machine
+    from crane.recordings.recording import Recording
+
+# Arguments and options of several commands that are not part of a block.
+MachineName = Annotated[
+    str,
+    typer.Argument(
+        metavar="MACHINE",
+        help="Name of a bundled machine, or path of a machine file, URDF, SDF or MJCF.",
+    ),
+]
+RecordingFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RECORDING",
+        help="A recording (CSV or npz) or the folder of a run.",
+    ),
+]
+RecordingFiles = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORDING...",
+        help="Recordings (CSV or npz) or folders of runs.",
+    ),
+]
+Task = Annotated[str | None, typer.Option(metavar="TASK", help="A task of the machine file.")]
+Tasks = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TASK",
+        help="A task of the machine file to measure with; may be repeated; all by default.",
+    ),
+]
+Frame = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LINK", help="Link that carries the load or is the tool; the tip by default."
+    ),
+]
+Bucket = Annotated[
+    str | None, typer.Option(metavar="JOINT", help="The joint whose drive curls the bucket.")
+]
+Configuration = Annotated[
+    str | None,
+    typer.Option(
+        "--at",
+        metavar="JOINT=VALUE,...",
+        help="Active coordinates in m or rad; those of the home configuration by default.",
+    ),
+]
+Rule = Annotated[
+    str,
+    typer.Option(metavar="RULE", help="Rule of the ratings: none, iso10567, en12999 or sfs4677."),
+]
+Outputs = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES",
+        help="Outputs, as X_lift,tip_z,pressure_X_lift_a; joints and pressures by default.",
+    ),
+]
+ComparedColumns = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors",
+        metavar="COLUMNS",
+        help="Measured columns, as X_lift,pressure_X_lift_a; strokes and pressures by default.",
+    ),
+]
+_FIT_OPTION = typer.Option(
+    metavar="NAME[=START,LOW~HIGH]",
+    help="A parameter to fit, as payload.mass, friction.*.viscous, sensor.q2.zero; auto: all that "
+    "the recordings determine; may be repeated.",
+)
+Fit = Annotated[list[str], _FIT_OPTION]
+OptionalFit = Annotated[list[str] | None, _FIT_OPTION]
+_BY_OPTION = typer.Option(
+    "--by",
+    metavar="NAME",
+    help="A parameter to differentiate by, as payload.mass, oil.bulk_modulus, lift_eye.x; may be "
+    "repeated.",
+)
+Parameters = Annotated[list[str], _BY_OPTION]
+OptionalParameters = Annotated[list[str] | None, _BY_OPTION]
+Seed = Annotated[int, typer.Option(help="Seed of the random numbers.")]
+Method = Annotated[
+    str,
+    typer.Option(
+        metavar="METHOD", help="wls (joints weighted by their noise), ols, or huber (robust)."
+    ),
+]
+TrainingWindow = Annotated[
+    str | None,
+    typer.Option(
+        "--train", metavar="FROM:TO", help="Seconds of the training data; the rest is held out."
+    ),
+]
+Validation = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="A recording that is held out; may be repeated."),
+]
+Trust = Annotated[
+    bool,
+    typer.Option(
+        "--trust", help="Use a recording that looks wrong, with a warning instead of an error."
+    ),
+]
+Requirements = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--require",
+        metavar="A>=B",
+        help="A constraint of measures, with >=, <= or ==; may be repeated.",
+    ),
+]
+UserMeasures = Annotated[
+    Path | None,
+    typer.Option(
+        "--measures",
+        metavar="FILE.py",
+        help="Python file with functions of a machine as measures.",
+    ),
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+_Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Another value of a parameter, as payload.mass=200; may be repeated.",
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChangeOptions(OptionBlock):
+    """Changed parameters of a machine."""
+
+    panel = "Machine options"
+    changes: _Changes = None
+
+    def changed_values(self) -> dict[str, float]:
+        """Values of the changed parameters."""
+        return parse_values("--set", self.changes, "NAME=VALUE, as in payload.mass=200")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterOptions(ChangeOptions):
+    """Changed parameters and locked joints of a machine."""
+
+    lock: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT=VALUE",
+            help="A joint to lock and its coordinate in m or rad; may be repeated.",
+        ),
+    ] = None
+
+    def load(self, name: str) -> "Machine":
+        """Load a machine by its name or path."""
+        from crane.formats import load
+
+        held = parse_values("--lock", self.lock)
+        return load(name, self.changed_values(), held, **self.assembly())
+
+    def assembly(self) -> dict[str, Any]:
+        """Arguments of `crane.load` about how a description is read and assembled."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackageOptions(OptionBlock):
+    """Where files of a description are found, and arguments of xacro files."""
+
+    panel = "Machine options"
+    packages: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FOLDER", help="A folder of packages that files refer to; may be repeated."
+        ),
+    ] = None
+    argument: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--arg", metavar="NAME:=VALUE", help="An argument of a xacro file; may be repeated."
+        ),
+    ] = None
+
+    def package_values(self) -> dict[str, Any]:
+        """Arguments of `crane.load` by name."""
+        return {"packages": self.packages or (), "arguments": parse_arguments(self.argument)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssemblyOptions(PackageOptions):
+    """How a description is assembled."""
+
+    active: Annotated[
+        str | None,
+        typer.Option(metavar="JOINTS", help="Active joints, as lift,tilt, instead of the file's."),
+    ] = None
+    free: Annotated[
+        str | None,
+        typer.Option(metavar="JOINTS", help="Active joints without an actuator, as swing,sway."),
+    ] = None
+    floating: Annotated[
+        bool,
+        typer.Option("--floating", help="Give the root a floating base: a vehicle, a humanoid."),
+    ] = False
+
+    def assembly(self) -> dict[str, Any]:
+        """Arguments of `crane.load` by name."""
+        return {
+            "active": parse_names(self.active), "free": parse_names(self.free),
+            "floating": self.floating, **self.package_values(),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions(AssemblyOptions, ParameterOptions):
+    """All options of a machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeOptions(OptionBlock):
+    """Which part of a recording is read."""
+
+    panel = "Recording options"
+    since: Annotated[
+        float | None,
+        typer.Option(
+            "--from", metavar="SECONDS", help="Start of the part to read, in recorded time."
+        ),
+    ] = None
+    until: Annotated[
+        float | None,
+        typer.Option("--until", metavar="SECONDS", help="End of the part to read."),
+    ] = None
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Start and end [s] of the part to read.
+
+        Raises:
+            InputError: It is empty.
+        """
+        start = -inf if self.since is None else self.since
+        end = inf if self.until is None else self.until
+        if not start < end:
+            raise InputError(f"nothing lies from {start:g} to {end:g} s, give a later --until")
+        return start, end
+
+    def check(self) -> None:
+        """Raise an error if the part to read is empty."""
+        _ = self.span
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions(TimeOptions):
+    """Which part and which columns of a recording are read."""
+
+    columns: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="File that assigns the columns of a raw log, as for import."
+        ),
+    ] = None
+
+    def read(self, path: Path, machine: "Machine | None" = None, needs: Any = ()) -> "Recording":
+        """Read a recording, see `crane.recordings.run_folder.read_run`."""
+        from crane.recordings.run_folder import read_run
+
+        return read_run(path, machine, self.columns, self.span, needs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParallelOptions(OptionBlock):
+    """Where variants are computed."""
+
+    panel = "Computing options"
+    processes: Annotated[
+        int | None, typer.Option(help="Number of processes; one per core by default.")
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Address of the scheduler of a Dask cluster."),
+    ] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `crane.study` and `crane.design` by name."""
+        import os
+
+        processes = (os.cpu_count() or 1) if self.processes is None else self.processes
+        return {"processes": processes, "scheduler": self.scheduler}
+
+
+def _as_path(text: str | Path) -> Path:
+    if not str(text):
+        raise OutputError("the name after --out is empty, give one")
+    return Path(text)
+
+
+def _default_folder(context: typer.Context, folder: Path) -> Path:
+    source = context.get_parameter_source("out")
+    is_given = source is not None and source.name != "DEFAULT"
+    return folder if is_given else Path(str(context.info_name).replace("-", "_"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputFolder(OptionBlock):
+    """The folder that a result is written to; one named like the command by default."""
+
+    panel = "Output options"
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FOLDER",
+            parser=_as_path,
+            callback=_default_folder,
+            show_default=False,
+            help="Folder of the results; named like the command by default.",
+        ),
+    ] = Path()
+    force: Force = False
+
+    def check(self) -> None:
+        """Raise an error if the folder cannot be written."""
+        check_folder_is_writable(self.out, self.force)
+
+    def write(self, result: "Result", note: str = "", **options: Any) -> None:
+        """Write a result into the folder, and print its summary.
+
+        Args:
+            result: The result.
+            note: Text after the name of the folder.
+            options: Options of `Result.write`.
+        """
+        with status("writing the results"):
+            text = result.write(self.out, self.force, **options)
+        print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionalOutputFolder(OptionBlock):
+    """The folder that a result is written to; none by default."""
+
+    panel = "Output options"
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", parser=_as_path, help="Folder of the results; none by default."
+        ),
+    ] = None
+    force: Force = False
+
+    def check(self) -> None:
+        """Raise an error if there is a folder and it cannot be written."""
+        if self.out is not None:
+            check_folder_is_writable(self.out, self.force)
+
+    def write(self, result: "Result", note: str = "", **options: Any) -> None:
+        """Print the summary of a result, and write it if there is a folder; as `OutputFolder`."""
+        if self.out is not None:
+            OutputFolder(out=self.out, force=self.force).write(result, note, **options)
+            return
+        from crane.view.result_files import result_summary
+
+        print(result_summary(result, **options).rstrip())
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverwriteOptions(OptionBlock):
+    """Whether files are replaced."""
+
+    panel = "Output options"
+    force: Force = False
+
+
+_OUT_FILE = typer.Option(metavar="FILE", parser=_as_path, help="The file to write.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequiredOutputFile(OptionBlock):
+    """The file that a command writes, without a default."""
+
+    panel = "Output options"
+    out: Annotated[Path, _OUT_FILE]
+    force: Force = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputFile(OptionBlock):
+    """The file that a command writes."""
+
+    panel = "Output options"
+    out: Annotated[Path | None, _OUT_FILE] = None
+    force: Force = False
+
+    def path(self, default: Path) -> Path:
+        """The file to write.
+
+        Raises:
+            OutputError: It exists and may not be replaced, or it cannot be written.
+        """
+        file = self.out or default
+        check_file_is_writable(file, self.force)
+        return file

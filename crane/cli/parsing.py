@@ -1,0 +1,349 @@
+"""Values of options and arguments from their text: NAME=VALUE, ranges, windows, loads, priors."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from crane.common.errors import InputError, suggest_names
+
+if TYPE_CHECKING:
+    from crane.common.samples import Array
+    from crane.description.estimation_settings import ParameterPrior, TermValues
+    from crane.description.external_forces import Wrench
+
+CONFIGURATION_FORM = "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
+_VALUE_FORM = "JOINT=VALUE, as in X1=0.5"
+_FIT_FORM = "NAME, NAME=START, or NAME=START,LOW~HIGH"
+_TERM_FORM = "NAME, NAME=NUMBERS or NAME=off, as in q1.presliding=1e-4"
+_TRIAL_FORM = "each NAME=VALUES once, as bandwidth=2,5,10 or bodies=1%,10%"
+_PRIOR_FORM = "NAME=STD, as in bodies=10%, q1.viscous=50 or q1.viscous=200+-50, a share, or none"
+_GRID_FORM, _RANGE_FORM = "NAME=start:stop:count", "NAME=low~high"
+_MAX_GRID_VALUES = 10_000  # of one parameter
+_MAX_SLEW_ANGLES = 8  # that a page has room for
+_Value = TypeVar("_Value")
+
+
+def parse_names(text: str | None) -> list[str] | None:
+    """Names in a list with commas; None if there is no list."""
+    return None if text is None else [word.strip() for word in text.split(",") if word.strip()]
+
+
+def parse_values(
+    option: str, texts: Sequence[str] | None, form: str = _VALUE_FORM
+) -> dict[str, float]:
+    """Numbers by name from texts NAME=VALUE.
+
+    Args:
+        option: Name of the option, for errors.
+        texts: The texts.
+        form: The form that an error asks for.
+
+    Raises:
+        InputError: A text has another form, a name is given twice, or a number is out of range.
+    """
+    from crane.common.samples import as_number
+
+    values: dict[str, float] = {}
+    for text in texts or ():
+        name, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            name, value = "", 0.0
+        if not name:
+            raise InputError(f"{option} is '{text}', write {form}")
+        if name in values:
+            raise InputError(f"{option} names '{name}' twice, give it once")
+        values[name] = as_number(value, f"{option} {name}", "")
+    return values
+
+
+def parse_configuration(option: str, text: str | None) -> dict[str, float]:
+    """Numbers by joint from JOINT=VALUE,JOINT=VALUE.
+
+    Raises:
+        InputError: As `parse_values`.
+    """
+    return parse_values(option, text.split(",") if text else None, CONFIGURATION_FORM)
+
+
+def parse_arguments(texts: Sequence[str] | None) -> dict[str, str]:
+    """Arguments of xacro files by name from NAME:=VALUE.
+
+    Raises:
+        InputError: A text has another form.
+    """
+    values = {}
+    for text in texts or ():
+        name, separator, value = text.partition(":=")
+        if not separator or not name.strip():
+            raise InputError(f"--arg is '{text}', write NAME:=VALUE")
+        values[name.strip()] = value
+    return values
+
+
+def parse_window(text: str | None) -> tuple[float, float]:
+    """Start and end [s] of the training data from FROM:TO; unbounded if there is no text.
+
+    Raises:
+        InputError: The text has another form.
+    """
+    first, colon, last = (text or ":").partition(":")
+    try:
+        start, end = float(first or "-inf"), float(last or "inf")
+    except ValueError:
+        start, end = 0.0, 0.0
+    if not colon or not start < end:
+        raise InputError(f"--train is '{text}', write FROM:TO in seconds, as 0:13.5")
+    return start, end
+
+
+def parse_numbers(texts: Sequence[str], message: str) -> list[float]:
+    """Numbers of texts.
+
+    Raises:
+        InputError: A text is no number; with this message.
+    """
+    try:
+        return [float(text) for text in texts]
+    except ValueError:
+        raise InputError(message) from None
+
+
+def parse_slew_angles(text: str) -> list[float]:
+    """Angles [deg] in a list with commas.
+
+    Raises:
+        InputError: The text has another form, or there are too many angles.
+    """
+    angles = parse_numbers(text.split(","), f"--slew is '{text}', write degrees, as 0,45,90")
+    if len(angles) > _MAX_SLEW_ANGLES:
+        raise InputError(
+            f"--slew has {len(angles)} angles, a page has room for {_MAX_SLEW_ANGLES}"
+        )
+    return angles
+
+
+def parse_fits(texts: Sequence[str]) -> dict[str, object]:
+    """What is fitted, by name: None, an initial guess, or initial guess, lower and upper bound.
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+
+    def parse(text: str) -> object:
+        start, comma, bounds = text.partition(",")
+        low, tilde, high = bounds.partition("~")
+        if not comma:
+            return float(start)
+        if not tilde:
+            raise ValueError
+        return float(start), float(low), float(high)
+
+    fits: dict[str, object] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not name:
+            raise InputError(f"--fit is '{text}', write {_FIT_FORM}")
+        if name in fits:
+            raise InputError(f"--fit names '{name}' twice, give it once")
+        try:
+            fits[name] = parse(value) if equals else None
+        except ValueError:
+            raise InputError(f"--fit is '{text}', write {_FIT_FORM}") from None
+    return fits
+
+
+def parse_terms(texts: Sequence[str] | None) -> "dict[str, TermValues | None]":
+    """Values of model terms by name; None of terms that are off.
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+    terms: dict[str, TermValues | None] = {}
+    for text in texts or ():
+        name, equals, values = text.partition("=")
+        is_word = not equals or values in ("on", "off")
+        message = f"--term is '{text}', write {_TERM_FORM}"
+        numbers = () if is_word else tuple(parse_numbers(values.split(","), message))
+        if name in terms:
+            raise InputError(f"--term names '{name}' twice, give it once")
+        terms[name] = None if values == "off" else numbers
+    return terms
+
+
+def parse_priors(texts: Sequence[str] | None) -> "dict[str, ParameterPrior] | None":
+    """Priors by name, "*" of one without a name; None of the text "none".
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+    from crane.description.estimation_settings import ParameterPrior
+
+    if texts and list(texts) == ["none"]:
+        return None
+    priors: dict[str, ParameterPrior] = {}
+    for text in texts or ():
+        name, equals, value = text.rpartition("=")
+        name = name.strip() if equals else "*"
+        try:
+            prior = ParameterPrior.parse(value)
+        except InputError:
+            raise InputError(f"--prior is '{text}', write {_PRIOR_FORM}") from None
+        if name in priors:
+            raise InputError(f"--prior says two things of '{name}', give one")
+        priors[name] = prior if equals else dataclasses.replace(prior, relative=True)
+    return priors
+
+
+def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | ParameterPrior]]":
+    """Values for cross-validation by name: bandwidths, or priors of parameters.
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+    from crane.description.estimation_settings import ParameterPrior
+
+    trials: dict[str, list[float | ParameterPrior]] = {}
+    for text in texts or ():
+        name, _, values = text.rpartition("=")
+        name = name.strip()
+        parse: Callable[[str], float | ParameterPrior]
+        parse = float if name == "bandwidth" else ParameterPrior.parse
+        try:
+            parsed = [parse(each) for each in values.split(",")]
+        except (ValueError, InputError):
+            name = ""
+        if not name or name in trials:
+            raise InputError(f"--try is '{text}', write {_TRIAL_FORM}")
+        trials[name] = parsed
+    return trials
+
+
+def parse_grids(texts: Sequence[str] | None) -> "dict[str, Array]":
+    """Values by parameter from NAME=start:stop:count.
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+    import numpy as np
+
+    def parse(text: str, name: str, values: str) -> "Array":
+        if "~" in values:
+            raise InputError(f"--vary {text}: a range is drawn from, say how often with --draws")
+        words = values.split(":")
+        if len(words) != 3:
+            raise InputError(f"--vary {text}: '{values}' is no grid, give {_GRID_FORM}")
+        start, stop = _finite_numbers(text, words[:2], _GRID_FORM)
+        count = int(words[2]) if words[2].strip().isdecimal() else 0
+        if not 1 <= count <= _MAX_GRID_VALUES:
+            raise InputError(
+                f"--vary {text}: '{words[2]}' is no count of 1 to {_MAX_GRID_VALUES}, "
+                f"give {_GRID_FORM}"
+            )
+        if count == 1 and start != stop:
+            raise InputError(f"--vary {text}: one value cannot be both ends, give a larger count")
+        return np.linspace(start, stop, count)
+
+    return _parse_varied(texts or (), parse)
+
+
+def parse_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Ends of ranges by parameter from NAME=low~high.
+
+    Raises:
+        InputError: A text has another form, or a name is given twice.
+    """
+
+    def parse(text: str, name: str, values: str) -> tuple[float, float]:
+        if "~" not in values:
+            raise InputError(f"--vary {text}: give a range, {name}=low~high")
+        words = values.split("~")
+        if len(words) != 2:
+            raise InputError(f"--vary {text}: a range has two ends, give {_RANGE_FORM}")
+        low, high = _finite_numbers(text, words, _RANGE_FORM)
+        if not low < high:
+            raise InputError(f"--vary {text}: {low:g} is not below {high:g}, give {_RANGE_FORM}")
+        return low, high
+
+    return _parse_varied(texts, parse)
+
+
+def _parse_varied(
+    texts: Sequence[str], parse: Callable[[str, str, str], _Value]
+) -> dict[str, _Value]:
+    varied: dict[str, _Value] = {}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        name = name.strip()
+        if not (equals and name and values.strip()):
+            raise InputError(f"--vary {text}: give {_GRID_FORM}, or {_RANGE_FORM}")
+        if name in varied:
+            raise InputError(f"--vary {text}: '{name}' is varied twice, give it once")
+        varied[name] = parse(text, name, values)
+    return varied
+
+
+def _finite_numbers(text: str, words: list[str], form: str) -> list[float]:
+    message = f"--vary {text}: '{':'.join(words)}' are no numbers, give {form}"
+    numbers = parse_numbers(words, message)
+    if not all(map(isfinite, numbers)):
+        raise InputError(message)
+    return numbers
+
+
+def parse_loads(texts: Sequence[str] | None) -> "list[Wrench]":
+    """External forces from FRAME=FX,FY,FZ, FRAME=FX,FY,FZ,MX,MY,MZ or FRAME=FILE.
+
+    Raises:
+        InputError: A text has another form.
+        RecordingError: A file cannot be read.
+    """
+    return [_parse_load(text) for text in texts or ()]
+
+
+def _parse_load(text: str) -> "Wrench":
+    from crane.description.external_forces import Wrench
+
+    head, equals, wrench = text.partition("=")
+    frame, _, axes = head.partition("@")
+    what = f"--load {text!r}"
+    if not equals or not frame or not wrench:
+        raise InputError(f"{what} is no FRAME=WRENCH, give one such as tip=0,0,-1000")
+    axes = axes or "world"
+    if Path(wrench).suffix.lower() in (".csv", ".npz"):
+        times, force, moment = _read_wrenches(Path(wrench))
+        return Wrench(frame, force, moment, times, axes)
+    message = f"{what}: give 3 or 6 numbers with commas, or a CSV file"
+    numbers = parse_numbers(wrench.split(","), message)
+    if len(numbers) not in (3, 6):
+        raise InputError(message)
+    return Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)
+
+
+def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":
+    """Times (N,), forces (N, 3) and moments (N, 3) of a file."""
+    import numpy as np
+
+    from crane.description.external_forces import WRENCH_COMPONENTS
+    from crane.recordings import timeseries
+
+    table = timeseries.read_table(path)
+    names = list(table.units)
+    if "time" not in names:
+        raise InputError(f"{path}: has no column 'time', add it")
+    for name in names:
+        if name != "time" and name not in WRENCH_COMPONENTS:
+            raise InputError(
+                f"{path}: '{name}' is no part of a wrench, "
+                f"{suggest_names(WRENCH_COMPONENTS, name)}"
+            )
+    if len(names) < 2:
+        raise InputError(f"{path}: has no force, add columns such as force_z")
+    columns = dict(zip(names, table.values.T, strict=True))
+    zero = np.zeros(len(table.values))
+    wrenches = np.stack([columns.get(part, zero) for part in WRENCH_COMPONENTS], axis=1)
+    return columns["time"], wrenches[:, :3], wrenches[:, 3:]

@@ -1,0 +1,329 @@
+"""Commands that rate machines: workspace, working-range, breakout, capacity, stability, power."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from crane.cli.command import OptionBlock, command, refuse_options
+from crane.cli.options import (
+    Bucket,
+    Configuration,
+    Frame,
+    MachineName,
+    MachineOptions,
+    OptionalParameters,
+    OutputFolder,
+    RecordingFile,
+    RecordingOptions,
+    Rule,
+    Seed,
+    Task,
+)
+from crane.cli.parsing import parse_numbers, parse_slew_angles
+from crane.cli.show import active_coordinates
+from crane.cli.terminal import status
+from crane.common.errors import CraneWarning, InputError
+
+if TYPE_CHECKING:
+    from crane import ratings
+
+ChartStep = Annotated[
+    float | None, typer.Option("--step", metavar="M", help="Distance of grid points in m.")
+]
+
+
+@command()
+def workspace(
+    machine: MachineName,
+    options: MachineOptions,
+    output: OutputFolder,
+    samples: Annotated[int, typer.Option(help="Approximate number of configurations.")] = 10_000,
+    frame: Frame = None,
+    seed: Seed = 0,
+) -> None:
+    """Compute the reachable workspace and its singular curves."""
+    from crane.motion.workspaces import workspace as compute
+
+    loaded = options.load(machine)
+    with status("exploring"):
+        result = compute(loaded, samples, frame, seed)
+    output.write(result)
+
+
+@command("working-range")
+def working_range(
+    machine: MachineName,
+    options: MachineOptions,
+    output: OutputFolder,
+    frame: Frame = None,
+    bucket: Bucket = None,
+    level: Annotated[
+        float, typer.Option(metavar="M", help="Length of the level bottom in m.")
+    ] = 2.44,
+) -> None:
+    """Compute reach, digging depth and dump height (ISO 7135)."""
+    from crane.ratings import working_range as compute
+
+    loaded = options.load(machine)
+    with status("measuring"):
+        result = compute(loaded, frame, bucket=bucket, level=level)
+    output.write(result)
+
+
+@command()
+def breakout(
+    machine: MachineName,
+    options: MachineOptions,
+    output: OutputFolder,
+    frame: Frame = None,
+    bucket: Bucket = None,
+    arm: Annotated[
+        str | None, typer.Option(metavar="JOINT", help="The joint whose drive moves the arm.")
+    ] = None,
+    weights: Annotated[
+        bool, typer.Option("--weights", help="Include the machine's weight and tipping.")
+    ] = False,
+    direction: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIRECTION",
+            help="Chart the largest tool force in this direction instead: up, down, in, out, "
+            "tangent or normal to the path of the tool (=-tangent, =-normal), or X,Y,Z.",
+        ),
+    ] = None,
+    step: ChartStep = None,
+) -> None:
+    """Compute break-out forces (ISO 6015) or tool forces."""
+    from crane.ratings import breakout as compute
+    from crane.ratings import tool_force
+
+    if direction is None and step is not None:
+        raise InputError("--step is for the reach, add --direction")
+    if direction is not None and arm is not None:
+        raise InputError("--arm is for break-out forces, leave it out with --direction")
+    loaded = options.load(machine)
+    result: ratings.Breakout | ratings.ToolForce
+    with status("computing forces"):
+        if direction is None:
+            result = compute(loaded, frame, bucket=bucket, arm=arm, weights=weights)
+        else:
+            vector: str | list[float] = direction
+            if "," in direction:
+                message = f"--direction {direction} is no X,Y,Z, give three numbers"
+                vector = parse_numbers(direction.split(","), message)
+            result = tool_force(loaded, vector, frame, joint=bucket, weights=weights, step=step)
+    output.write(result)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatingOptions(OptionBlock):
+    """The conditions of rated loads."""
+
+    panel = "Rating options"
+    rule: Rule = "none"
+    hydraulic: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE", help="Share of the hydraulic lifting load instead of the rule's."
+        ),
+    ] = None
+    tipping: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="Share of the tipping load instead of the rule's."),
+    ] = None
+    raising: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT",
+            help="A drive that raises the load; the others hold it; may be repeated; by the rule "
+            "by default.",
+        ),
+    ] = None
+    slew: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEG,...",
+            help="Slew angles; by default home, and a quarter turn of a machine that tips.",
+        ),
+    ] = None
+    slope: Annotated[
+        float, typer.Option(metavar="DEG", help="Slope of the ground towards the worst side.")
+    ] = 0.0
+    friction: Annotated[
+        bool, typer.Option("--friction", help="Raising drives overcome joint friction.")
+    ] = False
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `crane.capacity` and `crane.torques` by name.
+
+        Raises:
+            InputError: The rule is unknown, or a number is out of range.
+        """
+        from math import radians
+
+        from crane.common.samples import as_number
+
+        slope = radians(as_number(self.slope, "--slope", "degrees", max_magnitude=45.0))
+        slews = None if self.slew is None else [radians(x) for x in parse_slew_angles(self.slew)]
+        return {
+            "rule": self._applied_rule(), "raising": self.raising or None, "slope": slope,
+            "slews": slews, "friction": self.friction,
+        }  # fmt: skip
+
+    def _applied_rule(self) -> "ratings.Rule":
+        """The rule, with the shares that are given instead of its own."""
+        from crane.common.samples import as_number
+        from crane.ratings.rating_rules import find_rule
+
+        rule, words = find_rule(self.rule), []
+        for what, share in (("hydraulic", self.hydraulic), ("tipping", self.tipping)):
+            if share is not None:
+                share = as_number(share, f"--{what}", "", greater_than=0.0, max_magnitude=1.0)
+                rule = replace(rule, **{what: share})  # type: ignore[arg-type]
+                words.append(f"{100 * share:g} % of the {what} load")
+        if words:
+            rule = replace(rule, description=f"{rule.description}; here {' and '.join(words)}")
+        return rule
+
+
+@command()
+def capacity(
+    machine: MachineName,
+    rating: RatingOptions,
+    options: MachineOptions,
+    output: OutputFolder,
+    frame: Frame = None,
+    step: ChartStep = None,
+    torque: Annotated[
+        float | None,
+        typer.Option(
+            metavar="RADIUS",
+            help="Also compute lifting torques at this radius in m, and the slewing torque.",
+        ),
+    ] = None,
+    by: OptionalParameters = None,
+) -> None:
+    """Compute rated loads over the reach (load chart)."""
+    from crane.dynamics.tipping_stability import has_supports
+    from crane.ratings import capacity as compute
+    from crane.ratings import torques
+
+    conditions = rating.arguments()
+    loaded, tipping_share = options.load(machine), conditions["rule"].tipping
+    if tipping_share < 1 and not has_supports(loaded):
+        text = (
+            f"'{loaded.name}' has no supports, so that nothing tips and the rule's "
+            f"{100 * tipping_share:.3g} % of the tipping load are left out: name what it stands "
+            "on under 'supports' of the machine file"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=2)
+    with status("rating"):
+        chart, lifting = compute(loaded, frame, step=step, **conditions), None
+        if torque is not None:
+            lifting = torques(loaded, frame, radius=torque, **conditions)
+    output.write(chart, torques=lifting, parameters=by or ())
+
+
+@command()
+def stability(
+    machine: MachineName,
+    options: MachineOptions,
+    at: Configuration = None,
+    frame: Frame = None,
+    task: Task = None,
+) -> None:
+    """Compute stability margins and tipping loads.
+
+    With --task, also the payload that tips the machine during the task.
+    """
+    from crane.dynamics.tipping_stability import TippingStability
+    from crane.studies.task_tipping_load import tipping_load
+
+    loaded = options.load(machine)
+    tipping, q_a = TippingStability(loaded), active_coordinates(loaded, at)
+    found = None
+    if task is not None:
+        with status("simulating"):
+            found = tipping_load(loaded, task)
+    (moments,), (shares,) = tipping.static_margins(q_a)
+    load_text = ""
+    if loaded.tip is not None or frame is not None:
+        ((mass,), (line,)), name = tipping.tipping_load(q_a, frame), frame or loaded.tip
+        load_text = f"no load at '{name}' tips it"
+        if line:
+            load_text = f"{mass:.5g} kg at '{name}' tip it about {line}"
+    print("| tipping line | held by | of the weight |\n| --- | ---: | ---: |")
+    for names, moment, share in zip(tipping.line_names, moments, shares, strict=True):
+        print(f"| {' to '.join(names)} | {moment:.4g} N m | {100 * share:.1f} % |")
+    if load_text:
+        print(f"\n{load_text}")
+    if found is not None:
+        print(
+            f"in '{task}' a payload of {found.mass:.5g} kg tips it, at t = {found.time:.4g} s; "
+            f"at rest {found.static_mass:.5g} kg would"
+        )
+
+
+@command()
+def power(
+    machine: MachineName,
+    recording: RecordingFile,
+    options: MachineOptions,
+    reading: RecordingOptions,
+    output: OutputFolder,
+    beside: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="A run to compare with, of the machine that it names; may be repeated.",
+        ),
+    ] = None,
+    moved: Annotated[
+        float | None,
+        typer.Option(metavar="KG", help="Mass that each run moves, for the work per kg."),
+    ] = None,
+) -> None:
+    """Compute the power balance of a hydraulic run.
+
+    It distributes the power of the pumps over losses of components, loads and stored energy.
+    """
+    from crane.control.valve_commands import require_circuit
+    from crane.recordings.run_folder import recorded_machine
+    from crane.studies.hydraulic_power_balance import power_balance
+    from crane.studies.power_comparison import PowerComparison
+
+    if not beside:
+        refuse_options(
+            {"--moved": moved}, "is for a comparison, name the other runs with --beside"
+        )
+    names = _run_names([recording, *(beside or ())])
+    loaded = options.load(machine)
+    require_circuit(loaded)  # before anything is read
+    run = reading.read(recording, loaded)
+    with status("adding up"):
+        balances = {names[0]: power_balance(loaded, run)}
+    for name, path in zip(names[1:], beside or (), strict=True):
+        other = reading.read(path)
+        other_machine = recorded_machine(path, other.machine)
+        require_circuit(other_machine)
+        with status("adding up"):
+            balances[name] = power_balance(other_machine, other)
+    output.write(PowerComparison(balances, moved) if beside else balances[names[0]])
+
+
+def _run_names(paths: Sequence[Path]) -> list[str]:
+    """Names of runs: of their folders or files, or whole paths if those are not unique.
+
+    Raises:
+        InputError: A run is given twice.
+    """
+    short = [path.stem if path.suffix else path.name for path in paths]
+    names = short if len(set(short)) == len(paths) else [str(path) for path in paths]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"the run '{name}' is given twice, leave one out")
+    return names
