@@ -19,7 +19,7 @@ from crane.closure import compiled_closure as loops
 from crane.closure.constraint_tolerances import RedundancyGap
 from crane.closure.kinematics_formulas import folding_pattern
 from crane.codegen import Program
-from crane.codegen.llvm.module_emitter import emit_module
+from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.program_cache import cache_entry_name
 from crane.dynamics import compiled_dynamics as quantities
 from crane.motion.kinematics import _CompiledFrame, _CompiledPoint

@@ -1,4 +1,9 @@
-"""Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
+"""`Closure`: solves the loops of a machine, q = f(q_A), v = gamma v_A, a = gamma a_A + drift.
+
+Newton's method for one configuration is `NewtonContinuation.solve_newton` in
+`crane.closure.newton_continuation`; in machine code the routine `close` of
+`crane.closure.compiled_closure`.
+"""
 
 import copy
 import dataclasses
@@ -45,13 +50,11 @@ _MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = (
     100,
     0.1,
 )  # samples worth sorting: how many, how far apart as a share of the range
-_SAME_CONFIGURATION_TOLERANCE = (
-    1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
-)
-_MIN_SINGULAR_VALUE_SHARE = (
-    0.1  # share of the least singular value of all equations that independent ones keep
-)
-_CONTINUATION_STEPS = 8  # from home to a target that is far from the one before it
+# rad, machine's size, between a posture and what Newton's method makes of it
+_SAME_CONFIGURATION_TOLERANCE = 1e-6
+# share of the least singular value of all equations that independent ones keep
+_MIN_SINGULAR_VALUE_SHARE = 0.1
+_CONTINUATION_STEPS = 8  # steps from home to a target far from the previous one
 
 
 class Closure(OneLineRepr):
@@ -60,7 +63,7 @@ class Closure(OneLineRepr):
     Park, Choi, Ploen (1999); equations (3) and (4) of the reduced-scale forwarder paper, for any
     machine. With J = dphi/dq split into active and passive columns and independent rows,
 
-        q = f(q_A)                 phi(q) = 0, on the assembly branch of the home posture
+        q = f(q_A)                 phi(q) = 0, on the branch of the home configuration
         gamma = df/dq_A            rows of active joints: identity; passive: -J_P^-1 J_A
         drift = gammadot v_A       rows of active joints: zero; passive: -J_P^-1 (Jdot v)
 
@@ -68,34 +71,31 @@ class Closure(OneLineRepr):
         model: The spanning tree.
         loops: The loops that close it.
         active: Names of the active joints, in the order of q_A.
-        initial_guess: (nq,) active coordinates of the home posture, and a first guess of the
-            others.
+        initial_guess: (nq,) active coordinates of the home configuration, and an initial guess of
+            the others.
         couplings: Linear constraints of joints.
-        specified: Names of joints whose home is said to be that of the guess; where the loops do
-            not close from the guess, the others are sought. None: all are said, and none is
-            sought.
-        movable: Names of active joints that nothing holds at the guess while the others are
-            sought.
-        keep_revolutions: Whether pins keep the whole turns of the guess, which else are taken out.
+        specified: Names of joints whose home coordinate the file specifies. Where the loops do not
+            close from the guess, home is searched for with the other joints. None: no search.
+        movable: Names of active joints that may move during this search.
+        keep_revolutions: Whether the full revolutions of the guess are kept; removed if not.
 
     Raises:
         MechanismError: The loops cannot be closed, or the active joints do not fit the degrees of
             freedom.
 
     Attributes:
-        home: (nq,) the closed home posture.
-        initial_guess: (nq,) what it was closed from.
-        specified: Columns for which it is the file that says so.
+        home: (nq,) closed home configuration.
+        initial_guess: (nq,) configuration from which it was closed.
+        specified_columns: Columns whose home coordinate the file specifies.
         active: Columns of the active joints.
         passive: Columns of the passive joints.
-        structure: Independent equations and the order in which they solve.
-        characteristic_length: Of the machine [m], see
+        structure: Independent equations and the order in which they are solved.
+        characteristic_length: Characteristic length of the machine [m], see
             `crane.closure.active_joint_selection.characteristic_length`.
-        coordinate_units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size
+        units: (nv,) units that make coordinates comparable: 1 rad, and the characteristic length
             [m].
-        characteristic_time: Unit of time [s] of what moves by its weight, 1 s for a machine of 1
-            m: motions of similar machines in the same gravity take times like the roots of their
-            sizes (Froude).
+        characteristic_time: Characteristic time [s] of motions under gravity, 1 s for a machine of
+            1 m: times of similar machines scale with the square root of the length (Froude).
         home_search: How home was found where it did not follow from the guess, else None.
     """
 
@@ -162,7 +162,7 @@ class Closure(OneLineRepr):
         self, specified: list[int] | None, movable: list[int]
     ) -> tuple[ConstraintStructure, HomeSearchResult | None]:
         def find() -> tuple[ConstraintStructure, HomeSearchResult | None]:
-            import scipy.linalg  # noqa: F401 - which brings a library of its own
+            import scipy.linalg  # noqa: F401 - loads the BLAS library to limit
 
             with single_threaded_blas(self.model.nv):
                 return find_home(
@@ -189,7 +189,7 @@ class Closure(OneLineRepr):
 
     @property
     def cache_key(self) -> tuple[Any, ...]:
-        """All that its equations are made of, see `crane.codegen.cached_result`."""
+        """Everything that the equations depend on, see `crane.codegen.cached_result`."""
         loops = tuple(
             (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
             for x in self.equations.loops
@@ -200,7 +200,7 @@ class Closure(OneLineRepr):
         return self.model.saveToString(), loops, couplings
 
     def _one_line(self) -> str:
-        """Its loops, and what drives them."""
+        """Loops and active joints."""
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
         return (
             f"Closure of {loops}: {len(self.passive)} passive joints from "
@@ -210,7 +210,7 @@ class Closure(OneLineRepr):
     def with_other_masses(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure | None":
-        """This closure, of a tree that differs in masses alone; None where more differs.
+        """This closure for a tree that differs in masses only; None if it differs in more.
 
         Args:
             model: The tree, of the same structure.
@@ -220,15 +220,15 @@ class Closure(OneLineRepr):
         if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other._thread_local = threading.local()  # where a thread begins is no one else's
+        other._thread_local = threading.local()  # cursors belong to one closure
         return other
 
     def with_perturbed_model(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure":
-        """The closure of a tree whose numbers differ little, by its structure and on its branch.
+        """The closure of a slightly different tree, with this structure and on this branch.
 
-        A look at a machine beside this one: it has no machine code of its own.
+        It is used for finite differences and has no machine code.
 
         Args:
             model: The tree.
@@ -236,7 +236,7 @@ class Closure(OneLineRepr):
             couplings: Its couplings.
 
         Raises:
-            MechanismError: The loops do not close there, or lock up.
+            MechanismError: The loops do not close there, or lock.
         """
         equations = LoopEquations(model, loops, couplings)
         if _has_same_geometry(equations, self.equations):
@@ -268,13 +268,13 @@ class Closure(OneLineRepr):
         return other
 
     def with_home_configuration(self, q: Array) -> "Closure | None":
-        """The same coordinates on the branch of another closed posture.
+        """The same coordinates on the branch of another closed configuration.
 
         Args:
-            q: (nq,) its home, whose whole turns stay.
+            q: (nq,) the other home configuration, whose full revolutions are kept.
 
         Returns:
-            None where other independent equations determine the passive joints better there.
+            None where other independent equations determine the passive joints much better.
 
         Raises:
             MechanismError: The loops do not close there.
@@ -326,15 +326,15 @@ class Closure(OneLineRepr):
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is machine code for these loops."""
+        """Whether the loops are solved by machine code."""
         return self._optional_compiled_closure is not None
 
     @property
     def compiled_closure(self) -> CompiledClosure:
-        """Machine code for these loops, made when it is first needed.
+        """Machine code of the loops, compiled on first use.
 
         Raises:
-            TooLongError: The machine is too large for it.
+            FormulaTooLongError: The machine is too large for it.
         """
         if self._optional_compiled_closure is None:
             raise FormulaTooLongError
@@ -342,7 +342,7 @@ class Closure(OneLineRepr):
 
     @property
     def _cursor(self) -> ContinuationCursor:
-        """This thread's cursor."""
+        """The cursor of this thread."""
         try:
             return self._thread_local.cursor
         except AttributeError:
@@ -351,29 +351,30 @@ class Closure(OneLineRepr):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of active joints n."""
+        """Number n of active joints."""
         return len(self.active)
 
     def solve(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
         """Close the loops: q = f(q_A), equation (3) of the reduced-scale forwarder paper.
 
-        Newton's method from the last posture this thread solved (or the guess), in one step where
-        that follows the branch; else from home, along the straight line of q_A, in steps that are
-        halved whenever Newton hesitates or would change the assembly branch. A stack is tracked
-        like a path; one of far samples is sorted for that. The result is closed to rounding, on
-        the home posture's branch whatever was solved before, or an error is raised.
+        Newton's method starts from the last configuration that this thread solved (or the guess),
+        in one step where that stays on the branch; else from home, along the straight line of q_A,
+        in steps that are halved where Newton's method converges slowly or would leave the branch.
+        A stack is followed like a path; a stack of distant samples is sorted first. The result is
+        closed to rounding and on the branch of home, independently of earlier calls, or an error
+        is raised.
 
         Args:
             q_a: (n,) or (N, n) active coordinates [m], [rad]. Limits are not checked here.
-            initial_guess: (nq,) posture to start from, on the home posture's branch.
+            initial_guess: (nq,) configuration to start from, on the branch of home.
 
         Returns:
             q, (nq,) or (N, nq).
 
         Raises:
             InputError: Wrong shape or not finite.
-            OutOfReachError: No posture closes the loops.
-            BranchEdgeError: The passive joints are not determined there.
+            OutOfReachError: No configuration closes the loops.
+            SingularConfigurationError: The passive joints are not determined there.
             WrongBranchError: The guess belongs to another branch.
         """
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
@@ -409,21 +410,21 @@ class Closure(OneLineRepr):
         return out
 
     def follow_motion(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
-        """Closed postures along a recorded motion, also behind its dead centres.
+        """Closed configurations along a recorded motion, also beyond dead centres.
 
-        `solve` keeps to the branch of home. A motion that passes a dead centre of its active
-        joints leaves it, while q_A turns and comes back; here postures go on as the motion does.
+        `solve` keeps to the branch of home. A motion through a dead centre of its active joints
+        leaves this branch, while q_A turns back; here the configurations continue with the motion.
 
         Args:
-            q_a: (N, n) active coordinates, from sample to sample as dense as the motion is smooth.
-            initial_guess: (nq,) near the first posture; home if not given.
+            q_a: (N, n) active coordinates, sampled densely enough to extrapolate.
+            initial_guess: (nq,) near the first configuration; home if not given.
 
         Returns:
             (N, nq).
 
         Raises:
             InputError: Wrong shape or not finite.
-            ClosureError: The loops do not close, or the motion does not go on.
+            ClosureError: The loops do not close, or the motion does not continue to a sample.
         """
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.ndim != 2 or not len(targets):
@@ -454,10 +455,10 @@ class Closure(OneLineRepr):
             out[order] = closed
 
     def _sort_samples(self, targets: Array) -> NDArray[np.intp] | None:
-        """An order of far samples in which neighbours are near; None for what is a path already.
+        """An order of distant samples with close neighbours; None for samples along a path.
 
-        Cells of all coordinates but one, along the last one within a cell. Coordinates that move
-        no passive joint do not count.
+        Samples are sorted into cells of all coordinates but the last, and by the last one within a
+        cell. Coordinates that move no passive joint are ignored.
         """
         moves_passive_joints = (
             np.abs(self._continuation.home.passive_gamma).max(axis=0, initial=0.0) > 0
@@ -473,7 +474,7 @@ class Closure(OneLineRepr):
         return order
 
     def is_on_branch(self, q: Array) -> bool:
-        """Whether a closed posture (nq,) lies on the assembly branch of home."""
+        """Whether a closed configuration (nq,) lies on the branch of home."""
         if self.is_compiled:
             return self.compiled_closure.start_cursor_at(self._cursor, q)
         try:
@@ -485,14 +486,14 @@ class Closure(OneLineRepr):
     def continue_from_home(
         self, cursor: ContinuationCursor, target: Array, sample: str = ""
     ) -> Array:
-        """The posture at a target that is too far for one step, where the cursor is left.
+        """Close the loops at a target that is too far for one step, and move the cursor there.
 
-        In several steps from home, or as `NewtonContinuation` can.
+        In several steps from home, or else by `NewtonContinuation`.
 
         Args:
-            cursor: Where to go on from afterwards.
+            cursor: Cursor to move.
             target: (n,).
-            sample: What to call the target in errors.
+            sample: Name of the target in errors.
 
         Returns:
             q (nq,).
@@ -515,14 +516,14 @@ class Closure(OneLineRepr):
         """Derivative of f, equation (4) of the reduced-scale forwarder paper.
 
         Args:
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
 
         Returns:
             gamma, (nv, n) or (N, nv, n): v = gamma v_A.
 
         Raises:
             InputError: Wrong shape or not finite.
-            BranchEdgeError: The passive joints are not determined there.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
         if not self.is_compiled:
@@ -532,7 +533,7 @@ class Closure(OneLineRepr):
         rows = np.atleast_2d(np.ascontiguousarray(q))
         out = np.empty((len(rows), self.model.nv, len(self.active)))
 
-        def pivoted(i: int) -> None:  # what looks singular
+        def pivoted(i: int) -> None:  # at nearly singular configurations
             try:
                 out[i] = self._gamma_of_sample(rows[i])
             except SingularConfigurationError as error:
@@ -547,10 +548,10 @@ class Closure(OneLineRepr):
         return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Acceleration of the tree at a_A = 0: drift = gammadot v_A, a = gamma a_A + drift.
+        """Accelerations of the joints at a_A = 0: drift = gammadot v_A, a = gamma a_A + drift.
 
         Args:
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
             v: (nv,) or (N, nv) velocities v = gamma v_A.
 
         Returns:
@@ -558,14 +559,14 @@ class Closure(OneLineRepr):
 
         Raises:
             InputError: Wrong shape or not finite.
-            BranchEdgeError: The passive joints are not determined there.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
         v = as_samples(v, self.model.nv, "v", self._names)
         return apply_per_sample(self._drift_of_sample, q, v)
 
     def residual(self, q: ArrayLike) -> Array:
-        """Largest absolute residual of all loop equations, redundant ones too.
+        """Largest absolute residual of all loop equations, redundant ones included.
 
         Args:
             q: (nq,) or (N, nq).
@@ -579,13 +580,13 @@ class Closure(OneLineRepr):
         )
 
     def condition_number(self, q: ArrayLike) -> Array:
-        """How well the active joints drive the machine: ||D^-1 gamma D_A||_2, D = diag(scales).
+        """Condition number of the active joints: ||D^-1 gamma D_A||_2, D = diag(scales).
 
-        1 where no other joint moves, infinite where the branch ends; see
+        1 where no other joint moves, infinite at the end of the branch; see
         `crane.closure.active_joint_selection`.
 
         Args:
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
 
         Returns:
             () or (N,).
@@ -594,19 +595,17 @@ class Closure(OneLineRepr):
 
     @cached_property
     def proposed_active_joints(self) -> list[ActiveJointSelection]:
-        """Possible choices of active joints at home, see `active_joint_selection`."""
+        """Possible selections of active joints at home, see `active_joint_selection`."""
         coupled = np.flatnonzero((self.equations.coupling_factors != 0).any(axis=0)).tolist()
-        rows = (
-            self.structure.independent_rows
-        )  # the others contradict them by the digits of a file
+        rows = self.structure.independent_rows  # the others contradict these by the file precision
         jacobian = self.equations.evaluate(self.home)[1] / self.equations.residual_units[:, None]
         return propose_active_joints(self.model, jacobian[rows], coupled)
 
     def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
-        """gamma, v = gamma v_A and drift of one sample, at less cost than one by one.
+        """gamma, v = gamma v_A and drift of one sample in one evaluation.
 
         Args:
-            q: (nq,) closed posture.
+            q: (nq,) closed configuration.
             v_a: (n,) [m/s], [rad/s].
 
         Returns:
@@ -625,7 +624,7 @@ class Closure(OneLineRepr):
         )
 
     def _passive_gamma(self, jacobian: Array, q: Array) -> Array:
-        """(passive, n) of gamma, from a Jacobian in shares of the machine's size."""
+        """(passive, n) rows of gamma, from a scaled Jacobian."""
         rows = self._solve_passive(jacobian, jacobian[:, self.active], q)
         coordinate_units = self.equations.coordinate_units
         return rows * coordinate_units[self.passive, None] / coordinate_units[self.active]
@@ -651,7 +650,7 @@ class Closure(OneLineRepr):
         return drift
 
     def _solve_passive(self, jacobian: Array, right_side: Array, q: Array) -> Array:
-        """-J_P^-1 right, all in shares of the machine's size."""
+        """-J_P^-1 right_side, all scaled."""
         try:
             solution = solve_linear(jacobian[:, self.passive], -right_side)
         except np.linalg.LinAlgError:
@@ -661,7 +660,7 @@ class Closure(OneLineRepr):
 
 
 def _has_same_geometry(first: LoopEquations, second: LoopEquations) -> bool:
-    """Whether joints, limits and loops of two trees of one structure are at the same places."""
+    """Whether two trees of one structure have equal joint frames, limits and loop frames."""
     pairs = [
         [
             x.coupling_factors,

@@ -1,4 +1,4 @@
-"""Positions, loop equations and gamma as traced formulas of one machine."""
+"""Position kinematics, loop equations and gamma of one machine as symbolic formulas."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,13 @@ import pinocchio as pin
 from crane.closure.constraint_structure import ConstraintStructure, Indices
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
 from crane.closure.loop_equations import LoopEquations, aligned_axes, rotation_with_z_axis
-from crane.closure.rotation_vector_formulas import rotation_matrix
-from crane.closure.spatial_vectors import SpatialVector, Vector, spatial_dot, subtract_spatial
+from crane.closure.spatial_vectors import (
+    SpatialVector,
+    Vector,
+    rotation_matrix,
+    spatial_dot,
+    subtract_spatial,
+)
 from crane.codegen.symbolic import (
     Scalar,
     Tape,
@@ -31,25 +36,25 @@ from crane.codegen.symbolic import (
 from crane.common.samples import Array
 from crane.description import LOOP_TYPES
 
-_RIGHT_ANGLE_ROUNDING = 1e-15  # of a rotation by a right angle
+_RIGHT_ANGLE_ROUNDING = 1e-15  # rounding of a rotation by a right angle
 
 
 @dataclass(frozen=True, eq=False)
 class TreeGeometry:
-    """What the formulas of a machine's positions depend on.
+    """The geometry of a machine, which its kinematics formulas depend on.
 
-    Body i (1 to nb) is moved by joint i, which turns about or slides along the body's own z;
-    body 0 is the world. A free-flyer is six bodies in a row on the world, at the place of the last
-    one, which alone has mass: its velocities are along and about the axes of that body.
+    Joint i (1 to nb) moves body i and turns about or slides along the body's z axis; body 0 is the
+    world. A floating base is a series of six bodies on the world, at the position of the last one,
+    which alone has mass: its velocities are along and about the axes of that body.
 
     Attributes:
         parents: (nb + 1,) parent bodies.
-        is_revolute: (nb + 1,) whether the joint turns.
-        floating_bases: First body of each free-flyer.
-        body_rotations: (nb + 1, 3, 3) from the body's directions here to those of Pinocchio's
+        is_revolute: (nb + 1,) whether the joint is revolute.
+        floating_bases: First body of each floating base.
+        body_rotations: (nb + 1, 3, 3) from the axes of the body here to those of Pinocchio's
             joint.
         constants: (12 (nb + frames) + 1,) rotation and origin of every joint frame in its parent
-            body, then of every loop frame in its body; one over the machine's size.
+            body, then of every loop frame in its body; one over the characteristic length.
         frame_bodies: Body of each loop frame, predecessor and successor of each loop in turn.
     """
 
@@ -64,8 +69,8 @@ class TreeGeometry:
     def reference_body(self) -> int:
         """The body in whose frame formulas are shortest: the one that carries all others, if any.
 
-        Seen from there its own joint moves nothing but the world, and what lies in a plane of it
-        stays in that plane.
+        In its frame the joint of this body moves nothing but the world, and planes that contain it
+        stay fixed.
         """
         if self.parents.count(0) != 2 or 0 in self.frame_bodies:
             return 0
@@ -73,17 +78,17 @@ class TreeGeometry:
 
     @property
     def floating_bodies(self) -> frozenset[int]:
-        """All bodies of free-flyers."""
+        """All bodies of floating bases."""
         return frozenset(i + k for i in self.floating_bases for k in range(6))
 
     @property
     def massless_bodies(self) -> frozenset[int]:
-        """Those of them that are none."""
+        """Bodies of floating bases without mass."""
         return frozenset(i + k for i in self.floating_bases for k in range(5))
 
 
 def tree_geometry(equations: LoopEquations) -> TreeGeometry:
-    """Read the geometry off an assembled model."""
+    """The geometry of an assembled model."""
     model, coordinates = equations.model, equations.coordinates
     parents, rotations = coordinates.parents, [pin.SE3.Identity()]
     revolute = [False, *(not slides for slides in coordinates.is_translation)]
@@ -122,17 +127,17 @@ def tree_geometry(equations: LoopEquations) -> TreeGeometry:
 
 
 def _round_to_right_angles(rotation: Array) -> Array:
-    """Exact zeros and ones, so that they are folded."""
+    """Rotations by right angles with exact zeros and ones, which fold into the formulas."""
     rounded = np.round(rotation)
     return np.where(np.abs(rotation - rounded) < _RIGHT_ANGLE_ROUNDING, rounded, rotation)
 
 
 class FormulaConstants:
-    """Numbers of a machine: 0, 1 and -1 become part of the formulas, the others stay arguments.
+    """Constants of a machine: 0, 1 and -1 are folded into the formulas, others stay arguments.
 
     Args:
-        tape: Where they are read.
-        argument: Which argument holds them.
+        tape: Tape to trace on.
+        argument: Index of the argument that holds them.
         values: Their values while tracing.
     """
 
@@ -144,34 +149,34 @@ class FormulaConstants:
         return value if value in (0.0, 1.0, -1.0) else self._tape.load(self._argument, index)
 
     def vector(self, start: int, count: int = 3) -> Vector:
-        """Consecutive numbers."""
+        """Consecutive constants."""
         return [self[start + i] for i in range(count)]
 
     def placement(self, index: int) -> tuple[list[Vector], Vector]:
-        """Rotation (3, 3) and origin (3,) number `index` of a geometry."""
+        """Rotation (3, 3) and origin (3,) of frame `index` of a geometry."""
         start = 12 * index
         return [self.vector(start + 3 * row) for row in range(3)], self.vector(start + 9)
 
 
 def folding_pattern(values: Array) -> bytes:
-    """What of a machine's numbers is part of its formulas."""
+    """The pattern of constants that are folded into formulas."""
     return np.where(np.isin(values, (0.0, 1.0, -1.0)), values, 2.0).tobytes()
 
 
 class PositionKinematics:
-    """Bodies and loops at traced coordinates, seen from the geometry's trunk.
+    """Symbolic placements of bodies and loop frames, in the frame of the reference body.
 
     Args:
-        geometry: The machine's geometry.
-        constants: Its numbers.
+        geometry: Geometry of the machine.
+        constants: Its constants.
         q: (nb,).
 
     Attributes:
         q: (nb,).
-        rotation: Of every body, (3, 3).
-        origin: Of every body, (3,).
-        joint_axes: Of every joint, its spatial column at the trunk's origin: linear, angular.
-        offsets: Of every body, its origin seen from its parent's; not of those on the world.
+        rotation: Rotation (3, 3) of every body.
+        origin: Origin (3,) of every body.
+        joint_axes: Spatial column of every joint at the reference origin: linear, angular.
+        offsets: Origin of every body relative to its parent's; zero for bodies on the world.
     """
 
     def __init__(self, geometry: TreeGeometry, constants: FormulaConstants, q: Sequence[Scalar]):
@@ -210,11 +215,11 @@ class PositionKinematics:
 
     @property
     def inverse_characteristic_length(self) -> Scalar:
-        """One over the machine's size."""
+        """One over the characteristic length."""
         return self._constants[len(self.geometry.constants) - 1]
 
     def joint_axis(self, i: int) -> Vector:
-        """Along or about which joint i moves."""
+        """Axis of joint i."""
         flyers = self.geometry.floating_bases
         axis_index = (
             2
@@ -224,20 +229,20 @@ class PositionKinematics:
         return [row[axis_index] for row in self.rotation[i]]
 
     def body_motion_axes(self, i: int) -> tuple[Vector, Vector]:
-        """How origin and directions of body i move per unit of its joint: linear, angular."""
+        """Motion of the origin and axes of body i per unit of its joint: linear, angular."""
         along: Vector = self.joint_axis(i)
         still: Vector = [0.0] * 3
         return (still, along) if self.geometry.is_revolute[i] else (along, still)
 
     def _floating_base_placement(self, i: int) -> tuple[list[Vector], Vector]:
-        """Rotation and origin of a free-flyer, from its place and rotation vector."""
+        """Rotation and origin of a floating base, from its position and rotation vector."""
         turn, place = self._constants.placement(i - 1)
         position, vector = self.q[i - 1 : i + 2], self.q[i + 2 : i + 5]
-        # the world is at its origin, and turned if the trunk flies
+        # the world is at the origin, and rotated if the reference body floats
         return matmul(turn, rotation_matrix(vector)), add_vectors(place, matvec(turn, position))
 
     def _joint_placement(self, i: int, q: Scalar) -> tuple[list[Vector], Vector]:
-        """Rotation of body i and its origin from its parent's, whose rotation is known."""
+        """Rotation of body i, and its origin relative to its parent's."""
         parent = self.geometry.parents[i]
         turn, place = self._constants.placement(i - 1)
         rotation = matmul(self.rotation[parent], turn)
@@ -257,16 +262,16 @@ class PositionKinematics:
 
 @dataclass(frozen=True)
 class LoopEquationFormula:
-    """One traced loop equation; see `LoopEquations`.
+    """One symbolic loop equation; see `LoopEquations`.
 
     Attributes:
-        bodies: On which the two frames are.
-        is_translation: Whether it is about a length.
-        has_fixed_axis: Whether its axis may as well stand still: the two origins stay together.
-        axis: Of the first frame.
-        arm: Axis or origin of the second.
-        wrench: That is measured by phi.
-        phi: Zero where it holds.
+        bodies: Bodies of the two frames.
+        is_translation: Whether the equation is a length.
+        has_fixed_axis: Whether the axis rate may be left out, because the origins coincide.
+        axis: Axis of the first frame.
+        arm: Axis or origin of the second frame.
+        wrench: Wrench w of the row, phi' = w . (V_2 - V_1).
+        phi: Residual.
         jacobian: dphi/dq by joint.
     """
 
@@ -282,7 +287,7 @@ class LoopEquationFormula:
     def axis_and_arm_rates(
         self, first_motion: SpatialVector, second_motion: SpatialVector
     ) -> tuple[Vector, Vector]:
-        """Of axis and arm, whose bodies move so."""
+        """Time derivatives of axis and arm, from the motions of the two bodies."""
         axis: Vector = [0.0] * 3 if self.has_fixed_axis else cross(first_motion[1], self.axis)
         arm = cross(second_motion[1], self.arm)
         return axis, add_vectors(arm, second_motion[0]) if self.is_translation else arm
@@ -290,14 +295,14 @@ class LoopEquationFormula:
     def wrench_rate(
         self, first_motion: SpatialVector, second_motion: SpatialVector
     ) -> SpatialVector:
-        """Of the wrench."""
+        """Time derivative of the wrench."""
         axis, arm = self.axis_and_arm_rates(first_motion, second_motion)
         moment = add_vectors(cross(arm, self.axis), cross(self.arm, axis))
         return (axis if self.is_translation else [0.0] * 3), moment
 
 
 def _coupling_formula(factors: Array, offset: float, q: Sequence[Scalar]) -> LoopEquationFormula:
-    """A coupling of joints, whose slopes are constant: nothing bends it."""
+    """The equation of a coupling, whose Jacobian is constant."""
     zero: Vector = [0.0] * 3
     jacobian: dict[int, Scalar] = {i + 1: float(x) for i, x in enumerate(factors) if x}
     phi = dot([float(x) for x in factors], q) - float(offset)
@@ -307,12 +312,12 @@ def _coupling_formula(factors: Array, offset: float, q: Sequence[Scalar]) -> Loo
 def largest_scaled_value(
     values: Sequence[Scalar], is_length: Sequence[bool], inverse_length: Scalar
 ) -> Scalar:
-    """The largest absolute value in rad and shares of the machine's size.
+    """The largest absolute value, in rad and characteristic lengths.
 
     Args:
         values: Angles and lengths.
-        is_length: Which are lengths.
-        inverse_length: One over the machine's size.
+        is_length: Which of them are lengths.
+        inverse_length: One over the characteristic length.
     """
     angles = [value for value, is_long in zip(values, is_length, strict=True) if not is_long]
     lengths = [value for value, is_long in zip(values, is_length, strict=True) if is_long]
@@ -321,16 +326,16 @@ def largest_scaled_value(
 
 
 class LoopFormulas:
-    """The independent loop equations at a traced posture.
+    """The symbolic independent loop equations at one configuration.
 
-    `alignments` are cosines that are 1 where the loops' axes are not opposed.
+    `alignments` are cosines that are 1 where the axes of the loop frames are not opposed.
 
     Args:
         equations: All equations of the machine.
-        structure: Which of them count.
+        structure: Independent equations.
         active: Columns of the active joints.
-        passive: Columns of the others.
-        kinematics: The posture.
+        passive: Columns of the other joints.
+        kinematics: Position kinematics.
     """
 
     def __init__(
@@ -405,11 +410,11 @@ class LoopFormulas:
     def solve_passive(
         self, active_rows: dict[int, Vector], right_sides: Sequence[Vector]
     ) -> tuple[dict[int, Vector], list[Scalar]]:
-        """Solve J x = right for the passive joints, block after block.
+        """Solve J x = right_sides for the passive joints, block by block.
 
         Args:
             active_rows: Rows of x of the active joints, by joint.
-            right_sides: Right sides, by row.
+            right_sides: Right-hand sides, by row.
 
         Returns:
             Rows of x of all joints, and the determinants of the blocks.
@@ -419,7 +424,7 @@ class LoopFormulas:
         for rows, columns in self._structure.blocks:
             joints = [self.passive_joints[c] for c in columns]
             matrix = [[self.rows[r].jacobian.get(joint, 0.0) for joint in joints] for r in rows]
-            # the order of the blocks knows which slopes vanish everywhere
+            # the block order accounts for derivatives that vanish everywhere
             before = {joint: row for joint, row in x.items() if joint not in joints}
             sides = [self._right_side(r, before, right_sides[r]) for r in rows]
             found, determinant = solve_linear_system(matrix, sides)
@@ -428,7 +433,7 @@ class LoopFormulas:
         return x, determinants
 
     def _right_side(self, row: int, known: dict[int, Vector], side: Vector) -> Vector:
-        """Right side of a row without what the joints in x have to do with it."""
+        """Right-hand side of a row minus the contributions of known joints."""
         for joint, slope in self.rows[row].jacobian.items():
             if joint in known:
                 side = subtract_vectors(side, scale_vector(slope, known[joint]))
@@ -449,24 +454,24 @@ class LoopFormulas:
 
     @property
     def determinants(self) -> list[Scalar]:
-        """Of the blocks, in their order."""
+        """Determinants of the blocks, in their order."""
         return self._gamma_and_determinants[1]
 
     @cached_property
     def newton_step(self) -> dict[int, Scalar]:
-        """Newton's step of the passive joints, by joint."""
+        """Newton step of the passive joints, by joint."""
         held: dict[int, Vector] = {joint: [0.0] for joint in self.active_joints}
         x, _ = self.solve_passive(held, [[-row.phi] for row in self.rows])
         return {joint: x[joint][0] for joint in self.passive_joints}
 
     @property
     def largest_residual(self) -> Scalar:
-        """The largest absolute phi of the independent equations, in shares of the size."""
+        """The largest absolute scaled residual of the independent equations."""
         return self._largest_scaled_residual(self.rows, self._structure.independent_rows)
 
     @property
     def largest_redundant_residual(self) -> Scalar:
-        """The largest absolute phi of the redundant equations, likewise."""
+        """The largest absolute scaled residual of the redundant equations."""
         return self._largest_scaled_residual(self._redundant_rows, self._structure.redundant_rows)
 
     def _largest_scaled_residual(
@@ -479,19 +484,19 @@ class LoopFormulas:
 
 
 class VelocityKinematics:
-    """Bodies in motion at a traced posture.
+    """Symbolic velocities and bias accelerations of the bodies.
 
     Args:
-        kinematics: Bodies.
-        loops: Loops at that posture.
+        kinematics: Position kinematics.
+        loops: Loop formulas.
         joint_velocities: (nb + 1,) joint velocities, 0 for the world.
-        gravity: (3,) in the trunk's directions; the world accelerates with -gravity, so that
-            weights need no terms of their own.
+        gravity: (3,) in the axes of the reference body; the world accelerates with -gravity, so
+            that weights need no terms of their own.
         carriers: (nb + 1,) the body whose motion each body shares, its parent or 0.
 
     Attributes:
-        velocities: Of every body, linear at the trunk's origin, angular.
-        bias_accelerations: The same at zero joint acceleration.
+        velocities: Velocity of every body, linear at the reference origin, angular.
+        bias_accelerations: Accelerations at zero joint acceleration.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""One assembly branch: closing the loops from a near posture, and following the branch."""
+"""Newton's method and continuation along one branch."""
 
 from dataclasses import dataclass
 
@@ -14,23 +14,21 @@ from crane.common.errors import (
 )
 from crane.common.samples import Array, solve_linear
 
-# All in rad and shares of the machine's size, so that a branch is the same at any scale.
-_CLOSED_TOLERANCE = 1e-12  # of a closed loop
-_SINGULAR_TOLERANCE = (
-    1e-6  # relative least singular value of a block where the passive joints get undetermined
-)
-_MIN_STEP = 2.0**-24  # step of the continuation at which it gives up
+# Scaled values (rad, characteristic length): the same for machines of any size.
+_CLOSED_TOLERANCE = 1e-12  # residual of a closed loop
+# relative least singular value of a singular block
+_SINGULAR_TOLERANCE = 1e-6
+_MIN_STEP = 2.0**-24  # smallest step of the continuation, as a fraction of the line
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedConfiguration:
-    """A closed posture with what the next step from it needs.
+    """A closed configuration with what the next continuation step needs.
 
     Attributes:
         q: (nq,).
         q_a: (n,) its active coordinates.
-        jacobian: (m, nv) of the independent loop equations, as `LoopEquations.evaluate_scaled` has
-            it.
+        jacobian: (m, nv) of the independent equations, see `LoopEquations.evaluate_scaled`.
         passive_gamma: (m, n) passive rows of gamma.
     """
 
@@ -41,18 +39,18 @@ class ClosedConfiguration:
 
 
 class NewtonContinuation:
-    """The postures that can be reached from home without passing a singular one.
+    """The configurations that are reached from home without passing a singular one.
 
     Args:
         equations: All loop equations.
-        structure: Which of them count.
+        structure: Independent equations.
         names: Names of all joints.
         active: Columns of the active joints.
-        passive: Columns of the others.
+        passive: Columns of the other joints.
         ranges: (n,) ranges of the active coordinates, to compare distances [m], [rad].
 
     Raises:
-        MechanismError: The home posture does not close.
+        MechanismError: The home configuration does not close.
     """
 
     def __init__(
@@ -82,7 +80,7 @@ class NewtonContinuation:
         self._home_signs = self._determinant_signs(home)
 
     def rounding_scale(self, q: Array) -> float:
-        """The longest part of a posture (nq,) whose rounding is that of its loops, at least 1."""
+        """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
         largest_stroke = float(
             np.abs(q[self._is_translation]).max(initial=self._largest_dimension)
         )
@@ -91,7 +89,7 @@ class NewtonContinuation:
     def solve_newton(
         self, q: Array, q_a: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """Close the loops at q_A from a near posture; None where that does not work."""
+        """Close the loops at q_A by Newton's method from a nearby q; None if it diverges."""
         q = q.copy()
         q[self._active_columns] = q_a
         rounding_scale, previous_residual = self.rounding_scale(q), np.inf
@@ -127,7 +125,7 @@ class NewtonContinuation:
         return None
 
     def take_newton_step(self, q: Array, target: Array) -> ClosedConfiguration | None:
-        """The posture at a target right beside a posture q (nq,); None where in doubt."""
+        """The configuration at a target very close to q (nq,), None if the branch is uncertain."""
         if not (np.abs(target - q[self._active_columns]) < 0.01 * self._active_ranges).all():
             return None
         solution = self.solve_newton(q, target, 5)
@@ -141,16 +139,16 @@ class NewtonContinuation:
     def continue_to(
         self, target: Array, known: ClosedConfiguration, sample: str = ""
     ) -> ClosedConfiguration:
-        """The closed posture at a target, tracked from a known one or from home.
+        """The closed configuration at a target, followed from a known one or from home.
 
         Args:
             target: (n,) active coordinates.
-            known: Where to start; home if that is nearer or if it fails.
-            sample: What to call the target in errors.
+            known: Start; home if that is nearer or if this start fails.
+            sample: Name of the target in errors.
 
         Raises:
-            OutOfReachError: No posture closes the loops.
-            BranchEdgeError: The passive joints are not determined there.
+            OutOfReachError: No configuration closes the loops.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         starts = [known] if known is self.home else [known, self.home]
         starts.sort(
@@ -165,7 +163,7 @@ class NewtonContinuation:
         raise self._out_of_reach_error(target, last_reached, sample)
 
     def nearest_closed_configuration(self, q: Array) -> ClosedConfiguration:
-        """The closed posture nearest to a guess (nq,), home where the guess leads nowhere.
+        """The closed configuration nearest to a guess (nq,), home if Newton's method diverges.
 
         Raises:
             WrongBranchError: It lies on another branch.
@@ -185,16 +183,16 @@ class NewtonContinuation:
     def check_singularity(
         self, jacobian: Array, solution: Array, q_a: Array, sample: str = ""
     ) -> None:
-        """Raise where J_P is singular, which shows in what was solved with it.
+        """Raise if J_P is singular, judged by a solution of a system with it.
 
         Args:
             jacobian: (m, nv) see `LoopEquations.evaluate_scaled`.
-            solution: What was solved with its passive columns.
-            q_a: (n,) where.
+            solution: Solution of a linear system with its passive columns.
+            q_a: (n,) active coordinates, for the error.
             sample: See `continue_to`.
 
         Raises:
-            BranchEdgeError: It is.
+            SingularConfigurationError: J_P is singular.
         """
         if (
             np.abs(solution).max(initial=0.0) > 1e-3 / _SINGULAR_TOLERANCE
@@ -205,7 +203,7 @@ class NewtonContinuation:
     def singularity_error(
         self, jacobian: Array, q_a: Array, sample: str = ""
     ) -> SingularConfigurationError:
-        """The error for a posture with a singular J_P."""
+        """The error for a configuration with a singular J_P."""
         return SingularConfigurationError(
             f"{self._format_loop_names(self._most_singular_block(jacobian)[1])} is at the edge "
             f"of its assembly branch "
@@ -215,9 +213,9 @@ class NewtonContinuation:
         )
 
     def _most_singular_block(self, jacobian: Array) -> tuple[float, Indices]:
-        """Least singular value of a block, relative to its rows, at the most singular block.
+        """Relative least singular value and rows of the most singular block.
 
-        Rows are taken whole: a single equation for a single joint is singular where that joint
+        Whole rows set the scale: a single equation for a single joint is singular where that joint
         loses its lever while others keep theirs.
         """
         least_ratio, rows = 1.0, np.zeros(0, dtype=np.intp)
@@ -233,7 +231,7 @@ class NewtonContinuation:
         return least_ratio, rows
 
     def _determinant_signs(self, solution: ClosedConfiguration) -> Array:
-        """Sign of every block's determinant: constant on an assembly branch."""
+        """Sign of every block's determinant: constant on a branch."""
         signs = [
             np.linalg.slogdet(solution.jacobian[rows, self._passive_columns[columns]])[0]
             for rows, columns in self._blocks
@@ -243,10 +241,10 @@ class NewtonContinuation:
     def _follow_line(
         self, start: ClosedConfiguration, target: Array
     ) -> tuple[ClosedConfiguration | None, ClosedConfiguration]:
-        """Follow the branch along the straight line from a posture to a target.
+        """Follow the branch along the straight line of q_A to a target.
 
         Returns:
-            The posture at the target, or None, and the last posture on the way.
+            The configuration at the target, or None, and the last configuration that was reached.
         """
         current, progress, step = start, 0.0, 1.0
         while progress < 1.0 and step >= _MIN_STEP:
@@ -271,7 +269,7 @@ class NewtonContinuation:
     def _predict_and_correct(
         self, current: ClosedConfiguration, q_a: Array, passive_step: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """The posture at q_A from one beside it, None where it is not on the same branch."""
+        """The configuration at q_A next to the current one, None if the branch changes."""
         if (
             not np.abs(passive_step / self._coordinate_units[self._passive_columns]).max(
                 initial=0.0
@@ -289,7 +287,7 @@ class NewtonContinuation:
     def _is_continuation(
         self, predicted: Array, solution: ClosedConfiguration, passive_step: Array
     ) -> bool:
-        """Whether a posture continues the branch it was predicted on."""
+        """Whether a configuration continues the branch on which it was predicted."""
         if (self._determinant_signs(solution) * self._home_signs < 0).any():
             return False
         units = self._coordinate_units[self._passive_columns]
@@ -372,7 +370,7 @@ class NewtonContinuation:
         )
 
     def _format_gap(self, row: int, scaled_residual: float) -> str:
-        """How far an equation is open, in words."""
+        """The gap of an equation as text."""
         unit = "m" if self._equations.is_translation[row] else "rad"
         return f"{scaled_residual * self._equations.residual_units[row]:.3g} {unit}"
 

@@ -1,4 +1,4 @@
-"""Derivatives of traced formulas, as formulas."""
+"""Derivatives of symbolic formulas, as symbolic formulas: forward and reverse mode."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,7 +12,7 @@ from crane.codegen.symbolic import (
     where_positive,
 )  # fmt: skip
 
-# Of functions of one number: f'(x) by x and y = f(x).
+# Unary functions: f'(x) from x and y = f(x).
 _UNARY_DERIVATIVES: dict[str, Callable[[SymbolicExpression, SymbolicExpression], Scalar]] = {
     "sin": lambda x, y: apply_function("cos", x),
     "cos": lambda x, y: -apply_function("sin", x),
@@ -27,13 +27,13 @@ _UNARY_DERIVATIVES: dict[str, Callable[[SymbolicExpression, SymbolicExpression],
 def differentiate(
     outputs: Sequence[Scalar], variables: Sequence[SymbolicExpression]
 ) -> list[list[Scalar]]:
-    """Jacobian of formulas, the derivative that is not there being the number 0.
+    """Jacobian of formulas; entries that vanish are the number 0.
 
     At a kink it is that of one of the two sides.
 
     Args:
         outputs: (m,) formulas on one tape.
-        variables: (n,) what was loaded, or any expressions on the tape that count as independent.
+        variables: (n,) loaded values, or any expressions on the tape that are independent.
 
     Returns:
         (m, n) formulas on the same tape.
@@ -45,11 +45,11 @@ def differentiate(
 
 
 def directional_derivative(outputs: Sequence[Scalar], seeds: Mapping[int, Scalar]) -> list[Scalar]:
-    """Derivatives of formulas along a direction; see `differentiate`.
+    """Derivatives of formulas along a direction (forward mode); see `differentiate`.
 
     Args:
         outputs: (m,) formulas on one tape.
-        seeds: How expressions on it change that count as independent, by their index.
+        seeds: Derivatives of independent expressions on it, by their index.
 
     Returns:
         (m,) formulas on the same tape.
@@ -76,18 +76,18 @@ def directional_derivative(outputs: Sequence[Scalar], seeds: Mapping[int, Scalar
 def weighted_gradient(
     outputs: Sequence[Scalar], weights: Sequence[Scalar], variables: Sequence[SymbolicExpression]
 ) -> list[Scalar]:
-    """Gradient of a weighted sum of formulas, in one pass against their order.
+    """Gradient of a weighted sum of formulas (reverse mode).
 
-    It takes a small multiple of the formulas' own operations, however many variables there are
-    (Griewank and Walther, Evaluating Derivatives, 2008, section 3.2).
+    It takes a small multiple of the formulas' operations, for any number of variables (Griewank
+    and Walther, Evaluating Derivatives, 2008, section 3.2).
 
     Args:
         outputs: (m,) formulas on one tape.
-        weights: (m,) numbers or expressions on it, which count as constant.
-        variables: (n,) what was loaded, or any expressions on the tape that count as independent.
+        weights: (m,) numbers or expressions on it, which are treated as constant.
+        variables: (n,) loaded values, or any expressions on the tape that are independent.
 
     Returns:
-        (n,) formulas on the same tape, the sum over i of weights_i d outputs_i / d by.
+        (n,) formulas on the same tape, sum over i of weights_i d outputs_i / d variable.
     """
     gradient: dict[int, Scalar] = {}
 
@@ -113,7 +113,7 @@ def weighted_gradient(
 
 
 def _dependent_operations(tape: Tape, variable_indices: set[int], last: int) -> set[int]:
-    """Indices up to the last of what depends on independent ones, which are among them."""
+    """Indices up to `last` of operations that depend on the variables, which are included."""
     dependent = set(variable_indices)
     for index in range(min(variable_indices) + 1, last + 1):
         kind, *operands = tape.operations[index]
@@ -156,7 +156,7 @@ def _forward_rule(
     if kind == "maximum":
         return where_positive(a - b, da, db)
     if kind == "copysign":
-        # |a| with the sign of b: as a changes while both have one sign, else against it
+        # |a| with the sign of b changes as a if both have one sign, else as -a
         assert isinstance(b, SymbolicExpression)
         flipped = copysign(1.0, b)
         if isinstance(a, SymbolicExpression):
@@ -169,7 +169,7 @@ def _forward_rule(
 def _reverse_rule(
     tape: Tape, index: int, kind: str, operands: list, adjoint: Scalar
 ) -> tuple[Scalar, ...]:
-    """What a weight of an operation gives its operands: the transpose of `_forward_rule`."""
+    """Adjoints of the operands of an operation: the transpose of `_forward_rule`."""
     value: list[Scalar] = [SymbolicExpression(tape, x) if type(x) is int else x for x in operands]
     a = value[0]
     if kind == "negate":

@@ -1,4 +1,4 @@
-"""Equations of motion and their derivatives in machine code made for one machine."""
+"""Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -51,7 +51,7 @@ STICK_SLIP_QUANTITIES = (
     "observation",
     "resting",
 )  # what depends on `set_modes`, `set_grip`
-# What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
+# Quantities of `DynamicsFormulas` with a second argument x (n,): a_A for inverse and regressor,
 # tau_A for the others.
 QUANTITIES: dict[str, Callable[[DynamicsFormulas, list[Scalar]], list[Scalar]]] = {
     "inverse": lambda sweep, x: sweep.inverse_dynamics(x, friction=False),
@@ -81,20 +81,19 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
     "inverse": lambda found, x: (*found.inverse_dynamics_derivatives(x), found.mass_matrix),
     "forward": lambda found, x: found.forward_dynamics_derivatives(x),
 }
-DERIVATIVES_OF = (
-    "slopes of "  # before a quantity: its derivatives by q_A, v_A and the second argument
-)
+# before a quantity: its derivatives by q_A, v_A and the second argument
+DERIVATIVES_OF = "slopes of "
 _FLOAT = np.dtype(np.float64)
 
 
 class _QuantityWorkspace(NamedTuple):
-    """What evaluating a quantity writes.
+    """Buffers of one thread that evaluates a quantity.
 
     Attributes:
-        cursor: Where it has got to.
-        q: (nq,) the last posture.
-        sample_buffers: Of one sample second argument, v_A and q_A (n,) each, the result (size,),
-            and what evaluates it.
+        cursor: Continuation cursor.
+        q: (nq,) last configuration.
+        sample_buffers: For one sample: second argument, v_A and q_A (n,) each, result (size,), and
+            the bound function that evaluates it.
     """
 
     cursor: ContinuationCursor
@@ -106,17 +105,17 @@ class CompiledQuantity:
     """One quantity as machine code.
 
     Args:
-        quantity: A key of `QUANTITIES`, perhaps behind `DERIVATIVES_OF`.
+        quantity: A key of `QUANTITIES`, with or without the prefix `DERIVATIVES_OF`.
         machine: The machine.
-        formula_constants: See `dynamics_constants`; read when a quantity is asked for.
-        constant_pattern: What of them is part of the formulas.
-        formula_structure: What they depend on besides.
+        formula_constants: See `dynamics_constants`; read at every evaluation.
+        constant_pattern: Constants that are folded into the formulas.
+        formula_structure: What else the formulas depend on.
 
     Attributes:
-        result_size: Length of the result of one sample.
+        size: Length of the result of one sample.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: It would take too long to compile.
     """
 
     def __init__(
@@ -161,16 +160,16 @@ class CompiledQuantity:
 
     @property
     def cursor(self) -> ContinuationCursor:
-        """Where this thread has got to."""
+        """Continuation cursor of this thread."""
         return self._workspace.value.cursor
 
     def evaluate_sample(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
-        """The quantity of one sample without delay, or None where arguments need a closer look.
+        """The quantity of one sample, or None where arguments need to be checked first.
 
         Args:
             q_a: (n,).
-            v_a: (n,), or None where the quantity does not ask for it.
-            x: Likewise.
+            v_a: (n,), or None if the quantity does not depend on it.
+            x: (n,), or None if the quantity does not depend on it.
         """
         shape = self._shape
         second, first, target, out, once = self._workspace.value.sample_buffers
@@ -186,17 +185,17 @@ class CompiledQuantity:
         return out.copy() if once() == 1 else None
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
-        """The quantity at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        """The quantity at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
         out = np.empty(self.size)
         geometry = self._compiled_closure.geometry.constants
         self._program.call("formula", geometry, self._formula_constants, q, inputs, out)
         return out
 
     def evaluate_targets(self, targets: Array, inputs: Array, out: Array) -> int:
-        """The quantity at q_A (N, n) with inputs (N, 2 n), until one is too far from the last.
+        """The quantity at q_A (N, n) with inputs (N, 2 n) until a sample is too far from the last.
 
         Returns:
-            How many were done.
+            Number of evaluated samples.
         """
         fast, memory = self._compiled_closure, self._workspace.value
         arrays = (
@@ -211,7 +210,7 @@ class CompiledQuantity:
         )
 
     def evaluate_closed_stack(self, q: Array, inputs: Array, out: Array) -> None:
-        """The quantity at closed postures (N, nq) with inputs (N, 2 n) into out (N, size)."""
+        """The quantity at closed configurations (N, nq), inputs (N, 2 n), into out (N, size)."""
         geometry = self._compiled_closure.geometry.constants
         self._program.call("along", len(q), geometry, self._formula_constants, q, inputs, out)
 
@@ -258,7 +257,7 @@ def _build_quantity(
         if base_quantity != quantity:
             outputs = _state_derivatives(formulas, outputs, x)
     program.add_formula("formula", 4, outputs)
-    tape = Tape()  # what is not finite is left to the checks that name it
+    tape = Tape()  # arguments that are not finite are left to the checks that name them
     program.add_formula(
         "scan", 2, [max_abs([*tape.load_vector(0, 0, n), *tape.load_vector(1, 0, 2 * n)])]
     )
@@ -266,10 +265,9 @@ def _build_quantity(
 
 
 class CompiledParameterDerivatives:
-    """Derivatives of one quantity by numbers of the machine, as machine code.
+    """Derivatives of one quantity by parameters of the machine, as machine code.
 
-    With numbers p of the machine, and phi(q, p) = 0 of its loops, at given q_A, v_A and second
-    argument,
+    With parameters p and the loops phi(q, p) = 0, at given q_A, v_A and second argument,
 
         d y / d p = dy/dp + dy/dq dq/dp,    J_P dq_P/dp = -dphi/dp.
 
@@ -277,14 +275,13 @@ class CompiledParameterDerivatives:
         quantity: A key of `QUANTITIES`.
         machine: The machine.
         formula_constants: See `dynamics_constants`.
-        constant_pattern: What of them is part of the formulas.
-        formula_structure: What the formulas depend on besides.
-        geometry_derivatives: (k, .) how the geometry's numbers change with each number of the
-            machine.
-        constant_derivatives: (k, .) how `formula_constants` do.
+        constant_pattern: Constants that are folded into the formulas.
+        formula_structure: What else the formulas depend on.
+        geometry_derivatives: (k, .) derivatives of the geometry constants by each parameter.
+        constant_derivatives: (k, .) derivatives of `formula_constants` by each parameter.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: It would take too long to compile.
     """
 
     def __init__(
@@ -347,7 +344,7 @@ class CompiledParameterDerivatives:
         self.result_size = self._program.formula_outputs("formula").size
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
-        """(size, k) at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        """(size, k) at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
         out = np.empty((len(self._constant_derivatives), self.result_size))
         geometry = self._compiled_closure.geometry.constants
         for row, bent, moved in zip(
@@ -377,18 +374,17 @@ def _state_derivatives(
 
 
 def _tape_index(loaded: Scalar) -> int:
-    """Of a number that was loaded."""
+    """Tape index of a loaded value."""
     assert isinstance(loaded, SymbolicExpression)
     return loaded.index
 
 
 def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
-    """each: close the loops sample by sample and evaluate there; once: the same of one sample.
+    """Add the routines that evaluate a quantity.
 
-    along: evaluate at postures that are closed already.
-
-    Like `follow` of `CompiledClosure`, it stops at the first sample that is too far from the one
-    before it.
+    "each" closes the loops and evaluates sample by sample; "once" does so for one finite sample;
+    "closed_each" evaluates at closed configurations. Like `follow` of `CompiledClosure`, "each"
+    stops at the first sample that is too far from the previous one.
     """
     arrays = ("geometry", "numbers", "targets", "inputs", "at", "q", "out", "bounds")
     outputs = program.formula_outputs("formula").size

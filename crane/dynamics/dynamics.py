@@ -1,4 +1,4 @@
-"""The equations of motion in the active coordinates."""
+"""Equations of motion in the active coordinates."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,10 +29,10 @@ from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.machine import Machine
-from crane.machine.mass_checks import has_mass
+from crane.machine.machine_checks import has_mass
 
 BACKENDS = ("compiled", "pinocchio")
-QUANTITY_ARGUMENTS = {  # of the quantities that `derivatives` takes
+QUANTITY_ARGUMENTS = {  # arguments of the quantities of `derivatives`
     "inverse": ("q_a", "v_a", "a_a"),
     "forward": ("q_a", "v_a", "tau_a"),
     "mass_matrix": ("q_a",),
@@ -47,7 +47,7 @@ QUANTITY_ARGUMENTS = {  # of the quantities that `derivatives` takes
 
 
 class Dynamics(OneLineRepr):
-    """Dynamics of a machine in its active coordinates, without multipliers.
+    """Dynamics of a machine in its active coordinates, without Lagrange multipliers.
 
     The tree's dynamics projected by gamma (Park, Choi, Ploen 1999), equations (4) and (6) of the
     reduced-scale forwarder paper:
@@ -55,25 +55,26 @@ class Dynamics(OneLineRepr):
         tau_A = gamma^T (rnea(q, v, a) - f(q, v)) [+ gamma^T tau_F(v)]
               = M_A(q_A) a_A + bias(q_A, v_A) [+ friction(q_A, v_A)],
 
-    with f the passive forces and tau_F the friction of all joints. Friction is left out unless
-    asked for; passive forces belong to the machine and are always in. Every method takes single
-    samples (n,) or stacks (N, n) and returns the same kind. Not safe to share between threads.
+    with f the passive forces and tau_F the friction of all joints. Friction is only included on
+    request; passive forces belong to the machine and are always included. Every method takes
+    single samples (n,) or stacks (N, n) and returns the same kind. Not safe to share between
+    threads.
 
-    Two paths compute the same to rounding: "compiled" turns each quantity, when it is first asked
-    for, into machine code of straight-line formulas for this one machine; "pinocchio" projects the
-    results of Pinocchio's algorithms. Formulas of very large machines take too long to compile and
-    are left to the second.
+    Two backends compute the same to rounding: "compiled" turns each quantity, on first use, into
+    machine code of straight-line formulas of this machine; "pinocchio" projects the results of
+    Pinocchio's algorithms. Formulas of very large machines take too long to compile and are left
+    to the second.
 
     Args:
-        machine: The machine; its payload and parameters are those at this moment.
+        machine: The machine with its current payload and parameters.
         formulation: "exact", or "decoupled": every sub-chain on a base held still, as published.
-            It lacks the forces of a chain on the chain that carries it, so it does not keep
-            energy; `docs/validation/mini_forwarder.md` shows how much that is.
+            It lacks the forces of a chain on the chain that carries it, so that it does not
+            conserve energy; `docs/validation/mini_forwarder.md` shows by how much.
         backend: "compiled" or "pinocchio".
 
     Raises:
         InputError: Unknown formulation or backend.
-        MechanismError: Nothing that moves has a mass.
+        MechanismError: No moving body has a mass.
     """
 
     def __init__(self, machine: Machine, formulation: str = "exact", backend: str = "compiled"):
@@ -101,7 +102,7 @@ class Dynamics(OneLineRepr):
         if self.backend == "compiled":
             geometry = machine.closure.compiled_closure.geometry
             self.numbers = np.ascontiguousarray(dynamics_constants(machine, geometry, self.forces))
-        # what becomes part of formulas; not what changes with the motion
+        # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.numbers.copy()
         self._mode_indices = (
             stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
@@ -113,30 +114,30 @@ class Dynamics(OneLineRepr):
         self.constant_pattern[self._circuit_friction_indices] = np.nan
 
     def _one_line(self) -> str:
-        """Of what, and how it is computed."""
+        """Machine and backend."""
         return f"Dynamics of '{self.machine.name}', {self.backend}"
 
     @property
     def parameters(self) -> Array:
         """(10 nb + nr,) inertial parameters of the bodies, in the order of the tree's joints.
 
-        Ten per body about its joint frame's origin: m, m c_x, m c_y, m c_z, I_xx, I_xy, I_yy,
-        I_xz, I_yz, I_zz [kg, kg m, kg m2]. After them the rotor inertias that are not zero, nr of
-        them, in the same order [kg m2], [kg].
+        Ten per body about the origin of its joint frame: m, m c_x, m c_y, m c_z, I_xx, I_xy, I_yy,
+        I_xz, I_yz, I_zz [kg, kg m, kg m2]. After them the nr rotor inertias that are not zero, in
+        the same order [kg m2], [kg].
         """
         return self.tree_dynamics.inertial_parameters
 
     def inverse(
         self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, friction: bool = False
     ) -> Array:
-        """Active forces of a motion: tau_A = gamma^T (rnea(q, v, a) - f) [+ friction].
+        """Inverse dynamics: tau_A = gamma^T (rnea(q, v, a) - f) [+ friction].
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             a_a: The same shape [m/s2], [rad/s2].
-            friction: Whether the drives also overcome friction. From rest, where it sticks, it is
-                against the acceleration of the joint, and its offset where there is none.
+            friction: Whether the drives overcome friction. At rest, under stiction, it opposes the
+                acceleration of the joint; without acceleration it is the friction offset.
 
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
@@ -147,14 +148,14 @@ class Dynamics(OneLineRepr):
     def forward(
         self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, friction: bool = False
     ) -> Array:
-        """Accelerations under active forces: M_A a_A = tau_A - bias [- friction].
+        """Forward dynamics: M_A a_A = tau_A - bias [- friction].
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             tau_a: The same shape [N], [N m].
-            friction: Whether friction brakes; at rest, where it sticks, by its offset: what holds
-                a joint is found by `simulate`.
+            friction: Whether friction brakes. At rest, under stiction, only its offset acts:
+                `simulate` determines which joints are held.
 
         Returns:
             a_A, (n,) or (N, n) [m/s2], [rad/s2].
@@ -167,15 +168,16 @@ class Dynamics(OneLineRepr):
     ) -> tuple[Array, Array]:
         """Inverse dynamics of the driven joints d, forward dynamics of the free ones f.
 
-        Free joints have no force. With c = inverse(q_A, v_A, (a_d, 0)),
+        No drive acts on free joints. With c = inverse(q_A, v_A, (a_d, 0)),
 
             a_f = -M_ff^-1 c_f,    tau_d = c_d + M_df a_f.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
-            a_d: Of the k driven joints in their order, (k,) or (N, k) [m/s2], [rad/s2].
-            friction: As of `inverse` for driven joints; of free ones as of `forward`.
+            a_d: Accelerations of the k driven joints in their order, (k,) or (N, k) [m/s2],
+                [rad/s2].
+            friction: As in `inverse` for driven joints, as in `forward` for free ones.
 
         Returns:
             tau_d, (k,) or (N, k) [N], [N m], and a_f, (n - k,) or (N, n - k) [m/s2], [rad/s2].
@@ -218,7 +220,7 @@ class Dynamics(OneLineRepr):
         return self._evaluate("bias", (), q_a, v_a)
 
     def gravity(self, q_a: ArrayLike) -> Array:
-        """Active forces that hold the weight alone: gamma^T g(q), without passive forces.
+        """Active forces that balance gravity: gamma^T g(q), without passive forces.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -229,7 +231,7 @@ class Dynamics(OneLineRepr):
         return self._evaluate("gravity", (), q_a)
 
     def friction(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
-        """Active forces that friction of all joints consumes: gamma^T tau_F(gamma v_A).
+        """Active forces that overcome friction of all joints: gamma^T tau_F(gamma v_A).
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -241,7 +243,7 @@ class Dynamics(OneLineRepr):
         return self._evaluate("friction", (), q_a, v_a)
 
     def passive(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
-        """What passive forces do at the active joints: gamma^T f(q, gamma v_A).
+        """Passive forces at the active joints: gamma^T f(q, gamma v_A).
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -253,11 +255,10 @@ class Dynamics(OneLineRepr):
         return self._evaluate("passive", (), q_a, v_a)
 
     def project_wrenches(self, q_a: ArrayLike, wrenches: Mapping[str, ArrayLike]) -> Array:
-        """What wrenches from outside do at the active joints: gamma^T sum J^T w.
+        """External wrenches at the active joints: gamma^T sum J^T w.
 
-        M_A a_A + bias = tau_A + applied: the active forces of a motion under them are `inverse`
-        less this, those that hold the machine `gravity` less this, and `forward` takes tau_A and
-        this added up. The quantities themselves know nothing of the machine's `external`.
+        M_A a_A + bias = tau_A + applied: subtract them from `inverse` or `gravity`, and add them
+        to tau_A for `forward`. These methods do not include the machine's `external_forces`.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -268,7 +269,7 @@ class Dynamics(OneLineRepr):
             (n,) or (N, n) [N], [N m].
 
         Raises:
-            InputError: Unknown link, or shapes that do not go together.
+            InputError: Unknown link, or shapes that do not match.
         """
         q_a = as_samples(q_a, self._mobility, "q_a", self.machine.active)
         given = {
@@ -307,7 +308,7 @@ class Dynamics(OneLineRepr):
         return both[..., 0], both[..., 1]
 
     def regressor(self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike) -> Array:
-        """Y_A = gamma^T Y(q, v, a): inverse = Y_A parameters - passive.
+        """Regressor Y_A = gamma^T Y(q, v, a): inverse = Y_A parameters - passive.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -333,13 +334,13 @@ class Dynamics(OneLineRepr):
     ) -> dict[str, Array]:
         """Exact derivatives of a quantity through the closed loops.
 
-        By the state and the second argument, along the motions of the active joints:
-        dq = gamma dq_A (of a floating base along its twist). By numbers of the machine at the same
-        q_A, v_A and second argument: J_P dq_P = -(dphi/dp) dp. Inverse and forward dynamics
-        without floating bases have formulas of their own (`crane.dynamics.dynamics_derivatives`),
-        which cost a few evaluations; everything else is differentiated operation by operation.
-        Friction that sticks has, at rest, the derivatives of its offset alone; an end stop those
-        of the side that it is on.
+        By the state and the second argument, along the motions of the active joints: dq = gamma
+        dq_A (for a floating base along its twist). By parameters of the machine at the same q_A,
+        v_A and second argument: J_P dq_P = -(dphi/dp) dp. Inverse and forward dynamics without
+        floating bases have analytic formulas (`crane.dynamics.dynamics_derivatives`), which cost a
+        few evaluations; other quantities are differentiated operation by operation. Under stiction
+        at rest the derivatives are those of the friction offset alone; at an end stop those of the
+        current side.
 
         Args:
             quantity: "inverse", "forward", "mass_matrix", "bias", "gravity", "friction",
@@ -349,14 +350,12 @@ class Dynamics(OneLineRepr):
             v_a: The same shape [m/s], [rad/s], where the quantity depends on it.
             x: The second argument of inverse and regressor (a_A) and of forward (tau_A), the same
                 shape.
-            friction: Whether friction is in, of inverse and forward.
-            by: Of "q_a", "v_a", "a_a", "tau_a", and names of
-                `crane.description.parameters` such as "boom.mass", "lift_eye.x",
-                "friction.lift.viscous". All the arguments there are if not given.
+            friction: Whether inverse and forward dynamics include friction.
+            by: Names among "q_a", "v_a", "a_a", "tau_a" and `crane.description.parameters` such as
+                "boom.mass", "lift_eye.x", "friction.lift.viscous". All arguments if not given.
 
         Returns:
-            By name, arrays of the quantity's shape and one more axis (n,) for the arguments; of
-            the quantity's shape for numbers.
+            By name, arrays of the quantity's shape, with one more axis (n,) for the arguments.
 
         Raises:
             InputError: An unknown quantity or name, a missing argument, or a machine whose
@@ -410,7 +409,7 @@ class Dynamics(OneLineRepr):
         return {name: found[name] if stacked else found[name][0] for name in by}
 
     def result_shape(self, quantity: str) -> tuple[int, ...]:
-        """Of one sample of a quantity that `derivatives` takes."""
+        """Shape of one sample of a quantity of `derivatives`."""
         n, model = self._mobility, self.machine.model
         shapes = {
             "mass_matrix": (n, n),
@@ -436,7 +435,7 @@ class Dynamics(OneLineRepr):
     def _parameter_derivative_code(
         self, quantity: str, names: Sequence[str]
     ) -> CompiledParameterDerivatives:
-        """Machine code of derivatives by numbers of the machine."""
+        """Machine code of derivatives by parameters of the machine."""
         self._required_formula(quantity)
         key = quantity, tuple(names)
         if key not in self._parameter_derivatives:
@@ -445,7 +444,7 @@ class Dynamics(OneLineRepr):
             geometry, numbers = np.split(
                 constants, [len(closure.compiled_closure.geometry.constants)], axis=1
             )
-            geometry[:, -1] = 0.0  # the size that residuals are measured by
+            geometry[:, -1] = 0.0  # the characteristic length only scales residuals
             self._parameter_derivatives[key] = CompiledParameterDerivatives(
                 quantity,
                 self.machine,
@@ -458,7 +457,7 @@ class Dynamics(OneLineRepr):
         return self._parameter_derivatives[key]
 
     def constants_of(self, variant: Machine) -> Array:
-        """Those of its formulas: geometry, then `formula_constants`."""
+        """Constants of the formulas of a variant: geometry, then `dynamics_constants`."""
         variant = replace(variant, tip=self.machine.tip)
         geometry = tree_geometry(variant.closure.equations)
         if geometry.parents != self.machine.closure.compiled_closure.geometry.parents:
@@ -470,15 +469,15 @@ class Dynamics(OneLineRepr):
     def drive_forces(
         self, q_a: ArrayLike, tau_a: ArrayLike, sharing: Mapping[str, float] | None = None
     ) -> Array:
-        """Forces of the drives that make active forces, also where drives are in surplus.
+        """Forces of the drives that produce active forces, also for redundant drives.
 
         With the drives' lengths L = S q + const and B = (S gamma)^T, tau_A = B u. Where there are
-        more drives than freedoms the forces share the load by weights W,
+        more drives than degrees of freedom the forces share the load by weights W,
 
             u = W B^T (B W B^T)^+ tau_A,
 
-        the least sum of u_i^2 / W_i. What no drive moves keeps no force: active forces of free
-        joints are left out, which `active_forces` tells.
+        the least sum of u_i^2 / W_i. Active forces of joints that no drive moves are dropped;
+        `active_forces` shows the result.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -505,7 +504,7 @@ class Dynamics(OneLineRepr):
         units = self.machine.closure.units[self.machine.closure.active]
         drive_jacobian = (
             drive_jacobian * units[:, None]
-        )  # virtual work per 1 rad and the machine's size: to compare
+        )  # comparable: virtual work per 1 rad or characteristic length
         weighted_jacobian = weights[:, None] * np.swapaxes(drive_jacobian, -1, -2)
         inverse = np.linalg.pinv(drive_jacobian @ weighted_jacobian, rcond=1e-12, hermitian=True)
         joint_forces: Array = np.einsum(
@@ -514,7 +513,7 @@ class Dynamics(OneLineRepr):
         return joint_forces
 
     def active_forces(self, q_a: ArrayLike, forces: ArrayLike) -> Array:
-        """Active forces of the drives': tau_A = (S gamma)^T u, see `drive_forces`.
+        """Active forces from forces of the drives: tau_A = (S gamma)^T u, see `drive_forces`.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -539,17 +538,17 @@ class Dynamics(OneLineRepr):
         return np.swapaxes(lengths @ gamma, -1, -2)
 
     def backend_of(self, quantity: str = "forward") -> str:
-        """Which backend computes a quantity of `crane.dynamics.compiled_dynamics.QUANTITIES`."""
+        """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
         return "pinocchio" if self._compiled_quantity(quantity) is None else "compiled"
 
     def evaluate_closed(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
-        """A quantity at postures that are closed already, which are not checked.
+        """A quantity at configurations that are closed already, without checks.
 
         Args:
             quantity: A key of `crane.dynamics.compiled_dynamics.QUANTITIES`.
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
             v_a: (n,) or (N, n) [m/s], [rad/s].
-            x: The same shape, a_A or tau_A, whatever the quantity asks for.
+            x: The same shape, a_A or tau_A, depending on the quantity.
 
         Returns:
             The results, each flattened.
@@ -569,9 +568,9 @@ class Dynamics(OneLineRepr):
     def set_stick_slip_modes(
         self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
     ) -> None:
-        """Say what the joints do whose friction sticks; see `JointForces.set_stick_slip_modes`.
+        """Set the stick-slip modes; see `JointForces.set_stick_slip_modes`.
 
-        It counts for "rates" and "observation" alone, which only an integration asks for.
+        They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
         if self._mode_indices:
@@ -581,9 +580,9 @@ class Dynamics(OneLineRepr):
             ]
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
-        """Say what a circuit adds to Coulomb friction; see `JointForces.set_circuit_friction`.
+        """Set the circuit friction; see `JointForces.set_circuit_friction`.
 
-        It counts where `set_stick_slip_modes` does.
+        It only affects the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_circuit_friction(circuit_friction)
         if self.backend == "compiled":
@@ -608,7 +607,7 @@ class Dynamics(OneLineRepr):
                     )
             except FormulaTooLongError:
                 pass
-            # of two threads' that made it at once one counts, in which both follow the branch
+            # if two threads compile it at the same time, both use the first
             self._compiled_quantities.setdefault(quantity, made)
         return self._compiled_quantities[quantity]
 
@@ -621,9 +620,9 @@ class Dynamics(OneLineRepr):
         x: ArrayLike | None = None,
         x_name: str = "",
     ) -> Array:
-        """A quantity of samples or stacks, single samples among stacks held for every row.
+        """A quantity of samples or stacks; single samples apply to every row of a stack.
 
-        `result_shape` is that of one result, () for a vector.
+        `shape` is that of one result, () for a vector.
         """
         formula = self._compiled_quantities.get(quantity)
         if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:

@@ -1,22 +1,21 @@
-"""Exact derivatives of inverse and forward dynamics through closed loops, as formulas.
+"""Analytic derivatives of inverse and forward dynamics through closed loops, as symbolic formulas.
 
-Coordinates q_j of the machine move every body b with a twist J_b,j = dV_b/dv_j. For any holonomic
-mechanism, d_j J_k - d_k J_j = J_j x J_k, so what a coordinate does to twists and accelerations are
-time derivatives of its own columns,
+Coordinate q_j of the machine moves every body b with a twist J_b,j = dV_b/dv_j. For any holonomic
+mechanism, d_j J_k - d_k J_j = J_j x J_k, so that derivatives of twists and accelerations are time
+derivatives of these columns,
 
     d_j V = J_j' + J_j x V,    d_j A = J_j'' + J_j' x V + J_j x A,
 
-and of the wrench f = I A + V x* I V = I A + B V of a body
+and those of the wrench f = I A + V x* I V = I A + B V of a body are
 
     d f / d v_j = 2 I J_j' + 2 B J_j,
     d f / d q_j = J_j x* f + I J_j'' + 2 B J_j',
     2 B [u, t] = [2 t x p, 2 (tr(K) t - K t)],    p = sum m r',    K = sum m r' r^T,
 
-with sums over the body's points r (Singh, Russell, Wensing 2022, equations (39) to (46), have the
-same for open trees, with other signs and names). Columns hold gamma's derivatives
+with sums over the points r of the body (Singh, Russell, Wensing 2022, equations (39) to (46), have
+the same for open trees, with other signs and names). The columns include the derivatives of gamma
 (`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.clusters`) move with its
-own coordinates alone: sums over bodies are taken cluster by cluster, with what hangs on each body
-as one inertia.
+own coordinates only: sums over bodies are taken by cluster, with all bodies beyond as one inertia.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -54,7 +53,7 @@ _UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True)
 class MassMoments:
-    """What moves as one body: sums over its points at r, which move with r'.
+    """Sums over the points r of bodies that move as one, with velocities r'.
 
     Attributes:
         mass: sum m.
@@ -74,12 +73,12 @@ class MassMoments:
     def rigid_body(
         cls, mass: Scalar, centre: Vector, tensor: Matrix, motion: SpatialVector
     ) -> "MassMoments":
-        """A rigid body.
+        """Moments of a rigid body.
 
         Args:
             mass: Its mass.
             centre: Its centre of mass.
-            tensor: Inertia about it.
+            tensor: Inertia about the centre of mass.
             motion: Its twist.
         """
         first = scale_vector(mass, centre)
@@ -120,26 +119,26 @@ class MassMoments:
         return force, add_vectors(cross(self.first_moment, a), matvec(self.inertia_tensor, e))
 
     def velocity_wrench(self, angular: Vector) -> SpatialVector:
-        """B of a motion, whose linear part does not matter."""
+        """B of a motion; its linear part has no effect."""
         return cross(angular, self.momentum), matvec(self.moment_rate, angular)
 
     def transposed_velocity_product(self, motion: SpatialVector) -> Vector:
-        """What B^T of a motion has for the angular part of another."""
+        """Angular part of B^T of a motion."""
         v, w = motion
         return add_vectors(cross(self.momentum, v), matvec(transpose(self.moment_rate), w))
 
 
 @dataclass(frozen=True)
 class _CoordinateEffect:
-    """What a coordinate does to inverse dynamics within its cluster and on what carries that.
+    """Derivatives of inverse dynamics by one coordinate, within its cluster and on its carrier.
 
     Attributes:
-        joint_forces_by_q: Forces along the cluster's joints, by joint, per unit of the coordinate,
-            but for what turns with the joints.
-        joint_forces_by_v: Half of those per unit of its velocity.
-        wrench_shifts: By joint, wrenches that turn with it.
-        base_wrench_by_q: Wrench on the body that carries the cluster, per unit of the coordinate.
-        base_wrench_by_v: Half of that per unit of its velocity.
+        joint_forces_by_q: Derivative of the forces along the cluster's joints by the coordinate,
+            by joint, without the part in `wrench_shifts`.
+        joint_forces_by_v: Half of their derivative by the coordinate's velocity.
+        wrench_shifts: By joint, derivative of the wrench that rotates with it.
+        base_wrench_by_q: Derivative of the wrench on the carrier of the cluster by the coordinate.
+        base_wrench_by_v: Half of its derivative by the coordinate's velocity.
         transposed_product: B^T J_j of all bodies.
     """
 
@@ -152,14 +151,14 @@ class _CoordinateEffect:
 
 
 class DynamicsDerivatives:
-    """Derivatives of inverse and forward dynamics at a posture and velocity.
+    """Derivatives of inverse and forward dynamics at a configuration and velocity.
 
-    Of holonomic coordinates, without free-flyers, in the exact formulation.
+    For holonomic coordinates, without floating bases, in the exact formulation.
 
     Args:
-        formulas: The machine.
-        gamma_derivatives: Derivatives of its gamma.
-        friction: Whether friction brakes.
+        formulas: Dynamics formulas.
+        gamma_derivatives: Derivatives of gamma.
+        friction: Whether friction is included.
     """
 
     def __init__(
@@ -178,18 +177,18 @@ class DynamicsDerivatives:
 
     @cached_property
     def _body_velocities(self) -> list[SpatialVector]:
-        """Of every body."""
+        """Velocities of all bodies."""
         return self._formulas.body_motions([0.0] * len(self._parents))[0]
 
     @cached_property
     def _body_moments(self) -> dict[int, MassMoments]:
-        """Every body."""
+        """Mass moments of every body."""
         bodies = enumerate(self._formulas.body_inertias, start=1)
         return {i: MassMoments.rigid_body(*body, self._body_velocities[i]) for i, body in bodies}
 
     @cached_property
     def _lumped_moments(self) -> dict[int, MassMoments]:
-        """What every joint moves, but for what hangs on other joints of its cluster."""
+        """Mass moments of every body with all bodies beyond it in other clusters."""
         lumped, subtree = dict(self._body_moments), dict(self._body_moments)
         for i in range(len(lumped), 0, -1):
             if parent := self._parents[i]:
@@ -201,7 +200,7 @@ class DynamicsDerivatives:
     def _accumulate_wrenches(
         self, cluster_index: int, wrenches: dict[int, SpatialVector]
     ) -> dict[int, SpatialVector]:
-        """Wrenches on the bodies of a cluster and all beyond them in it, and on its base."""
+        """Sums of wrenches over each body of a cluster and those beyond it, and at its base."""
         out = dict(wrenches)
         for i in reversed(self._gamma_derivatives.clusters[cluster_index].joints):
             parent = self._parents[i]
@@ -210,7 +209,7 @@ class DynamicsDerivatives:
 
     @cached_property
     def _unit_acceleration_wrenches(self) -> dict[int, dict[int, SpatialVector]]:
-        """By coordinate, wrenches I J_j of its cluster's bodies and what is beyond."""
+        """By coordinate, accumulated wrenches I J_j of its cluster."""
         return {
             j: self._accumulate_wrenches(
                 c,
@@ -251,7 +250,7 @@ class DynamicsDerivatives:
         return out
 
     def _carrying_coordinates(self, cluster_index: int) -> list[tuple[int, int]]:
-        """The coordinates that carry a cluster, with the body of theirs that it hangs on."""
+        """The coordinates that move the base of a cluster, with the body through which they do."""
         out, body = [], self._gamma_derivatives.clusters[cluster_index].base
         while body:
             carrying_cluster = self._cluster_of_joint[body]
@@ -273,7 +272,7 @@ class DynamicsDerivatives:
             self._subtree_wrenches(rates),
             formulas.passive_and_friction_forces(self._friction),
         )
-        # what the drives of all joints would have to do
+        # forces of drives at all joints
         required_joint_forces = subtract_vectors(
             self._inertial_joint_forces(subtree_wrenches, rates), forces
         )
@@ -299,7 +298,7 @@ class DynamicsDerivatives:
         return by_q, by_v
 
     def _subtree_wrenches(self, joint_accelerations: Sequence[Scalar]) -> dict[int, SpatialVector]:
-        """By joint, the wrench that all that hangs on it takes to accelerate so."""
+        """By joint, the wrench that accelerates all bodies beyond it."""
         _, accelerations = self._formulas.body_motions(joint_accelerations)
         subtree: dict[int, SpatialVector] = {}
         for i in range(len(accelerations) - 1, 0, -1):
@@ -318,7 +317,7 @@ class DynamicsDerivatives:
     def _inertial_joint_forces(
         self, subtree_wrenches: Mapping[int, SpatialVector], joint_accelerations: Sequence[Scalar]
     ) -> Vector:
-        """Forces along the joints (nb + 1,) that bodies and rotors take to accelerate so."""
+        """Forces along the joints (nb + 1,) that accelerate bodies and rotors."""
         out: Vector = [0.0] * len(joint_accelerations)
         for i, wrench in subtree_wrenches.items():
             out[i] = (
@@ -335,7 +334,7 @@ class DynamicsDerivatives:
         subtree_wrenches: Mapping[int, SpatialVector],
         second_time_derivative: Mapping[int, Scalar],
     ) -> "_CoordinateEffect":
-        """What one of a cluster's own coordinates does to the bodies of the cluster."""
+        """Effect of one of a cluster's coordinates on the bodies of the cluster."""
         formulas, cluster, (rate, twice) = (
             self._formulas,
             self._gamma_derivatives.clusters[cluster_index],
@@ -389,7 +388,7 @@ class DynamicsDerivatives:
         by_q: Matrix,
         by_v: Matrix,
     ) -> None:
-        """Rows of the coordinates of the same cluster, gamma's derivative among them."""
+        """Add the entries of coordinates of the same cluster, with the derivative of gamma."""
         gamma, gamma_derivatives = self._formulas.gamma, self._gamma_derivatives
         joints = gamma_derivatives.clusters[cluster_index].joints
         for k in gamma_derivatives.own[cluster_index]:
@@ -417,7 +416,7 @@ class DynamicsDerivatives:
         by_q: Matrix,
         by_v: Matrix,
     ) -> None:
-        """Rows and columns of the coordinates that carry the cluster."""
+        """Add the entries of coordinates that carry the cluster."""
         wrench = self._unit_acceleration_wrenches[j][
             self._gamma_derivatives.clusters[cluster_index].base
         ]
@@ -457,7 +456,7 @@ class DynamicsDerivatives:
     def _joint_force_derivatives(
         self, cluster_index: int, coordinate: int, forces: Vector
     ) -> tuple[Vector, Vector]:
-        """What forces along the joints change by with q_j and with v_j (nb + 1,)."""
+        """Derivatives of forces along the joints by q_j and by v_j, (nb + 1,) each."""
         formulas, joints = self._formulas, self._gamma_derivatives.clusters[cluster_index].joints
         at = {i: formulas.q[i - 1] for i in joints}
         rates = {

@@ -1,4 +1,8 @@
-"""One forward sweep (Kane's form) and the forces along joints and distances, as formulas."""
+"""Dynamics as symbolic formulas: one forward sweep over the bodies (Kane's equations).
+
+The stick-slip accelerations and the margin whose sign change is a stick-slip transition are
+`DynamicsFormulas.accelerations_with_stick_slip`; the modes are chosen in the simulation room.
+"""
 
 from collections.abc import Iterable, Sequence
 from copy import copy
@@ -14,8 +18,12 @@ from crane.closure.kinematics_formulas import (
     TreeGeometry,
     VelocityKinematics,
 )
-from crane.closure.rotation_vector_formulas import rotation_matrix, rotation_vector_derivative
-from crane.closure.spatial_vectors import SpatialVector, Vector
+from crane.closure.spatial_vectors import (
+    SpatialVector,
+    Vector,
+    rotation_matrix,
+    rotation_vector_derivative,
+)
 from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
     Scalar,
@@ -33,8 +41,12 @@ from crane.codegen.symbolic import (
     where_positive,
 )  # fmt: skip
 from crane.common.samples import Array
-from crane.dynamics.cluster_recursion import RecursionPlan, joint_accelerations, plan_recursion
-from crane.dynamics.composite_mass_matrix import CompositeMassMatrix
+from crane.dynamics.cluster_recursion import (
+    RecursionInput,
+    RecursionPlan,
+    joint_accelerations,
+    plan_recursion,
+)
 from crane.dynamics.force_law_formulas import (
     END_STOP_INDEX,
     LAW_SIZE,
@@ -45,28 +57,28 @@ from crane.dynamics.force_law_formulas import (
     friction_sign,
 )
 from crane.dynamics.formulation import carrier_bodies
-from crane.dynamics.frame_distances import MIN_LENGTH
+from crane.dynamics.frame_jacobians import MIN_LENGTH
 from crane.dynamics.joint_forces import REST_ACCELERATION, REST_VELOCITY, JointForces
-from crane.dynamics.recursion_input import RecursionInput
+from crane.dynamics.spatial_inertia import CompositeMassMatrix
 from crane.machine import Machine
 
-BODY_SIZE = 10  # numbers of a body
-_MAX_MOBILITY_FACTORIZED = (
-    7  # freedoms up to which solving with M_A takes fewer operations than recursion
-)
+BODY_SIZE = 10  # inertia constants of a body
+# degrees of freedom up to which factorizing M_A takes fewer operations than recursion
+_MAX_MOBILITY_FACTORIZED = 7
 _UPPER_TRIANGLE = np.triu_indices(3)
-DistanceBodies = tuple[tuple[int, int], ...]  # by distance the bodies of both ends; 0 is the world
+DistanceBodies = tuple[
+    tuple[int, int], ...
+]  # bodies of both ends of each distance; 0 is the world
 
 
 def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointForces) -> Array:
-    """Inertias, force laws and gravity in the order that `DynamicsFormulas` reads them.
+    """Inertias, force laws and gravity in the order in which `DynamicsFormulas` reads them.
 
-    Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
-    the geometry; per joint the 22 numbers of `JointForces.law_table`; gravity (3); per joint its
-    rotor inertia; per distance its 22 numbers, and where its two ends are on their bodies,
-    likewise; whether anything moves; what a circuit adds to the Coulomb friction of joints
-    (`JointForces.circuit_friction_columns`); mass and first moment of what stands (4); where the
-    tip is on its body, likewise, if there is one.
+    Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the axes of the geometry;
+    per joint the 22 values of `JointForces.table`; gravity (3); per joint its rotor inertia; per
+    distance its 22 values and the attachment points on its two bodies; the moving factor; circuit
+    friction of joints (`JointForces.circuit_friction`); mass and first moment of the fixed bodies
+    (4); the tip point on its body, if there is a tip.
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -99,7 +111,7 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
 
 
 def tip_body_and_point(machine: Machine) -> tuple[int, Array]:
-    """The body of a machine's tip, and where it is on it (3,) [m]."""
+    """The body of a machine's tip, and the point on it (3,) [m]."""
     assert machine.tip is not None
     frame = machine.model.frames[machine.frame(machine.tip)]
     return machine.coordinates.body_of_joint[frame.parentJoint], np.array(
@@ -108,13 +120,13 @@ def tip_body_and_point(machine: Machine) -> tuple[int, Array]:
 
 
 def circuit_friction_indices(machine: Machine, forces: JointForces) -> list[int]:
-    """Where `dynamics_constants` has what `JointForces.set_circuit_friction` says."""
+    """Indices in `dynamics_constants` of what `JointForces.set_circuit_friction` sets."""
     first = stick_slip_mode_indices(machine, forces)[-1] + 1
     return list(range(first, first + len(forces.circuit_friction_columns)))
 
 
 def stick_slip_mode_indices(machine: Machine, forces: JointForces) -> list[int]:
-    """Indices in `dynamics_constants` of the stick-slip modes, joint by joint."""
+    """Indices in `dynamics_constants` of the values of `JointForces.set_stick_slip_modes`."""
     bodies = machine.model.nv
     first = BODY_SIZE * bodies + SLIP_INDEX
     last = (
@@ -125,16 +137,15 @@ def stick_slip_mode_indices(machine: Machine, forces: JointForces) -> list[int]:
 
 @dataclass(frozen=True)
 class FormulaStructure:
-    """What a machine's formulas depend on besides its loops and numbers.
+    """What the formulas of a machine depend on besides its loops and constants.
 
     Attributes:
         carrier_bodies: See `crane.dynamics.formulation`.
-        recursion_plan: How forward dynamics goes through the machine's clusters; see
+        recursion_plan: How forward dynamics reduces the machine's clusters; see
             `crane.dynamics.cluster_recursion`.
-        distance_bodies: By distance of `JointForces.frame_distances` the bodies that its ends are
-            on.
-        stick_slip_columns: Columns of the joints whose friction sticks.
-        circuit_friction_columns: Columns of the joints whose Coulomb friction a circuit adds to.
+        distance_bodies: Bodies of the two ends of each distance of `JointForces.lengths`.
+        stick_slip_columns: Columns of the joints with stick-slip friction.
+        circuit_friction_columns: Columns of the joints with circuit friction.
         tip_body: Body of the tip, if there is one.
     """
 
@@ -149,7 +160,7 @@ class FormulaStructure:
     def from_machine(
         cls, machine: Machine, formulation: str, forces: JointForces
     ) -> "FormulaStructure":
-        """That of a machine.
+        """The formula structure of a machine.
 
         Raises:
             InputError: Unknown formulation.
@@ -164,16 +175,15 @@ class FormulaStructure:
 
 @dataclass(frozen=True)
 class StickSlipAccelerations:
-    """A machine under forces, with friction that sticks.
+    """Accelerations under forces with stick-slip friction.
 
     Attributes:
         a_a: (n,) accelerations.
-        friction_at_rest: (k,) friction of the joints at rest whose friction sticks, 0 of those
-            that slip.
+        friction_at_rest: (k,) friction of the stick-slip joints at rest, 0 for those that slip.
         active_friction: gamma^T tau_F (n,).
-        transition_margin: What is left until a joint slips that is at rest, as a share of its
-            limit, or comes to rest that slips, as a velocity of the machine; the least. Negative
-            beyond.
+        transition_margin: Smallest distance from a stick-slip transition: for a held joint the
+            remaining fraction of its breakaway force, for a slipping joint its velocity divided by
+            a velocity of the machine. Negative beyond a transition.
     """
 
     a_a: Vector
@@ -183,29 +193,29 @@ class StickSlipAccelerations:
 
 
 class DynamicsFormulas:
-    """Dynamics at a traced closed posture.
+    """Symbolic dynamics at a closed configuration.
 
     Args:
-        kinematics: Bodies.
-        loops: Loops at that posture.
+        kinematics: Position kinematics.
+        loops: Loop formulas at that configuration.
         constants: See `dynamics_constants`.
         q: (nb,).
         v_a: (n,).
-        formula_structure: What goes where.
-        use_modes: Whether `JointForces.set_stick_slip_modes` says what joints do whose friction
-            sticks, not their velocities.
-        drift: If it is known already.
+        formula_structure: What else the formulas depend on.
+        use_modes: Whether stick-slip joints follow `JointForces.set_stick_slip_modes` instead of
+            their velocities.
+        drift: (nb + 1,), if it is known already.
 
     Attributes:
-        kinematics: Bodies.
-        loops: Loops.
+        posture: Position kinematics.
+        loops: Loop formulas.
         q: (nb,).
         v_a: (n,).
-        rotor_inertias: (nb + 1,) rotor inertias, 0 for the world.
+        rotors: (nb + 1,) rotor inertias, 0 for the world.
         gamma: Rows of gamma by joint.
-        joint_velocities: (nb + 1,) joint velocities, 0 for the world.
+        rates: (nb + 1,) joint velocities, 0 for the world.
         drift: (nb + 1,) accelerations of the joints at a_A = 0.
-        circuit_friction: (g,) what the constants say that a circuit adds to Coulomb friction.
+        circuit_friction: (g,) circuit friction in the constants.
     """
 
     def __init__(
@@ -252,7 +262,7 @@ class DynamicsFormulas:
         )
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._body_count))]
-        # the loops' drift is that of the whole machine whatever carries a body
+        # the drift of the loops is that of the whole machine in both formulations
         tree_velocities, carrier_velocities = (
             VelocityKinematics(kinematics, loops, self.rates, self._gravity, parents)
             for parents in (kinematics.geometry.parents, formula_structure.carrier_bodies)
@@ -261,14 +271,11 @@ class DynamicsFormulas:
         self._tree_velocities, self._carrier_velocities = tree_velocities, carrier_velocities
 
     def with_circuit_friction(self, circuit_friction: Sequence[Scalar]) -> "DynamicsFormulas":
-        """The same with the Coulomb friction (g,) that a circuit adds.
-
-        Its joints are those of `FormulaStructure.with_circuit_friction`.
-        """
+        """The same with the circuit friction (g,) added to the Coulomb friction of its joints."""
         if not self.formula_structure.circuit_friction_columns:
             return self
         out = copy(self)
-        for name in ("_at_joints", "_passive"):  # what is known already of their friction
+        for name in ("_at_joints", "_passive"):  # cached values that depend on friction
             out.__dict__.pop(name, None)
         out._joint_laws = list(self._joint_laws)
         for i, more in zip(
@@ -279,7 +286,7 @@ class DynamicsFormulas:
 
     @cached_property
     def _body_jacobians(self) -> list[list[tuple[Vector, Vector]]]:
-        """Per body dV/dv_A (linear at the trunk's origin, angular) by column, then the drift."""
+        """Per body dV/dv_A (linear at the reference origin, angular) by column, then the drift."""
         columns: list[list[tuple[Vector, Vector]]] = [
             [([0.0] * 3, [0.0] * 3)] * (self._mobility + 1)
         ]
@@ -300,7 +307,7 @@ class DynamicsFormulas:
 
     @cached_property
     def _body_inertias(self) -> list[tuple[Scalar, Vector, list[Vector]]]:
-        """Per body mass, lever from origin to COM, inertia about it, in the trunk's axes."""
+        """Per body mass, lever from origin to COM, inertia about it, in reference axes."""
         out: list[tuple[Scalar, Vector, list[Vector]]] = []
         for i in range(1, self._body_count):
             mass, *rest = self._inertia_constants[i - 1]
@@ -316,7 +323,7 @@ class DynamicsFormulas:
 
     @cached_property
     def body_inertias(self) -> list[tuple[Scalar, Vector, list[Vector]]]:
-        """Per body mass, COM, inertia about it, in the trunk's frame."""
+        """Per body mass, COM, inertia about it, in the frame of the reference body."""
         origins = self.posture.origin[1:]
         return [
             (mass, add_vectors(origin, lever), tensor)
@@ -363,7 +370,7 @@ class DynamicsFormulas:
         return out
 
     def _propagate_wrenches(self, wrenches: Sequence[SpatialVector]) -> Vector:
-        """Forces along the joints (nb + 1,) that hold wrenches at the bodies' COMs."""
+        """Forces along the joints (nb + 1,) that balance wrenches at the bodies' COMs."""
         forces = [force for force, _ in wrenches]
         moments = [
             add_vectors(moment, cross(lever, force))
@@ -384,9 +391,9 @@ class DynamicsFormulas:
     def body_motions(
         self, joint_accelerations: Sequence[Scalar]
     ) -> tuple[list[SpatialVector], list[SpatialVector]]:
-        """Velocities and accelerations of the bodies whose joints accelerate so (nb + 1,).
+        """Velocities and accelerations of the bodies for joint accelerations (nb + 1,).
 
-        Linear at the trunk's origin, angular; the world accelerates with -gravity.
+        Linear at the reference origin, angular; the world accelerates with -gravity.
         """
         added_accelerations: list[SpatialVector] = [([0.0] * 3, [0.0] * 3)]
         for i in range(1, self._body_count):
@@ -406,7 +413,7 @@ class DynamicsFormulas:
         return self._carrier_velocities.velocities, accelerations
 
     def body_wrenches(self, joint_accelerations: Sequence[Scalar]) -> list[SpatialVector]:
-        """Wrenches about the COMs that accelerate the joints so (nb + 1,), weights included."""
+        """Wrenches about the COMs for joint accelerations (nb + 1,), weights included."""
         wrenches: list[SpatialVector] = []
         velocities, accelerations = self.body_motions(joint_accelerations)
         for i in range(1, self._body_count):
@@ -422,7 +429,7 @@ class DynamicsFormulas:
         return wrenches
 
     def _inertial_joint_forces(self, joint_accelerations: Sequence[Scalar]) -> Vector:
-        """Forces along the joints (nb + 1,) that accelerate them so, weights included."""
+        """Joint forces (nb + 1,) for joint accelerations (nb + 1,), weights included."""
         rotor_inertias = [
             inertia * rate for inertia, rate in zip(self.rotors, joint_accelerations, strict=True)
         ]
@@ -445,14 +452,15 @@ class DynamicsFormulas:
 
     @property
     def static_quantities(self) -> list[Scalar]:
-        """The numbers that loads at rest depend on, see `crane.dynamics.static_quantities.layout`.
+        """The values that statics depends on, see `crane.dynamics.statics.StaticsEvaluator`.
 
         First moment s = sum m c of all masses and ds/dq_A, mass, gamma^T f (at rest where v_A is
-        0); tip and dtip/dq_A if there is one; in the world. With what joint j carries, m_j, s_j,
+        0); tip and dtip/dq_A if there is one; in the world. With mass m_j and first moment s_j of
+        all bodies beyond joint j,
 
             ds/dq_k = sum_j gamma_jk (m_j l_j + a_j x s_j),
 
-        l_j, a_j its column, linear at the trunk's origin and angular.
+        with l_j, a_j its column, linear at the reference origin and angular.
         """
         kinematics, parents = self.posture, self.posture.geometry.parents
         carried: list[tuple[Scalar, Vector]] = [(0.0, [0.0] * 3)]
@@ -497,12 +505,12 @@ class DynamicsFormulas:
         return [*out, *_flatten_by_row(map(self._rotate_to_world, jacobian))]
 
     def _rotate_to_world(self, vector: Vector) -> Vector:
-        """A vector in the world's directions."""
+        """A vector in the world's axes."""
         return matvec(transpose(self.posture.rotation[0]), vector)
 
     @cached_property
     def _joint_law_values(self) -> list[ForceLawValues]:
-        """What happens at all joints (nb + 1,)."""
+        """Values of the force laws of all joints (nb + 1,)."""
         every = zip(self._joint_laws, self.q, self.rates[1:], strict=True)
         sticking = self.formula_structure.stick_slip_columns
         laws = (
@@ -512,11 +520,11 @@ class DynamicsFormulas:
 
     @cached_property
     def _distance_law_values(self) -> list[tuple[dict[int, Scalar], ForceLawValues, Scalar]]:
-        """Of every distance dl/dv by joint, what happens along it, and itself.
+        """For every distance dl/dv by joint, the values of its force law, and its length.
 
-        See `crane.dynamics.frame_distances`.
-        The force along it is a wrench [u; p_2 x u] on the second body, and its reaction on the
-        first, so what carries both feels nothing.
+        See `crane.dynamics.frame_jacobians`. A force along the distance is a wrench [u; p_2 x u]
+        on the second body and its reaction on the first, so that joints that carry both are not
+        affected.
         """
         posture, out = self.posture, []
         for bodies, numbers in zip(
@@ -563,12 +571,12 @@ class DynamicsFormulas:
 
     @property
     def _law_values(self) -> list[ForceLawValues]:
-        """What happens at all joints and along all distances."""
+        """Values of the force laws of all joints and distances."""
         return [*self._joint_law_values, *(found for _, found, _ in self._distance_law_values)]
 
     @property
     def stiffness(self) -> list[Vector]:
-        """d(gamma^T f)/dq_A of springs, gas, end stops and ropes at frozen gamma (n, n)."""
+        """d(gamma^T f)/dq_A of springs, gas, end stops and ropes at constant gamma (n, n)."""
         along = [
             (self.gamma[i], self._joint_law_values[i].force_derivative)
             for i in range(1, self._body_count)
@@ -587,11 +595,11 @@ class DynamicsFormulas:
     def end_stop_distances(
         self, coordinate_units: Sequence[float], characteristic_length: float
     ) -> Vector:
-        """How far what stops is beyond where it begins to, each over its unit.
+        """Distances beyond the engagement points of end stops and ropes, each divided by its unit.
 
         Args:
             coordinate_units: (nb,) of the joints.
-            characteristic_length: Of the machine, that of ropes [m].
+            characteristic_length: Unit of rope lengths [m].
         """
         out: Vector = []
         for law, q, unit in zip(self._joint_laws, self.q, coordinate_units, strict=True):
@@ -609,14 +617,14 @@ class DynamicsFormulas:
 
     @property
     def rate_jacobian(self) -> list[Vector]:
-        """d(slopes)/dv_A (nb, n), none of free-flyers."""
+        """d(rates)/dv_A (nb, n), zero for floating bases."""
         flying = {i + k for i in self.posture.geometry.floating_bases for k in range(6)}
         none: Vector = [0.0] * self._mobility
         return [none if i in flying else self.gamma[i] for i in range(1, self._body_count)]
 
     @property
     def active_motion_factors(self) -> Vector:
-        """(n,) 0 of active joints that are at rest to the last bit, else 1."""
+        """(n,) 0 for active joints that are held exactly at rest, else 1."""
         out: Vector = [self._moving_factor] * self._mobility
         is_held = {
             i: self._joint_laws[i][SLIP_INDEX + 1]
@@ -629,11 +637,11 @@ class DynamicsFormulas:
 
     @property
     def coordinate_derivatives(self) -> Vector:
-        """Time derivatives of the coordinates (nb,): the rates, but of rotation vectors."""
+        """Time derivatives of the coordinates (nb,): the rates, except for rotation vectors."""
         return self._coordinate_derivatives(self.rates)
 
     def coordinate_direction(self, k: int) -> Vector:
-        """How the coordinates (nb,) change with the motion v_k = 1."""
+        """Derivatives of the coordinates (nb,) along the motion v_k = 1."""
         return self._coordinate_derivatives(
             [0.0, *(self.gamma[i][k] for i in range(1, self._body_count))]
         )
@@ -659,7 +667,7 @@ class DynamicsFormulas:
 
     @property
     def dissipated_power(self) -> Scalar:
-        """Power that friction, dampers, end stops and ropes take out [W]."""
+        """Power dissipated by friction, dampers, end stops and ropes [W]."""
         total: Scalar = 0.0
         for found in self._law_values:
             total = total + found.dissipated_power
@@ -691,7 +699,7 @@ class DynamicsFormulas:
         return total
 
     def inverse_dynamics(self, a_a: Sequence[Scalar], friction: bool) -> Vector:
-        """M_A a_A + bias - passive [+ friction]; friction at rest is against the acceleration."""
+        """M_A a_A + bias - passive [+ friction]; friction at rest opposes the acceleration."""
         joint_velocities = [
             0.0,
             *(dot(row, a_a) + self.drift[i] for i, row in sorted(self.gamma.items())),
@@ -713,7 +721,7 @@ class DynamicsFormulas:
         return self.project(joint_forces)
 
     def passive_and_friction_forces(self, friction: bool) -> Vector:
-        """Forces along the joints (nb + 1,) that nobody commands."""
+        """Passive forces minus friction (optional) along the joints (nb + 1,)."""
         return (
             subtract_vectors(self._passive_joint_forces, self._joint_friction)
             if friction
@@ -730,9 +738,9 @@ class DynamicsFormulas:
         )
 
     def stick_slip_equations(self, tau: Sequence[Scalar]) -> Vector:
-        """What tells which joints stick: M_A (n^2), rows of gamma (k n), their drift (k), net (n).
+        """Inputs of the stiction problem: M_A (n^2), rows of gamma (k n), drift (k), net (n).
 
-        Of the joints whose friction sticks; net is what tau leaves behind bias and friction.
+        The rows are those of the stick-slip joints; net is tau minus bias and friction.
         """
         rows = [
             entry for i in self.formula_structure.stick_slip_columns for entry in self.gamma[i + 1]
@@ -746,7 +754,7 @@ class DynamicsFormulas:
         ]
 
     def _net_force(self, tau: Sequence[Scalar]) -> Vector:
-        """What is left of tau behind bias and friction."""
+        """Active forces minus bias and friction."""
         return subtract_vectors(
             add_vectors(tau, self.project(self.passive_and_friction_forces(True))),
             self.inertial_bias,
@@ -754,7 +762,7 @@ class DynamicsFormulas:
 
     @property
     def stick_slip_rows(self) -> list[tuple[Scalar, Vector]]:
-        """Of each joint that can stick, whether it is held, and its row of gamma."""
+        """For each stick-slip joint, whether it is held, and its row of gamma."""
         return [
             (self._joint_laws[i][SLIP_INDEX + 1], self.gamma[i + 1])
             for i in self.formula_structure.stick_slip_columns
@@ -763,16 +771,16 @@ class DynamicsFormulas:
     def accelerations_with_stick_slip(
         self, tau: Sequence[Scalar], with_joints_at_rest: bool
     ) -> StickSlipAccelerations:
-        """Accelerations under active forces, with joints at rest or without.
+        """Accelerations under active forces, with joints held by stiction.
 
-        Joints k that are held accelerate by nothing, Gamma a_A + d = 0 with Gamma their rows of
-        gamma and d their drift, and r is what that takes beside the offset of their friction:
+        Held joints do not accelerate, Gamma a_A + d = 0 with their rows Gamma of gamma and their
+        drift d; r are the friction forces that this takes besides the friction offset:
 
             M_A a_A = f - Gamma^T r,    Gamma M_A^-1 Gamma^T r = Gamma M_A^-1 f + d.
 
         Args:
             tau: (n,).
-            with_joints_at_rest: Whether some joint is at rest.
+            with_joints_at_rest: Whether any joint is at rest.
         """
         laws = [self._joint_laws[i] for i in self.formula_structure.stick_slip_columns]
         slip_signs, is_held, inverse_velocities = (
@@ -824,7 +832,7 @@ class DynamicsFormulas:
             for w, one, other in zip(is_held, remaining_limit, slip_velocities, strict=True)
         ]
         any_held = 1.0 - _minimum([1.0 - w for w in is_held])  # whether any is held
-        # at rest: held, or with a share of its limit, or all of it, beside others that are held
+        # of held joints, or a share of the limit, or all of it besides held joints
         at_rest = [
             where_positive(
                 1.0 - apply_function("abs", s),
@@ -853,7 +861,7 @@ class DynamicsFormulas:
         )
 
     def _recursive_forward_dynamics(self, tau: Sequence[Scalar], friction: bool) -> Vector:
-        """The same without M_A."""
+        """Forward dynamics without M_A."""
         forces = list(self.passive_and_friction_forces(friction))
         for joint, force in zip(self.loops.active_joints, tau, strict=True):
             forces[joint] = forces[joint] + force
@@ -880,7 +888,7 @@ class DynamicsFormulas:
         return [rates[joint] for joint in self.loops.active_joints]
 
     def regressor(self, a_a: Sequence[Scalar]) -> list[Vector]:
-        """Y_A (n, 10 nb + nr), inertial parameters in Pinocchio's joint frames, then rotors'."""
+        """Y_A (n, 10 nb + nr), columns in the order of `Dynamics.parameters`."""
         velocity, acceleration = (
             self._carrier_velocities.velocities,
             self._carrier_velocities.bias_accelerations,
@@ -888,8 +896,8 @@ class DynamicsFormulas:
         out: list[Vector] = [[] for _ in range(self._mobility)]
         for i in sorted(set(range(1, self._body_count)) - self.posture.geometry.massless_bodies):
             turn = self.posture.geometry.body_rotations[i]
-            axes = matmul(self.posture.rotation[i], turn.T.tolist())  # columns: joint's axes
-            local = list(zip(*axes, strict=True))  # rows: trunk to joint
+            axes = matmul(self.posture.rotation[i], turn.T.tolist())  # columns: axes of the joint
+            local = list(zip(*axes, strict=True))  # rows: reference body to joint
             origin = self.posture.origin[i]
             v, w = velocity[i]
             a, e = acceleration[i]
@@ -912,12 +920,12 @@ class DynamicsFormulas:
 
 
 def _flatten_by_row(columns: Iterable[Vector]) -> Vector:
-    """The entries of a matrix (3, n), row by row."""
+    """The entries of a matrix (3, n) given by columns, row by row."""
     return [entry for row in zip(*columns, strict=True) for entry in row]
 
 
 def _minimum(values: Sequence[Scalar]) -> Scalar:
-    """The least, 1 of none."""
+    """The least value, at most 1."""
     out: Scalar = 1.0
     for value in values:
         out = minimum(out, value)
@@ -925,7 +933,7 @@ def _minimum(values: Sequence[Scalar]) -> Scalar:
 
 
 def _supporting_bodies(parents: Sequence[int], body: int) -> set[int]:
-    """The joints that carry a body."""
+    """A body and the bodies that carry it."""
     found = set()
     while body:
         found.add(body)

@@ -1,24 +1,24 @@
-"""The force law of a joint or of a distance between frames, as formulas."""
+"""The force law of a joint or distance as symbolic formulas: friction, spring, gas, end stop."""
 
 from typing import NamedTuple
 
 from crane.closure.spatial_vectors import Vector
 from crane.codegen.symbolic import Scalar, apply_function, maximum, where_positive
 
-LAW_SIZE = 22  # of a law, see `JointForces.law_table`
+LAW_SIZE = 22  # values of a law, see `JointForces.table`
 _SHARPNESS_INDEX = 4
 SLIP_INDEX = 7  # where the three are that change with the motion: slip, held, pace
 END_STOP_INDEX = 14  # where those of its stops are: stiffness, damping, lower, upper
 
 
 class ForceLawValues(NamedTuple):
-    """What a law does at a position and velocity.
+    """Values of a force law at a position and velocity.
 
     Attributes:
         force: Passive force.
         friction: Friction.
-        dissipated_power: Power taken out.
-        stored_energy: Energy.
+        dissipated_power: Dissipated power.
+        stored_energy: Stored energy.
         force_derivative: d force/dq.
     """
 
@@ -33,13 +33,13 @@ NO_FORCE = ForceLawValues(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes: bool) -> Scalar:
-    """Of a joint's friction: that of the slip where it sticks, else smoothed.
+    """Sign of a joint's friction: of the slip for stick-slip joints, else smoothed.
 
     Args:
-        law: (22,), see `JointForces.law_table`.
+        law: (22,), see `JointForces.table`.
         velocity: Velocity.
-        has_stick_slip: Whether friction sticks there.
-        use_modes: Whether the law's numbers say the sign of what sticks, not the velocity.
+        has_stick_slip: Whether the joint has stick-slip friction.
+        use_modes: Whether the stick-slip mode in `law` gives the sign instead of the velocity.
     """
     if has_stick_slip:
         negative_sign = where_positive(-1.0 * velocity, -1.0, 0.0)
@@ -50,16 +50,16 @@ def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes
 def evaluate_force_law(
     law: Vector, q: Scalar, velocity: Scalar, has_stick_slip: bool, use_modes: bool
 ) -> ForceLawValues:
-    """What the law does.
+    """Evaluate a force law.
 
-    Written apart from `JointForces`, which has the same in numpy, so that each checks the other.
+    `JointForces` has the same law in numpy, on purpose: each checks the other.
 
     Args:
-        law: (22,), see `JointForces.law_table`.
+        law: (22,), see `JointForces.table`.
         q: Position.
         velocity: Velocity.
         has_stick_slip: See `friction_sign`.
-        use_modes: Likewise.
+        use_modes: See `friction_sign`.
     """
     (
         coulomb, coulomb_offset, viscous, viscous_offset, _, stiction, stribeck,

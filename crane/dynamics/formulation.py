@@ -1,4 +1,4 @@
-"""What carries what: the exact dynamics, and the published one of chains on bases held still."""
+"""The exact formulation of the dynamics, and the published one with chains on bases held still."""
 
 from crane.common.errors import InputError, suggest_names
 from crane.machine import Machine
@@ -10,15 +10,16 @@ def carrier_bodies(machine: Machine, formulation: str) -> tuple[int, ...]:
     """The body whose motion each body shares.
 
     "exact": the parent in the tree. "decoupled": the same within a sub-chain, but every sub-chain
-    stands on a base held still at its present pose, equations (16) to (21) of the reduced-scale
-    forwarder paper; what a chain puts on the chain that carries it is left out.
+    stands on a base held still at its current pose, equations (16) to (21) of the reduced-scale
+    forwarder paper; the forces of a chain on the chain that carries it are left out.
 
     Args:
         machine: The machine.
         formulation: One of `FORMULATIONS`.
 
     Returns:
-        (nv + 1,) indices as `Coordinates.parents` has them; 0, the world, stands still.
+        (nv + 1,) indices in the numbering of `Coordinates.parents`; 0 for the world, which is at
+        rest.
 
     Raises:
         InputError: Unknown formulation.

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
 from crane.formats.joint_series import joint_series

@@ -1,4 +1,4 @@
-"""Machine: the assembled, immutable result of reading and closing a description."""
+"""`Machine`: the immutable result of assembling and closing a description."""
 
 import dataclasses
 import json
@@ -40,21 +40,21 @@ from crane.description.kinematic_tree import Tree
 from crane.description.machine_lookup import CHANGES_SEPARATOR, command_line_arguments
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.hydraulics import Hydraulics
-from crane.machine.frame_element_checks import frame_element_problems
+from crane.machine.machine_checks import frame_element_problems
 
-_LIMIT_TOLERANCE = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
+_LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
 
 
 @dataclass(frozen=True, repr=False)
 class Payload(OneLineRepr):
-    """A rigid load put on a frame at run time.
+    """A rigid load on a frame.
 
     Attributes:
         frame: A link of the machine.
         mass: [kg].
         com: Centre of mass in the frame [m].
-        inertia: (3, 3) about the centre of mass, in the frame's directions [kg m2]; zero for a
-            point mass.
+        inertia: (3, 3) about the centre of mass, in the frame's axes [kg m2]; zero for a point
+            mass.
     """
 
     frame: str
@@ -65,44 +65,42 @@ class Payload(OneLineRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Machine(OneLineRepr):
-    """A machine with closed kinematic chains, ready to be computed with.
+    """A machine with closed kinematic chains, assembled and closed.
 
     Attributes:
         name: Its name.
-        source: Where its numbers come from.
-        path: The machine file or URDF it was read from.
+        source: Source of its parameters.
+        path: The machine file or URDF that it was read from.
         chains: Its open sub-chains.
-        tree: Its links and joints, all sub-chains hung onto each other.
-        model: Pinocchio's model of the spanning tree, depth-first; nq = nv unless it floats, see
-            `coordinates`.
+        tree: Its links and joints, all sub-chains connected.
+        model: Pinocchio's model of the spanning tree, depth-first; nq = nv without floating bases,
+            see `coordinates`.
         closure: Its loops.
         active: Names of the active joints, in the order of q_A.
         lower: (n,) lower limits of the active joints [m], [rad].
         upper: (n,) upper limits of the active joints [m], [rad].
         friction: Friction by joint.
         forces: Passive force elements.
-        gas_springs: Enclosed gas along joints, at most one per joint, and between frames.
+        gas_springs: Gas springs along joints, at most one per joint, and between frames.
         ropes: Ropes between frames.
         end_stops: End stops.
-        tip: Name of the tip's frame.
-        tasks: Named reference motions.
+        tip: Name of the tip frame.
+        tasks: Reference trajectories by name.
         control: PI gains by active joint.
-        hydraulics: The circuit that drives it, None for a machine without.
-        estimation: What `identify` estimates, and knows before.
-        sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
-        free: Active joints that nothing drives: no force but friction, springs and stops.
-        external_forces: Forces from outside.
-        supports: Links that it stands on; none where those are its contacts.
-        pin_capacities: The largest force that pins bear, by joint or loop [N].
-        explicit_drives: What the file says that motors act on (actuators of a MJCF), or all drives
-            where there are more than freedoms; empty where `drives` are the active joints.
-        parameter_changes: Numbers that are not those of its files, by name.
-        locked_joints: Where joints are held that its files let move, by name [m], [rad].
-        chosen_joints: Active and free joints that are not those of its file, under "active" and
-            "free".
-        floating_base: Whether its root was made to float, which its file lets stand on the ground,
-            or by which freedoms.
-        packages: Folders in which its files' packages were sought.
+        hydraulics: Hydraulic circuit, None for a machine without.
+        estimation: Unknowns and priors of `identify`.
+        sensors: Sensor data by quantity, see `crane.description.sensors`.
+        free: Active joints without drive: only friction, springs and stops act on them.
+        external_forces: External forces.
+        supports: Links that stand on the ground; empty if its contacts do.
+        pin_capacities: Largest force that pins bear, by joint or loop [N].
+        explicit_drives: Drives of the file (actuators of a MJCF), or all drives where they are
+            redundant; empty where `drives` are the active joints.
+        parameter_changes: Parameters that differ from its files, by name.
+        locked_joints: Coordinates of joints that were locked, by name [m], [rad].
+        chosen_joints: Active and free joints that differ from its file, under "active" and "free".
+        floating_base: Whether its root was made a floating base, or with which degrees of freedom.
+        packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
     """
 
@@ -140,7 +138,7 @@ class Machine(OneLineRepr):
     arguments: Mapping[str, str]
 
     def _one_line(self) -> str:
-        """Name, degrees of freedom, joints, loops, and what is special about what drives it."""
+        """Name, degrees of freedom, numbers of joints and loops, hydraulics, free joints."""
         words = [
             repr(self.name),
             format_count(len(self.active), "degree of freedom", "degrees of freedom"),
@@ -153,26 +151,27 @@ class Machine(OneLineRepr):
 
     @property
     def home(self) -> Array:
-        """(nv,) the home posture, closed."""
+        """(nv,) closed home configuration."""
         return self.closure.home
 
     @property
     def has_traceable_forces(self) -> bool:
-        """Whether all that acts on it from outside can become machine code."""
+        """Whether all external forces can be compiled."""
         return all(force.is_traceable for force in self.external_forces)
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:
-        """Its force elements, gas springs and ropes, along joints and between frames."""
+        """Force elements, gas springs and ropes, along joints and between frames."""
         return (*self.forces, *self.gas_springs, *self.ropes)
 
     @property
     def undriven_joints(self) -> tuple[str, ...]:
-        """Active joints that are not free, and that nothing is said to drive either.
+        """Active joints that are not free and for which no drive is specified.
 
-        A joint is driven that has an `effort` above 0 in the `<limit>` of its URDF, a cylinder,
-        gains under `control`, or a motor by its file's format. All others are active because the
-        machine has their freedom: a grapple that swings, which is best named under `free`.
+        A joint has a drive if its URDF `<limit>` has an `effort` above 0, or if it has a cylinder,
+        gains under `control`, or a motor in the file. Others are active only because of the
+        mobility of the machine, for example a swinging grapple; they should be listed under
+        `free`.
         """
         driven = {
             *self.free,
@@ -190,7 +189,7 @@ class Machine(OneLineRepr):
 
     @cached_property
     def drives(self) -> tuple[Drive, ...]:
-        """What acts on the machine: its motors, or one drive along each driven active joint."""
+        """The drives of the machine: those of the file, or one along each driven active joint."""
         return self.explicit_drives or tuple(
             Drive(joint, {joint: 1.0}) for joint in self.driven_joints
         )
@@ -202,11 +201,11 @@ class Machine(OneLineRepr):
 
     @cached_property
     def is_driven(self) -> NDArray[np.bool_]:
-        """(n,) whether each active joint is driven, which free ones are not."""
+        """(n,) whether each active joint is driven, that is not free."""
         return np.array([joint not in self.free for joint in self.active])
 
     def expand_driven(self, x: ArrayLike, label: str) -> Array:
-        """Something of the k driven joints, (k,) or (N, k), with zeros of the free ones: (., n).
+        """Expand values of the k driven joints, (k,) or (N, k), by zeros to (n,) or (N, n).
 
         Raises:
             InputError: Wrong shape or not finite.
@@ -218,7 +217,7 @@ class Machine(OneLineRepr):
 
     @cached_property
     def load_name(self) -> str:
-        """What `load` takes to load it again: the bundled name, or the path."""
+        """Argument of `crane.load` for this machine: the bundled name, or the path."""
         known_as = self.path.stem
         bundle = bundled_machines()
         named = bundle if known_as in bundle else example_robots()
@@ -226,9 +225,9 @@ class Machine(OneLineRepr):
 
     @property
     def load_expression(self) -> str:
-        """What `recalled` takes to load it again, changes and locks included.
+        """Text from which this machine can be loaded again, with its changes and locks.
 
-        Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
+        For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
         given = {
             "changes": dict(self.parameter_changes),
@@ -244,7 +243,7 @@ class Machine(OneLineRepr):
 
     @property
     def command_line_arguments(self) -> str:
-        """Arguments of commands that load it again, quoted for a shell."""
+        """Command line arguments that load this machine again, quoted for a shell."""
         load_options = LoadOptions(self.packages, self.arguments, bool(self.floating_base))
         active, free = self.chosen_joints.get("active"), self.chosen_joints.get("free")
         return command_line_arguments(
@@ -253,19 +252,19 @@ class Machine(OneLineRepr):
 
     @property
     def coordinates(self) -> Coordinates:
-        """Those of the tree, and the way to Pinocchio's configurations."""
+        """Coordinates of the tree, and their conversion to Pinocchio's configurations."""
         return self.closure.equations.coordinates
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of all coordinates of the tree, in the order of q: joints, freedoms of a base."""
+        """Names of all coordinates of the tree in the order of q, with those of floating bases."""
         return self.coordinates.names
 
     def column(self, joint: str) -> int:
         """Index of a joint in q and v.
 
         Raises:
-            InputError: There is no such joint.
+            InputError: Unknown joint.
         """
         return self.coordinates.column(joint)
 
@@ -278,7 +277,7 @@ class Machine(OneLineRepr):
         """Pinocchio's index of a link's frame.
 
         Raises:
-            InputError: There is no such link.
+            InputError: Unknown link.
         """
         if not self.model.existFrame(link, pin.FrameType.BODY):
             links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
@@ -286,11 +285,11 @@ class Machine(OneLineRepr):
         return frame_id(self.model, link)
 
     def check_limits(self, q_a: ArrayLike, label: str = "q_a") -> Array:
-        """Active coordinates (n,) or (N, n) that lie within the limits.
+        """Check that active coordinates (n,) or (N, n) are within the limits, and return them.
 
         Raises:
             InputError: Wrong shape or not finite.
-            LimitError: A coordinate lies outside of its limits.
+            LimitError: A coordinate is outside of its limits.
         """
         q_a = as_samples(q_a, len(self.active), label, self.active)
         slack = _LIMIT_TOLERANCE * self.closure.units[self.closure.active]
@@ -320,12 +319,12 @@ class Machine(OneLineRepr):
         sensors: Mapping[str, Sensor] | None = None,
         estimation: EstimationSettings | None = None,
     ) -> "Machine":
-        """The same machine with other friction, springs, ropes, stops, hydraulics or sensors.
+        """A copy with other friction, force elements, stops, hydraulics, sensors or settings.
 
         Raises:
-            InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
-                limits, or a cylinder without being active; or the frames of an element are
-                unknown, make one body or meet at home.
+            InputError: A joint is unknown, has two gas springs, has an end stop or a cylinder but
+                no limits, or has a cylinder without being active; or the frames of an element are
+                unknown, belong to one body, or coincide at home.
         """
         for joint in friction or {}:
             self.column(joint)
@@ -370,10 +369,10 @@ class Machine(OneLineRepr):
         )
 
     def with_active_joints(self, names: Sequence[str]) -> "Machine":
-        """The same machine with other active joints: the angles of its booms, say.
+        """A copy with other active joints, for example the angles of its booms.
 
-        Home posture and assembly branch stay. With q_B the new active coordinates and q_A those
-        of this machine, gamma_A the rows of gamma = dq/dq_B that belong to q_A,
+        Home configuration and branch stay. With the new active coordinates q_B, those of this
+        machine q_A, and the rows gamma_A of gamma = dq/dq_B that belong to q_A,
 
             v_A = gamma_A v_B,    tau_B = gamma_A^T tau_A,
 
@@ -381,9 +380,8 @@ class Machine(OneLineRepr):
         tau_i = F_i dx_i/dq_i, for any choice of joints.
 
         The circuit keeps the cylinders whose joints are still active. Gains and tasks of active
-        joints are dropped unless they belong to the same joints. `load_name` and
-        `parameter_changes` stay: what loads the machine again gives it with the active joints of
-        its file.
+        joints are dropped unless the joints are the same. `load_name` and `parameter_changes`
+        stay: they load the machine with the active joints of its file.
 
         Args:
             names: As many joints as there are degrees of freedom, in the order of q_B.
@@ -402,10 +400,10 @@ class Machine(OneLineRepr):
         return self._with_closure(names, self._create_closure(names, self.home))
 
     def with_home_configuration(self, q: Array, names: tuple[str, ...]) -> "Machine":
-        """`with_active_joints` at another home, whose assembly branch may differ.
+        """`with_active_joints` at another home configuration, which may be on another branch.
 
         Args:
-            q: (nq,) closed posture, whose whole turns stay.
+            q: (nq,) closed configuration, whose full revolutions are kept.
             names: Active joints.
 
         Raises:
@@ -447,11 +445,11 @@ class Machine(OneLineRepr):
         )
 
     def with_external_forces(self, *forces: ExternalForce) -> "Machine":
-        """The same machine under more forces from outside.
+        """A copy with additional external forces.
 
         Raises:
-            InputError: What is no such force, a frame that is unknown or does not move, or a name
-                that is taken.
+            InputError: Not an external force, an unknown or fixed frame, or a name that exists
+                already.
         """
         every = (*self.external_forces, *forces)
         for force in forces:
@@ -464,13 +462,13 @@ class Machine(OneLineRepr):
         return dataclasses.replace(self, external_forces=every)
 
     def with_clock(self, clock: Callable[[Array], Array] | None) -> "Machine":
-        """The same machine, with the forces that count phases by the clock of a run.
+        """A copy whose phased external forces use the clock of a simulation.
 
         Args:
-            clock: Tells the phase (N,) at times (N,) [s]; None where there are none.
+            clock: Returns the phase (N,) at times (N,) [s]; None if there are no phases.
 
         Raises:
-            InputError: There is no clock for them.
+            InputError: A phased force without a clock.
         """
         phased_forces = [
             force for force in self.external_forces if isinstance(force, PhasedWrench)
@@ -487,10 +485,10 @@ class Machine(OneLineRepr):
         return dataclasses.replace(self, external_forces=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":
-        """The same machine carrying a payload.
+        """A copy that carries a payload.
 
         Raises:
-            InputError: Unknown frame, or no possible mass and inertia.
+            InputError: Unknown frame, or infeasible mass and inertia.
         """
         frame = self.model.frames[self.frame(payload.frame)]
         com = as_sample(payload.com, 3, "the payload's com")
@@ -514,7 +512,7 @@ class Machine(OneLineRepr):
 
 
 def read_only_copy(array: Array) -> Array:
-    """A copy that cannot be changed."""
+    """A read-only copy of an array."""
     out = array.copy()
     out.flags.writeable = False
     return out

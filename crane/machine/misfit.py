@@ -1,15 +1,15 @@
-"""The number of a description that keeps its loops from closing where the file says home is.
+"""Parameters that keep the loops from closing at the home configuration of the file.
 
-A linkage of which one length is wrong does not close at the home that its file says, or only far
-from it. With p a length and q_P the passive joints, the question of each length is which change
-of it closes the loops with the joints nearest to where they are said to be:
+If one length of a linkage is wrong, it does not close at the home configuration of its file, or
+only far from it. For each length p, with the passive joints q_P, the change that closes the loops
+with the joints nearest to their specified coordinates q_S solves
 
-    min |q_P - said|^2    such that    phi(q_P, p) = 0,
+    min |q_P - q_S|^2    such that    phi(q_P, p) = 0
 
-by Newton's method; phi is linear in p, which places a pin. The wrong length leaves the joints
-where they are said to be, but for the digits; any other one turns them. Where the file says no
-passive joint, it is the least change with which the loops close at all. Driven joints at home are
-tried like lengths.
+by Newton's method; phi is linear in p, which places a pin. The wrong length leaves the joints at
+their specified coordinates, up to rounding of the file; any other length moves them. If the file
+specifies no passive joint, the least change that closes the loops is searched for. Home
+coordinates of driven joints are tried like lengths.
 """
 
 import dataclasses
@@ -39,12 +39,12 @@ _LISTED = 2
 
 @dataclass(frozen=True)
 class Remedy:
-    """A number that would let the loops close.
+    """A parameter whose change would close the loops.
 
     Attributes:
-        name: As `crane.description.parameters` has it, or `home JOINT`.
+        name: As in `crane.description.parameters`, or `home JOINT`.
         now: Its value [m], [rad].
-        then: The value with which they close.
+        then: The value that closes the loops.
         turns: Whether it is an angle.
     """
 
@@ -59,12 +59,12 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Misfit:
-    """Where a machine does not close at the home that its file says.
+    """A machine that does not close at the home configuration of its file.
 
     Attributes:
-        loop: The loop whose frames are farthest apart there.
-        gap: By how much [m].
-        remedies: Numbers that would close it, the likeliest first; none where no single one does.
+        loop: The loop with the largest gap there.
+        gap: The gap [m].
+        remedies: Parameters that would close it, the likeliest first; empty if no single one does.
     """
 
     loop: str
@@ -78,21 +78,21 @@ class Misfit:
 
     @property
     def listed(self) -> str:
-        """The remedies in words."""
+        """The remedies as text."""
         return " or ".join(map(str, self.remedies))
 
 
 def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
-    """What keeps a machine from closing at the home that its file says.
+    """Find what keeps a machine from closing at the home configuration of its file.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        guess: (nq,) home as the file says it.
+        guess: (nq,) home as specified; joints that the file does not specify are moved to the
+            smallest gap.
 
     Returns:
-        None where no frames are apart there. Joints that the file does not say are where frames
-        come nearest to each other.
+        None if no loop has a gap there.
     """
     equations = LoopEquations(model, spec.loops, spec.couplings)
     names = equations.coordinates.names
@@ -140,7 +140,7 @@ def _numbers(
     guess: Array,
     active: Sequence[int],
 ) -> Iterator[tuple[str, float, float, bool, Changed]]:
-    """Lengths that loops go through, and driven joints: name, value, unit, whether it turns."""
+    """Lengths in loops and driven joints: name, value, unit, is angle, residual function."""
     joints = {joint for loop in loops for joint in _joints(spec, loop)}
     size = equations.characteristic_length
 
@@ -185,7 +185,7 @@ def _numbers(
 
 
 def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
-    """Joints of the tree that a loop goes through, fixed ones among them."""
+    """Joints of the tree in a loop, including fixed ones."""
     above = {joint.child: joint for joint in spec.tree.joints.values()}
     ways = []
     for link in (loop.predecessor, loop.successor):
@@ -198,7 +198,7 @@ def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
 
 
 def _gaps(equations: LoopEquations, q: Array) -> Array:
-    """(l,) how far apart the frames of loops are along what they lock [m]."""
+    """(l,) distances of the loops' frames along locked translations [m]."""
     phi = equations.evaluate(q)[0]
     return np.array([
         np.linalg.norm(phi[(equations.loop_of_row == i) & equations.is_translation])
@@ -213,7 +213,7 @@ def _change(
     said: NDArray[np.bool_],
     changed: Changed,
 ) -> tuple[float, float] | None:
-    """The change of a number in its unit that turns joints least that are said, by how much."""
+    """The scaled change of a parameter that closes the loops with least joint motion."""
     x, units = np.zeros(len(passive) + 1), equations.coordinate_units[passive]
     weights = np.append(np.where(said, 1.0, _LOOSE), _LOOSE)
     for _ in range(_ITERATIONS):
@@ -236,9 +236,9 @@ def _change(
 def _least(
     equations: LoopEquations, guess: Array, passive: Indices, changed: Changed
 ) -> tuple[float, float] | None:
-    """The least change of a number in its unit that closes the loops, and its amount.
+    """The least scaled change of a parameter that closes the loops, and its magnitude.
 
-    Of the gap |phi| that is left at the nearest approach the slope is phi . (dphi/dp) / |phi|.
+    At the nearest approach the derivative of the gap |phi| is phi . (dphi/dp) / |phi|.
     """
     q, change = guess.copy(), 0.0
     for _ in range(_CHANGES):
@@ -256,8 +256,8 @@ def _least(
 def _nearest(
     equations: LoopEquations, q: Array, free: Indices, changed: Changed, change: float = 0.0
 ) -> Array:
-    """The posture in which loops come nearest to closing, from one beside it."""
-    from scipy.optimize import least_squares  # slow to import, and not needed where they close
+    """The configuration of least squared residuals, from one nearby."""
+    from scipy.optimize import least_squares  # slow to import, only needed for open loops
 
     def there(x: Array) -> Array:
         out = q.copy()

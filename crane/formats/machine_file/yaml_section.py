@@ -11,7 +11,7 @@ from typing import Any, overload
 import yaml
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.machine_lookup import bundled_machines
 

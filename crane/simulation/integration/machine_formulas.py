@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from crane.closure import rotation_vector_formulas
+from crane.closure import spatial_vectors
 from crane.closure.compiled_closure import CompiledClosure
 from crane.closure.kinematics_formulas import FormulaConstants
 from crane.codegen import (
@@ -385,7 +385,7 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
     """A state, q first, with rotation vectors of at most pi."""
     out = list(state)
     for column in chart.machine.coordinates.floating_base_columns:
-        out[column + 3 : column + 6] = rotation_vector_formulas.wrap_rotation_vector(
+        out[column + 3 : column + 6] = spatial_vectors.wrap_rotation_vector(
             out[column + 3 : column + 6]
         )
     return out
