@@ -587,7 +587,7 @@ def test_four_bar_cut_in_the_middle_of_its_coupler(tmp_path):
     ("changes", "text"),
     [
         (("revolute", "fixed"), "'wrist' .* open"),
-        (("theta: 1.0, phi: -0.5, s: 0.37", "s: 0.4", "[theta]", "[s]"), "edge of the assembly"),
+        (("theta: 1.0, phi: -0.5, s: 0.37", "s: 0.4", "[theta]", "[s]"), "edge of the branch"),
         (
             ("theta: 1.0, phi: -0.5, s: 0.37", "s: 0.45", "[theta]", "[s]"),
             r"'wrist' .*\(s = 0\.45\): it stays",

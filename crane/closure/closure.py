@@ -7,7 +7,6 @@ Newton's method for one configuration is `NewtonContinuation.solve_newton` in
 
 import copy
 import dataclasses
-import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import Any
@@ -21,40 +20,29 @@ from crane.closure.active_joint_selection import (
     condition_number,
     propose_active_joints,
 )
+from crane.closure.branch_solver import BranchSolver
 from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import (
     CLOSED_TOLERANCE,
     ExactConstraints,
-    RedundancyGap,
     RoundedConstraints,
 )
-from crane.closure.home_search import HomeSearchResult, find_home
+from crane.closure.home_search import HomeSearchResult, find_cached_home
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.motion_continuation import follow_motion
-from crane.closure.newton_continuation import NewtonContinuation
-from crane.codegen import FormulaTooLongError, cached_result, run_with_fallback
+from crane.codegen import FormulaTooLongError
 from crane.common.errors import (
     InputError,
     MechanismError,
-    SingularConfigurationError,
-    WrongBranchError,
 )
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, apply_per_sample, as_samples, solve_linear
-from crane.common.threads import single_threaded_blas
+from crane.common.samples import Array, apply_per_sample, as_samples
 from crane.description import Coupling, LoopSpec
 
-_MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = (
-    100,
-    0.1,
-)  # samples worth sorting: how many, how far apart as a share of the range
-# rad, machine's size, between a posture and what Newton's method makes of it
-_SAME_CONFIGURATION_TOLERANCE = 1e-6
-# share of the least singular value of all equations that independent ones keep
+# least singular value of the independent equations over that of all, for the same coordinates
 _MIN_SINGULAR_VALUE_SHARE = 0.1
-_CONTINUATION_STEPS = 8  # steps from home to a target far from the previous one
 
 
 class Closure(OneLineRepr):
@@ -90,12 +78,6 @@ class Closure(OneLineRepr):
         active: Columns of the active joints.
         passive: Columns of the passive joints.
         structure: Independent equations and the order in which they are solved.
-        characteristic_length: Characteristic length of the machine [m], see
-            `crane.closure.active_joint_selection.characteristic_length`.
-        units: (nv,) units that make coordinates comparable: 1 rad, and the characteristic length
-            [m].
-        characteristic_time: Characteristic time [s] of motions under gravity, 1 s for a machine of
-            1 m: times of similar machines scale with the square root of the length (Froude).
         home_search: How home was found where it did not follow from the guess, else None.
     """
 
@@ -118,12 +100,6 @@ class Closure(OneLineRepr):
     ):
         self.model = model
         self.equations = LoopEquations(model, loops, couplings)
-        self.characteristic_length, self.units = (
-            self.equations.characteristic_length,
-            self.equations.coordinate_units,
-        )
-        self.characteristic_time = float(np.sqrt(self.characteristic_length))
-        self._thread_local = threading.local()
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
@@ -135,69 +111,50 @@ class Closure(OneLineRepr):
 
         self.initial_guess = initial_guess
         self.specified_columns = np.array(sorted(columns(specified or ())), dtype=np.intp)
-        where = None if specified is None else columns(specified), columns(movable)
-        self.structure, self.home_search = self._find_home(*where)
+        self.structure, self.home_search = find_cached_home(
+            self.equations,
+            self.active,
+            self.passive,
+            initial_guess,
+            None if specified is None else columns(specified),
+            columns(movable),
+        )
         if keep_revolutions:
             revolutions = np.round((initial_guess - self.structure.home) / (2 * np.pi))
             revolutions[coordinates.is_translation] = 0.0
             home = self.structure.home + 2 * np.pi * revolutions
             self.structure = dataclasses.replace(self.structure, home=home)
-        ranges = (coordinates.upper - coordinates.lower)[self.active]
-        limited = np.isfinite(ranges) & (ranges > 0)
-        self._active_ranges = np.where(
-            limited, ranges, self.equations.coordinate_units[self.active]
-        )
-        self._continuation = NewtonContinuation(
-            self.equations,
-            self.structure,
-            self._names,
-            self.active,
-            self.passive,
-            self._active_ranges,
-        )
-        self.home = self._continuation.home.q.copy()
+        self._start_solver()
+
+    def _start_solver(self, with_machine_code: bool = True) -> None:
+        """Close home, from which the branch is followed."""
+        parts = self.equations, self.structure, self.active, self.passive
+        self._solver = BranchSolver(*parts, with_machine_code)
+        self.home = self._solver.continuation.home.q.copy()
         self.home.flags.writeable = False
 
-    def _find_home(
-        self, specified: list[int] | None, movable: list[int]
-    ) -> tuple[ConstraintStructure, HomeSearchResult | None]:
-        def find() -> tuple[ConstraintStructure, HomeSearchResult | None]:
-            import scipy.linalg  # noqa: F401 - loads the BLAS library to limit
+    @property
+    def characteristic_length(self) -> float:
+        """Characteristic length of the machine [m]."""
+        return self.equations.characteristic_length
 
-            with single_threaded_blas(self.model.nv):
-                return find_home(
-                    self.equations,
-                    self.active,
-                    self.passive,
-                    self.initial_guess,
-                    specified,
-                    movable,
-                )
+    @property
+    def characteristic_time(self) -> float:
+        """Characteristic time [s] of motions under gravity, 1 s for a machine of 1 m.
 
-        if not self.equations.names:
-            return find_home(
-                self.equations, self.active, self.passive, self.initial_guess, specified, movable
-            )
-        specified_key = None if specified is None else tuple(specified)
-        depends = (self.cache_key, self.active, self.initial_guess, specified_key, tuple(movable))
-        return cached_result(
-            ("home", depends),
-            find,
-            "scipy.linalg",
-            (ConstraintStructure, RedundancyGap, HomeSearchResult),
-        )
+        Times of similar machines scale with the square root of the length (Froude).
+        """
+        return float(np.sqrt(self.characteristic_length))
+
+    @property
+    def units(self) -> Array:
+        """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length."""
+        return self.equations.coordinate_units
 
     @property
     def cache_key(self) -> tuple[Any, ...]:
         """Everything that the equations depend on, see `crane.codegen.cached_result`."""
-        loops = tuple(
-            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
-            for x in self.equations.loops
-        )
-        couplings = tuple(
-            (x.name, tuple(x.factors.items()), x.offset) for x in self.equations.couplings
-        )
-        return self.model.saveToString(), loops, couplings
+        return self.equations.cache_key
 
     def _one_line(self) -> str:
         """Loops and active joints."""
@@ -220,7 +177,7 @@ class Closure(OneLineRepr):
         if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other._thread_local = threading.local()  # cursors belong to one closure
+        other._solver = self._solver.with_new_cursors()
         return other
 
     def with_perturbed_model(
@@ -242,28 +199,12 @@ class Closure(OneLineRepr):
         if _has_same_geometry(equations, self.equations):
             return self
         other = copy.copy(self)
-        other.model, other.equations, other._thread_local = model, equations, threading.local()
-        other.characteristic_length, other.units = (
-            equations.characteristic_length,
-            equations.coordinate_units,
-        )
-        other.characteristic_time = float(np.sqrt(other.characteristic_length))
-        other.__dict__["_optional_compiled_closure"] = None
-        other._continuation = NewtonContinuation(
-            equations, self.structure, self._names, self.active, self.passive, self._active_ranges
-        )
-        other.home = other._continuation.home.q.copy()
-        other.home.flags.writeable = False
-        exact = (
-            ExactConstraints
-            if self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
-            else RoundedConstraints
-        )(equations)
+        other.model, other.equations = model, equations
+        other._start_solver(with_machine_code=False)
         rows = self.structure.independent_rows, self.structure.redundant_rows
-        if (
-            not exact.is_closed(other.home)
-            or exact.assess_redundancy(other.home, *rows, self.active)[0]
-        ):
+        constraints = other._constraints
+        lock, _ = constraints.assess_redundancy(other.home, *rows, self.active)
+        if not constraints.is_closed(other.home) or lock:
             raise MechanismError("the loops do not close there, or lock up")
         return other
 
@@ -287,47 +228,22 @@ class Closure(OneLineRepr):
         if not least > _MIN_SINGULAR_VALUE_SHARE * best:
             return None
         other = copy.copy(self)
-        other._thread_local, other.home_search, other.initial_guess = threading.local(), None, q
-        other.__dict__.pop("_optional_compiled_closure", None)
+        other.home_search, other.initial_guess = None, q
         other.structure = dataclasses.replace(self.structure, home=q)
-        other._continuation = NewtonContinuation(
-            self.equations,
-            other.structure,
-            self._names,
-            self.active,
-            self.passive,
-            self._active_ranges,
-        )
-        other.home = other._continuation.home.q.copy()
-        other.home.flags.writeable = False
-        exact = (
-            ExactConstraints
-            if self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
-            else RoundedConstraints
-        )(self.equations)
-        if not exact.is_closed(other.home):
+        other._start_solver()
+        if not other._constraints.is_closed(other.home):
             raise MechanismError("the loops do not close there")
         return other
 
-    @cached_property
-    def _optional_compiled_closure(self) -> CompiledClosure | None:
-        branch = self._continuation
-        try:
-            return CompiledClosure(
-                self.equations,
-                self.structure,
-                self.active,
-                self.passive,
-                branch.home,
-                branch.rounding_scale(branch.home.q),
-            )
-        except FormulaTooLongError:
-            return None
+    @property
+    def _constraints(self) -> ExactConstraints:
+        is_exact = self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
+        return (ExactConstraints if is_exact else RoundedConstraints)(self.equations)
 
     @property
     def is_compiled(self) -> bool:
         """Whether the loops are solved by machine code."""
-        return self._optional_compiled_closure is not None
+        return self._solver.compiled_closure is not None
 
     @property
     def compiled_closure(self) -> CompiledClosure:
@@ -336,18 +252,9 @@ class Closure(OneLineRepr):
         Raises:
             FormulaTooLongError: The machine is too large for it.
         """
-        if self._optional_compiled_closure is None:
+        if self._solver.compiled_closure is None:
             raise FormulaTooLongError
-        return self._optional_compiled_closure
-
-    @property
-    def _cursor(self) -> ContinuationCursor:
-        """The cursor of this thread."""
-        try:
-            return self._thread_local.cursor
-        except AttributeError:
-            self._thread_local.cursor = self.compiled_closure.new_cursor()
-            return self._thread_local.cursor
+        return self._solver.compiled_closure
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -380,33 +287,13 @@ class Closure(OneLineRepr):
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
-        guessed_configuration = None
+        guess = None
         if initial_guess is not None:
-            guessed_configuration = as_samples(initial_guess, self.model.nv, "guess", self._names)
-            if guessed_configuration.ndim != 1:
-                raise InputError(
-                    f"guess has the shape {guessed_configuration.shape}, give one "
-                    f"({self.model.nv},)"
-                )
-            if self.is_compiled and not self.compiled_closure.start_cursor_at(
-                self._cursor, guessed_configuration
-            ):
-                self._cursor.start_from(
-                    self._continuation.nearest_closed_configuration(guessed_configuration)
-                )
+            guess = as_samples(initial_guess, self.model.nv, "guess", self._names)
+            if guess.ndim != 1:
+                raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
         out = np.empty((*targets.shape[:-1], self.model.nv))
-        if not self.is_compiled:
-            known = (
-                self._continuation.home
-                if guessed_configuration is None
-                else self._continuation.nearest_closed_configuration(guessed_configuration)
-            )
-            for i, target in enumerate(np.atleast_2d(targets)):
-                sample = f" (sample {i})" if targets.ndim == 2 else ""
-                known = self._continuation.continue_to(target, known, sample)
-                out[(i,) if targets.ndim == 2 else ()] = known.q
-            return out
-        self._solve_stack(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
+        self._solver.solve(np.atleast_2d(targets), guess, targets.ndim == 2, np.atleast_2d(out))
         return out
 
     def follow_motion(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
@@ -434,54 +321,9 @@ class Closure(OneLineRepr):
             self.equations, self.active, self.equations.motion_scales, targets, first
         )
 
-    def _solve_stack(self, targets: Array, out: Array, stacked: bool) -> None:
-        """Close the loops at targets (N, n) into out (N, nq)."""
-        order = self._sort_samples(targets) if len(targets) > _MIN_SAMPLES_TO_SORT else None
-        sorted_targets = np.ascontiguousarray(targets if order is None else targets[order])
-        closed = out if order is None else np.empty_like(out)
-
-        def continue_from_home(i: int) -> None:
-            sample = f" (sample {i if order is None else order[i]})" if stacked else ""
-            closed[i] = self.continue_from_home(self._cursor, sorted_targets[i], sample)
-
-        run_with_fallback(
-            len(targets),
-            lambda i, _: self.compiled_closure.follow_targets(
-                self._cursor, sorted_targets[i:], closed[i:]
-            ),
-            continue_from_home,
-        )
-        if order is not None:
-            out[order] = closed
-
-    def _sort_samples(self, targets: Array) -> NDArray[np.intp] | None:
-        """An order of distant samples with close neighbours; None for samples along a path.
-
-        Samples are sorted into cells of all coordinates but the last, and by the last one within a
-        cell. Coordinates that move no passive joint are ignored.
-        """
-        moves_passive_joints = (
-            np.abs(self._continuation.home.passive_gamma).max(axis=0, initial=0.0) > 0
-        )
-        scaled = (targets / self._active_ranges)[:, moves_passive_joints]
-        if (
-            not scaled.size
-            or np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE
-        ):
-            return None
-        cells = np.floor(scaled * len(targets) ** (1 / scaled.shape[1]))
-        order: NDArray[np.intp] = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
-        return order
-
     def is_on_branch(self, q: Array) -> bool:
         """Whether a closed configuration (nq,) lies on the branch of home."""
-        if self.is_compiled:
-            return self.compiled_closure.start_cursor_at(self._cursor, q)
-        try:
-            solution = self._continuation.nearest_closed_configuration(q)
-        except WrongBranchError:
-            return False
-        return bool(np.abs((solution.q - q) / self.units).max() < _SAME_CONFIGURATION_TOLERANCE)
+        return self._solver.is_on_branch(q)
 
     def continue_from_home(
         self, cursor: ContinuationCursor, target: Array, sample: str = ""
@@ -498,19 +340,7 @@ class Closure(OneLineRepr):
         Returns:
             q (nq,).
         """
-        home = self._continuation.home
-        line = home.q_a + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (
-            target - home.q_a
-        )
-        line[-1] = target
-        out = np.empty((_CONTINUATION_STEPS, self.model.nv))
-        for waypoints in (line[-1:], line[1::2], line):
-            cursor.start_from(home)
-            if self.compiled_closure.follow_targets(cursor, waypoints, out) == len(waypoints):
-                return out[len(waypoints) - 1]
-        solution = self._continuation.continue_to(target, home, sample)
-        cursor.start_from(solution)
-        return solution.q
+        return self._solver.continue_from_home(self.compiled_closure, cursor, target, sample)
 
     def gamma(self, q: ArrayLike) -> Array:
         """Derivative of f, equation (4) of the reduced-scale forwarder paper.
@@ -526,25 +356,11 @@ class Closure(OneLineRepr):
             SingularConfigurationError: The passive joints are not determined there.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
-        if not self.is_compiled:
-            return apply_per_sample(self._gamma_of_sample, q)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")
         rows = np.atleast_2d(np.ascontiguousarray(q))
         out = np.empty((len(rows), self.model.nv, len(self.active)))
-
-        def pivoted(i: int) -> None:  # at nearly singular configurations
-            try:
-                out[i] = self._gamma_of_sample(rows[i])
-            except SingularConfigurationError as error:
-                sample = f" (sample {i})" if q.ndim == 2 else ""
-                raise SingularConfigurationError(f"{error}{sample}") from None
-
-        run_with_fallback(
-            len(rows),
-            lambda i, _: self.compiled_closure.evaluate_gamma(rows[i:], out[i:]),
-            pivoted,
-        )
+        self._solver.gamma(rows, q.ndim == 2, out)
         return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:
@@ -563,7 +379,7 @@ class Closure(OneLineRepr):
         """
         q = as_samples(q, self.model.nv, "q", self._names)
         v = as_samples(v, self.model.nv, "v", self._names)
-        return apply_per_sample(self._drift_of_sample, q, v)
+        return apply_per_sample(self._solver.continuation.drift, q, v)
 
     def residual(self, q: ArrayLike) -> Array:
         """Largest absolute residual of all loop equations, redundant ones included.
@@ -611,52 +427,7 @@ class Closure(OneLineRepr):
         Returns:
             (nv, n), (nv,), (nv,).
         """
-        jacobian = self.equations.evaluate_scaled(q)[1][self.structure.independent_rows]
-        gamma = self._insert_passive_gamma(self._passive_gamma(jacobian, q))
-        v = gamma @ v_a
-        return gamma, v, self._drift_from_jacobian(jacobian, q, v)
-
-    def _gamma_of_sample(self, q: Array) -> Array:
-        return self._insert_passive_gamma(
-            self._passive_gamma(
-                self.equations.evaluate_scaled(q)[1][self.structure.independent_rows], q
-            )
-        )
-
-    def _passive_gamma(self, jacobian: Array, q: Array) -> Array:
-        """(passive, n) rows of gamma, from a scaled Jacobian."""
-        rows = self._solve_passive(jacobian, jacobian[:, self.active], q)
-        coordinate_units = self.equations.coordinate_units
-        return rows * coordinate_units[self.passive, None] / coordinate_units[self.active]
-
-    def _drift_of_sample(self, q: Array, v: Array) -> Array:
-        return self._drift_from_jacobian(
-            self.equations.evaluate_scaled(q)[1][self.structure.independent_rows], q, v
-        )
-
-    def _insert_passive_gamma(self, passive: Array) -> Array:
-        gamma = np.zeros((self.model.nv, len(self.active)))
-        gamma[self.active] = np.eye(len(self.active))
-        gamma[self.passive] = passive
-        return gamma
-
-    def _drift_from_jacobian(self, jacobian: Array, q: Array, v: Array) -> Array:
-        drift = np.zeros(self.model.nv)
-        acceleration_bias = (
-            self.equations.acceleration_bias(q, v) / self.equations.residual_units
-        )[self.structure.independent_rows]
-        passive_drift = self._solve_passive(jacobian, acceleration_bias, q)
-        drift[self.passive] = passive_drift * self.equations.coordinate_units[self.passive]
-        return drift
-
-    def _solve_passive(self, jacobian: Array, right_side: Array, q: Array) -> Array:
-        """-J_P^-1 right_side, all scaled."""
-        try:
-            solution = solve_linear(jacobian[:, self.passive], -right_side)
-        except np.linalg.LinAlgError:
-            raise self._continuation.singularity_error(jacobian, q[self.active]) from None
-        self._continuation.check_singularity(jacobian, solution, q[self.active])
-        return solution
+        return self._solver.continuation.gamma_velocity_drift(q, v_a)
 
 
 def _has_same_geometry(first: LoopEquations, second: LoopEquations) -> bool:

@@ -40,12 +40,15 @@ from crane.closure.constraint_tolerances import (
     CLOSED_TOLERANCE,
     FILE_PRECISION,
     ExactConstraints,
+    RedundancyGap,
     RoundedConstraints,
 )
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import MultiStartSearch
+from crane.codegen import cached_result
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
+from crane.common.threads import single_threaded_blas
 
 _MAX_CANDIDATES = 4  # configurations that are tried as home
 # scaled distance of equal configurations
@@ -142,6 +145,30 @@ def find_home(
     if search.largest_specified_deviation(first.home)[1] <= FAR:
         return first, None
     return first, _search_result(search, equations, reason, alternative_count + 1, passive, first)
+
+
+def find_cached_home(
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    initial_guess: Array,
+    specified: Collection[int] | None,
+    movable: Collection[int] = (),
+) -> tuple[ConstraintStructure, HomeSearchResult | None]:
+    """`find_home`, from the cache if an earlier process has found it; the arguments are equal."""
+
+    def find() -> tuple[ConstraintStructure, HomeSearchResult | None]:
+        import scipy.linalg  # noqa: F401 - loads the BLAS library to limit
+
+        with single_threaded_blas(equations.model.nv):
+            return find_home(equations, active, passive, initial_guess, specified, movable)
+
+    if not equations.names:
+        return find_home(equations, active, passive, initial_guess, specified, movable)
+    columns = None if specified is None else tuple(specified), tuple(movable)
+    dependencies = ("home", (equations.cache_key, active, initial_guess, *columns))
+    classes = ConstraintStructure, RedundancyGap, HomeSearchResult
+    return cached_result(dependencies, find, "scipy.linalg", classes)
 
 
 def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -170,6 +171,15 @@ class LoopEquations:
     def motion_scales(self) -> Array:
         """(nv,) comparable displacements of the joints, see `motion_scales`."""
         return motion_scales(self.model)
+
+    @property
+    def cache_key(self) -> tuple[Any, ...]:
+        """Everything that the equations depend on, see `crane.codegen.cached_result`."""
+        loops = tuple(
+            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis)) for x in self.loops
+        )
+        couplings = tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings)
+        return self.model.saveToString(), loops, couplings
 
     @property
     def data(self) -> pin.Data:

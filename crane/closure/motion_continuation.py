@@ -1,4 +1,8 @@
-"""Continuation along a recorded motion, through dead centres of the recorded coordinates."""
+"""Continuation along recorded motions and over stacks of samples.
+
+A recorded motion may pass dead centres of the recorded coordinates; samples of a stack need not
+be a path.
+"""
 
 import numpy as np
 
@@ -17,6 +21,27 @@ _MAX_ITERATIONS, _STEP_TOLERANCE = 40, 1e-13
 _CLOSED_TOLERANCE = 1e-9  # residual of closed loops
 # scaled distance to the extrapolation that means another branch
 _MAX_EXTRAPOLATION_ERROR = 0.5
+
+# samples worth sorting: number, and mean distance of neighbours as a fraction of the range
+_MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = 100, 0.1
+
+
+def sort_samples(scaled: Array) -> Indices | None:
+    """An order of samples (N, n) with close neighbours; None if they need no sorting.
+
+    Samples are sorted into cells of all coordinates but the last, and by the last one within a
+    cell.
+
+    Args:
+        scaled: (N, n) coordinates as fractions of their ranges.
+    """
+    if len(scaled) <= _MIN_SAMPLES_TO_SORT or not scaled.size:
+        return None
+    if np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE:
+        return None
+    cells = np.floor(scaled * len(scaled) ** (1 / scaled.shape[1]))
+    order: Indices = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
+    return order
 
 
 def follow_motion(

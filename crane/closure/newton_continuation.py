@@ -44,7 +44,6 @@ class NewtonContinuation:
     Args:
         equations: All loop equations.
         structure: Independent equations.
-        names: Names of all joints.
         active: Columns of the active joints.
         passive: Columns of the other joints.
         ranges: (n,) ranges of the active coordinates, to compare distances [m], [rad].
@@ -57,13 +56,11 @@ class NewtonContinuation:
         self,
         equations: LoopEquations,
         structure: ConstraintStructure,
-        names: tuple[str, ...],
         active: Indices,
         passive: Indices,
         ranges: Array,
     ):
         self._equations, self._structure = equations, structure
-        self._active_names = [names[i] for i in active]
         self._active_columns, self._passive_columns, self._active_ranges = active, passive, ranges
         self._blocks = structure.blocks_by_size()
         self._coordinate_units, self._is_translation = (
@@ -75,7 +72,7 @@ class NewtonContinuation:
         self._largest_dimension = max(float(np.abs(place.translation).max()) for place in places)
         home = self.solve_newton(structure.home, structure.home[active], 30)
         if home is None:
-            raise MechanismError("the home posture does not close, change 'home'", "home")
+            raise MechanismError("the home configuration does not close, change 'home'", "home")
         self.home = home
         self._home_signs = self._determinant_signs(home)
 
@@ -168,17 +165,61 @@ class NewtonContinuation:
         Raises:
             WrongBranchError: It lies on another branch.
         """
-        posture = self.solve_newton(q, q[self._active_columns], 10)
-        if posture is None:
+        solution = self.solve_newton(q, q[self._active_columns], 10)
+        if solution is None:
             return self.home
-        changed_signs = np.flatnonzero(self._determinant_signs(posture) * self._home_signs < 0)
+        changed_signs = np.flatnonzero(self._determinant_signs(solution) * self._home_signs < 0)
         if len(changed_signs):
             rows = [block for group, _ in self._blocks for block in group][int(changed_signs[0])]
-            raise self._wrong_branch_error(self._format_loop_names(np.ravel(rows)), posture)
-        opposed_loop = self._equations.find_opposed_loop(posture.q)
+            raise self._wrong_branch_error(self._format_loop_names(np.ravel(rows)), solution)
+        opposed_loop = self._equations.find_opposed_loop(solution.q)
         if opposed_loop is not None:
-            raise self._wrong_branch_error(f"loop '{opposed_loop}'", posture)
-        return posture
+            raise self._wrong_branch_error(f"loop '{opposed_loop}'", solution)
+        return solution
+
+    def gamma(self, q: Array) -> Array:
+        """Derivative (nv, n) of f at a closed configuration (nq,); see `Closure.gamma`."""
+        return self._insert_passive_gamma(self._scaled_jacobian(q), q)
+
+    def drift(self, q: Array, v: Array) -> Array:
+        """Accelerations (nv,) at a_A = 0; see `Closure.drift`."""
+        return self._drift(self._scaled_jacobian(q), q, v)
+
+    def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
+        """gamma, v = gamma v_A and drift; see `Closure.gamma_velocity_drift`."""
+        jacobian = self._scaled_jacobian(q)
+        gamma = self._insert_passive_gamma(jacobian, q)
+        v = gamma @ v_a
+        return gamma, v, self._drift(jacobian, q, v)
+
+    def _scaled_jacobian(self, q: Array) -> Array:
+        return self._equations.evaluate_scaled(q)[1][self._structure.independent_rows]
+
+    def _insert_passive_gamma(self, jacobian: Array, q: Array) -> Array:
+        active, passive = self._active_columns, self._passive_columns
+        rows = self._solve_passive(jacobian, jacobian[:, active], q)
+        gamma = np.zeros((len(q), len(active)))
+        gamma[active] = np.eye(len(active))
+        units = self._coordinate_units
+        gamma[passive] = rows * units[passive, None] / units[active]
+        return gamma
+
+    def _drift(self, jacobian: Array, q: Array, v: Array) -> Array:
+        bias = self._equations.acceleration_bias(q, v) / self._equations.residual_units
+        passive = self._solve_passive(jacobian, bias[self._structure.independent_rows], q)
+        drift = np.zeros(len(q))
+        drift[self._passive_columns] = passive * self._coordinate_units[self._passive_columns]
+        return drift
+
+    def _solve_passive(self, jacobian: Array, right_side: Array, q: Array) -> Array:
+        """-J_P^-1 right_side, all scaled."""
+        q_a = q[self._active_columns]
+        try:
+            solution = solve_linear(jacobian[:, self._passive_columns], -right_side)
+        except np.linalg.LinAlgError:
+            raise self.singularity_error(jacobian, q_a) from None
+        self.check_singularity(jacobian, solution, q_a)
+        return solution
 
     def check_singularity(
         self, jacobian: Array, solution: Array, q_a: Array, sample: str = ""
@@ -204,12 +245,10 @@ class NewtonContinuation:
         self, jacobian: Array, q_a: Array, sample: str = ""
     ) -> SingularConfigurationError:
         """The error for a configuration with a singular J_P."""
+        loops = self._format_loop_names(self._most_singular_block(jacobian)[1])
         return SingularConfigurationError(
-            f"{self._format_loop_names(self._most_singular_block(jacobian)[1])} is at the edge "
-            f"of its assembly branch "
-            f"at {self._format_active_coordinates(q_a)}{sample}, where the passive joints are "
-            f"undetermined: stay away "
-            "from it"
+            f"{loops} is at the edge of its branch at {self._format_values(q_a)}{sample}, where "
+            "the passive joints are undetermined: stay away from it"
         )
 
     def _most_singular_block(self, jacobian: Array) -> tuple[float, Indices]:
@@ -311,13 +350,11 @@ class NewtonContinuation:
             redundant_residuals = np.abs(phi[self._structure.redundant_rows])
             if redundant_residuals.max() > self._structure.redundancy.tolerance:
                 row = int(self._structure.redundant_rows[redundant_residuals.argmax()])
-                loop = self._equations.names[self._equations.loop_of_row[row]]
                 raise OutOfReachError(
-                    f"loop '{loop}' stays {self._format_gap(row, redundant_residuals.max())} "
-                    f"open at "
-                    f"{self._format_active_coordinates(solution.q_a)}{sample}, its surplus "
-                    f"equations hold only near home: "
-                    "the mechanism is overconstrained, use a looser loop type"
+                    f"loop '{self._equations.name_of_row(row)}' stays "
+                    f"{self._format_gap(row, redundant_residuals.max())} open at "
+                    f"{self._format_values(solution.q_a)}{sample}, its redundant equations hold "
+                    "only near home: the mechanism is overconstrained, use a looser loop type"
                 )
 
     def _out_of_reach_error(
@@ -336,43 +373,36 @@ class NewtonContinuation:
         def residual(passive: Array) -> Array:
             return evaluate(passive)[0]
 
-        def passive_jacobian(passive: Array) -> Array:
+        def jacobian(passive: Array) -> Array:
             return evaluate(passive)[1]
 
-        nearest = least_squares(
-            residual, q[self._passive_columns] / units, passive_jacobian, xtol=1e-12
-        )
-        phi = residual(nearest.x)
+        start = q[self._passive_columns] / units
+        nearest = least_squares(residual, start, jacobian, xtol=1e-12)
+        phi = evaluate(nearest.x)[0]
         worst = int(np.abs(phi).argmax())
+        place, last = self._format_values(target), self._format_values(last_reached.q_a)
         if np.abs(phi[worst]) < 10 * _CLOSED_TOLERANCE * self.rounding_scale(q):
+            loops = self._format_loop_names(self._most_singular_block(last_reached.jacobian)[1])
             return OutOfReachError(
-                f"{self._format_loop_names(self._most_singular_block(last_reached.jacobian)[1])} "
-                "can be closed at "
-                f"{self._format_active_coordinates(target)}{sample}, but the branch does not "
-                f"lead straight there from "
-                f"{self._format_active_coordinates(last_reached.q_a)}: go around in between, or "
-                f"give a nearer guess"
+                f"{loops} can be closed at {place}{sample}, but the branch does not lead straight "
+                f"there from {last}: go around in between, or give a nearer guess"
             )
-        loop = self._equations.names[self._equations.loop_of_row[worst]]
         return OutOfReachError(
-            f"loop '{loop}' cannot be closed at "
-            f"{self._format_active_coordinates(target)}{sample}: it stays "
-            f"{self._format_gap(worst, np.abs(phi[worst]))} open; the last posture on the way "
-            f"that "
-            f"closes is at {self._format_active_coordinates(last_reached.q_a)}"
+            f"loop '{self._equations.name_of_row(worst)}' cannot be closed at {place}{sample}: it "
+            f"stays {self._format_gap(worst, np.abs(phi[worst]))} open; the last configuration on "
+            f"the way that closes is at {last}"
         )
 
     def _wrong_branch_error(self, subject: str, solution: ClosedConfiguration) -> WrongBranchError:
         return WrongBranchError(
-            f"{subject} is assembled the other way at "
-            f"{self._format_active_coordinates(solution.q_a)}: start from the home "
-            "posture's branch"
+            f"{subject} is assembled the other way at {self._format_values(solution.q_a)}: start "
+            "from the branch of the home configuration"
         )
 
     def _format_gap(self, row: int, scaled_residual: float) -> str:
         """The gap of an equation as text."""
-        unit = "m" if self._equations.is_translation[row] else "rad"
-        return f"{scaled_residual * self._equations.residual_units[row]:.3g} {unit}"
+        gap = scaled_residual * self._equations.residual_units[row]
+        return f"{gap:.3g} {self._equations.unit_of_row(row)}"
 
     def _format_loop_names(self, rows: Indices) -> str:
         loops = sorted(
@@ -381,6 +411,5 @@ class NewtonContinuation:
         names = " and ".join(f"'{self._equations.names[i]}'" for i in loops)
         return ("loop " if len(loops) == 1 else "the group of loops ") + names
 
-    def _format_active_coordinates(self, q_a: Array) -> str:
-        pairs = zip(self._active_names, q_a, strict=True)
-        return ", ".join(f"{name} = {value:.6g}" for name, value in pairs)
+    def _format_values(self, q_a: Array) -> str:
+        return self._equations.coordinates.format_values(self._active_columns, q_a)
