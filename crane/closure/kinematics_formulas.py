@@ -86,6 +86,14 @@ class TreeGeometry:
         """Bodies of floating bases without mass."""
         return frozenset(i + k for i in self.floating_bases for k in range(5))
 
+    def supporting_bodies(self, body: int) -> list[int]:
+        """A body and the bodies that carry it, except the world."""
+        found = []
+        while body:
+            found.append(body)
+            body = self.parents[body]
+        return found
+
 
 def tree_geometry(equations: LoopEquations) -> TreeGeometry:
     """The geometry of an assembled model."""

@@ -14,11 +14,8 @@ from crane.codegen.program import BoundFunction
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
 from crane.dynamics.dynamics_derivatives import DynamicsDerivatives
-from crane.dynamics.dynamics_formulas import (
-    DynamicsFormulas,
-    FormulaStructure,
-    StickSlipAccelerations,
-)
+from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
+from crane.dynamics.formula_structure import FormulaStructure
 from crane.dynamics.spatial_inertia import Matrix
 from crane.machine import Machine
 

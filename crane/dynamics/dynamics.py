@@ -19,7 +19,7 @@ from crane.dynamics.compiled_dynamics import (
     CompiledQuantity,
 )
 from crane.dynamics.constant_derivatives import ConstantDerivatives
-from crane.dynamics.dynamics_formulas import (
+from crane.dynamics.formula_structure import (
     FormulaStructure,
     circuit_friction_indices,
     dynamics_constants,

@@ -169,8 +169,8 @@ class DynamicsDerivatives:
             gamma_derivatives,
             friction,
         )
-        self._joint_axes = formulas.posture.joint_axes
-        self._parents, self._n = formulas.posture.geometry.parents, len(formulas.v_a)
+        self._joint_axes = formulas.kinematics.joint_axes
+        self._parents, self._n = formulas.kinematics.geometry.parents, len(formulas.v_a)
         self._cluster_of_joint = {
             i: c for c, x in enumerate(gamma_derivatives.clusters) for i in x.joints
         }
@@ -230,7 +230,7 @@ class DynamicsDerivatives:
         out: Matrix = [[0.0] * self._n for _ in range(self._n)]
         gamma, rotors, twists = (
             self._formulas.gamma,
-            self._formulas.rotors,
+            self._formulas.rotor_inertias,
             self._gamma_derivatives.twists,
         )
         for c, cluster in enumerate(self._gamma_derivatives.clusters):
@@ -266,7 +266,7 @@ class DynamicsDerivatives:
             len(self._parents),
         )
         rates = [0.0, *(dot(formulas.gamma[i], a_a) + formulas.drift[i] for i in range(1, size))]
-        second = gamma_derivatives.second_time_derivatives(formulas.rates, rates)
+        second = gamma_derivatives.second_time_derivatives(formulas.joint_velocities, rates)
         motions = tuple(dict(enumerate(x)) for x in formulas.body_motions(rates))
         subtree_wrenches, forces = (
             self._subtree_wrenches(rates),
@@ -322,7 +322,7 @@ class DynamicsDerivatives:
         for i, wrench in subtree_wrenches.items():
             out[i] = (
                 spatial_dot(self._joint_axes[i], wrench)
-                + self._formulas.rotors[i] * joint_accelerations[i]
+                + self._formulas.rotor_inertias[i] * joint_accelerations[i]
             )
         return out
 
@@ -366,11 +366,12 @@ class DynamicsDerivatives:
         return _CoordinateEffect(
             {
                 i: spatial_dot(self._joint_axes[i], by_q[i])
-                + formulas.rotors[i] * second_time_derivative[i]
+                + formulas.rotor_inertias[i] * second_time_derivative[i]
                 for i in cluster.joints
             },
             {
-                i: spatial_dot(self._joint_axes[i], by_v[i]) + formulas.rotors[i] * first[i]
+                i: spatial_dot(self._joint_axes[i], by_v[i])
+                + formulas.rotor_inertias[i] * first[i]
                 for i in cluster.joints
             },
             wrench_shifts,
@@ -460,7 +461,9 @@ class DynamicsDerivatives:
         formulas, joints = self._formulas, self._gamma_derivatives.clusters[cluster_index].joints
         at = {i: formulas.q[i - 1] for i in joints}
         rates = {
-            i: rate for i in joints if isinstance(rate := formulas.rates[i], SymbolicExpression)
+            i: rate
+            for i in joints
+            if isinstance(rate := formulas.joint_velocities[i], SymbolicExpression)
         }
         by_q = {
             x.index: formulas.gamma[i][coordinate]

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.kinematics_formulas import TreeGeometry
 from crane.closure.spatial_vectors import Vector
 from crane.codegen import PythonCallback, SymbolicExpression, Tape
 from crane.codegen.symbolic import (
@@ -122,7 +121,7 @@ def trace_external_forces(
     states: Sequence[Scalar],
 ) -> ExternalForceFormulas:
     """`ExternalForces` as formulas, from the concatenated references and states."""
-    kinematics, geometry = formulas.posture, formulas.posture.geometry
+    kinematics, geometry = formulas.kinematics, formulas.kinematics.geometry
     active_forces: Vector = [0.0] * len(machine.active)
     powers: Vector = []
     event_lengths: Vector = []
@@ -142,15 +141,18 @@ def trace_external_forces(
         arm = matvec(kinematics.rotation[body], (turn @ pose.translation).tolist())
         at = add_vectors(kinematics.origin[body], arm)
         axes = matmul(kinematics.rotation[body], (turn @ pose.rotation).tolist())
-        carriers = _supporting_bodies(geometry, body)
+        carriers = geometry.supporting_bodies(body)
         velocity: Vector = [0.0] * 3
         spin: Vector = [0.0] * 3
         for i in carriers:
             linear, angular = kinematics.joint_axes[i]
             velocity = add_vectors(
-                velocity, scale_vector(formulas.rates[i], add_vectors(linear, cross(angular, at)))
+                velocity,
+                scale_vector(
+                    formulas.joint_velocities[i], add_vectors(linear, cross(angular, at))
+                ),
             )
-            spin = add_vectors(spin, scale_vector(formulas.rates[i], angular))
+            spin = add_vectors(spin, scale_vector(formulas.joint_velocities[i], angular))
         here = FrameMotion(
             matvec(world_rotation, subtract_vectors(at, kinematics.origin[0])),
             matmul(world_rotation, axes),
@@ -284,11 +286,3 @@ def _frame_placement(machine: Machine, force: ExternalForce) -> tuple[int, pin.S
     """Pinocchio's joint that moves a force's frame, and the placement of the frame in it."""
     frame = machine.model.frames[machine.frame(force.frame)]
     return int(frame.parentJoint), frame.placement
-
-
-def _supporting_bodies(geometry: TreeGeometry, body: int) -> list[int]:
-    found = []
-    while body:
-        found.append(body)
-        body = geometry.parents[body]
-    return found

@@ -92,7 +92,7 @@ class PinocchioDynamics:
     Args:
         machine: The machine.
         forces: Its friction and passive forces.
-        carrier_bodies: See `crane.dynamics.formulation`.
+        carrier_bodies: See `crane.dynamics.formula_structure`.
     """
 
     def __init__(self, machine: Machine, forces: JointForces, carrier_bodies: Sequence[int]):

@@ -214,7 +214,7 @@ def trace_machine(
     v_a = (
         parts.v_a
         if chart.has_user_coordinates
-        else [dynamics_formulas.rates[i + 1] for i in chart.user_columns]
+        else [dynamics_formulas.joint_velocities[i + 1] for i in chart.user_columns]
     )
     applied = external_forces.trace_external_forces(
         chart.machine, dynamics_formulas, external_references, parts.shear
