@@ -275,7 +275,8 @@ def test_a_dead_centre_names_who_drives_through_it(tmp_path):
 def test_a_file_that_says_nothing_of_a_singular_posture_gets_another(tmp_path):
     """The two above, whose active joint is at zero only because nothing is said of it."""
     flat = cranks(tmp_path, (0.2, 0.2, 0.2), turned=False)
-    with pytest.warns(CraneWarning, match="the configuration is singular; moving one, too, the nearest"):
+    text = "configuration is singular; moving one, too, the nearest"
+    with pytest.warns(CraneWarning, match=text):
         machine = crane.load(flat)
     assert float(machine.closure.condition_number(machine.home)) < 20
 

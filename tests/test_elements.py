@@ -13,7 +13,8 @@ from test_compiled import off
 from typed import typed
 
 import crane
-from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen import Program, Tape
 from crane.codegen.differentiation import differentiate
 from crane.common.errors import CraneWarning, InputError

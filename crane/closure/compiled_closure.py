@@ -11,13 +11,13 @@ from crane.closure.clusters import Cluster, find_clusters
 from crane.closure.constraint_structure import ConstraintStructure, Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
-    LoopFormulas,
     PositionKinematics,
     folding_pattern,
     largest_scaled_value,
     tree_geometry,
 )
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
 from crane.codegen import Layout, Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.symbolic import minimum

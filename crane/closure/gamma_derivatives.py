@@ -15,7 +15,8 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import LoopEquationFormula, LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import PositionKinematics
+from crane.closure.loop_formulas import LoopEquationFormula, LoopFormulas
 from crane.closure.spatial_vectors import (
     ZERO_VECTOR,
     SpatialVector,

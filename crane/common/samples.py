@@ -135,6 +135,25 @@ def _call_with_sample_number(sample: int, function: Callable[..., Array], *array
         raise type(error)(f"{error} (sample {sample})") from None
 
 
+def read_only_copy(array: Array) -> Array:
+    """A read-only copy of an array."""
+    out = array.copy()
+    out.flags.writeable = False
+    return out
+
+
+def stack_length(arrays: Iterable[Array]) -> int | None:
+    """Common length N of the stacks (N, n) among samples (n,) and stacks; None without stacks.
+
+    Raises:
+        InputError: The stacks differ in length.
+    """
+    lengths = {len(array) for array in arrays if array.ndim == 2}
+    if len(lengths) > 1:
+        raise InputError(f"stacks of {sorted(lengths)} samples do not go together, give equal N")
+    return lengths.pop() if lengths else None
+
+
 def apply_per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
     """Apply a function of single samples, row by row to stacks.
 
@@ -143,12 +162,9 @@ def apply_per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
     Raises:
         InputError: The stacks differ in length.
     """
-    lengths = {len(array) for array in arrays if array.ndim == 2}
-    if not lengths:
+    count = stack_length(arrays)
+    if count is None:
         return function(*arrays)
-    if len(lengths) > 1:
-        raise InputError(f"stacks of {sorted(lengths)} samples do not go together, give equal N")
-    (count,) = lengths
     rows: Iterable[Array] = (
         _call_with_sample_number(
             i, function, *(array[i] if array.ndim == 2 else array for array in arrays)

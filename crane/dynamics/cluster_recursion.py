@@ -25,7 +25,8 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.clusters import Cluster, find_clusters
-from crane.closure.kinematics_formulas import LoopFormulas, PositionKinematics, VelocityKinematics
+from crane.closure.kinematics_formulas import PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
 from crane.closure.spatial_vectors import (
     ZERO_VECTOR,
     SpatialVector,

@@ -3,12 +3,8 @@
 from collections.abc import Sequence
 from functools import cached_property
 
-from crane.closure.kinematics_formulas import (
-    FormulaConstants,
-    LoopFormulas,
-    PositionKinematics,
-    VelocityKinematics,
-)
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
 from crane.closure.spatial_vectors import (
     SpatialVector,
     Vector,

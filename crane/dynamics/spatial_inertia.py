@@ -13,9 +13,11 @@ operations in proportion to its entries.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.spatial_vectors import (
     ZERO_VECTOR,
     SpatialVector,
@@ -29,13 +31,14 @@ from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
     Scalar,
     add_vectors,
+    cross,
     dot,
     matmul,
     matvec,
     scale_vector,
     subtract_vectors,
     transpose,
-)
+)  # fmt: skip
 
 Matrix = list[Vector]
 
@@ -258,3 +261,91 @@ class CompositeMassMatrix:
                     for j in coordinates_of_joint[i]:
                         entry = self.mass_matrix[j][k] + loops.gamma[i][j] * met
                         self.mass_matrix[j][k] = self.mass_matrix[k][j] = entry
+
+
+@dataclass(frozen=True)
+class MassMoments:
+    """Sums over the points r of bodies that move as one, with velocities r'.
+
+    Attributes:
+        mass: sum m.
+        first_moment: sum m r (3,).
+        inertia_tensor: sum m (r^2 - r r^T) (3, 3).
+        momentum: sum m r' (3,).
+        moment_rate: tr(K) - K (3, 3), K = sum m r' r^T.
+    """
+
+    mass: Scalar
+    first_moment: Vector
+    inertia_tensor: Matrix
+    momentum: Vector
+    moment_rate: Matrix
+
+    @classmethod
+    def rigid_body(
+        cls, mass: Scalar, centre: Vector, tensor: Matrix, motion: SpatialVector
+    ) -> "MassMoments":
+        """Moments of a rigid body.
+
+        Args:
+            mass: Its mass.
+            centre: Its centre of mass.
+            tensor: Inertia about the centre of mass.
+            motion: Its twist.
+        """
+        first = scale_vector(mass, centre)
+        square = dot(first, centre)
+        inertia = _symmetric_from_upper(
+            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0)
+        )
+        v, w = motion
+        momentum = scale_vector(mass, add_vectors(v, cross(w, centre)))
+        # second moments about the centre, tr(I) / 2 - I
+        half = 0.5 * (tensor[0][0] + tensor[1][1] + tensor[2][2])
+        spread = _symmetric_from_upper(lambda r, c: (half if r == c else 0.0) - tensor[r][c])
+        spun = transpose([cross(w, column) for column in spread])
+        k = [
+            [p * x + more for x, more in zip(centre, row, strict=True)]
+            for p, row in zip(momentum, spun, strict=True)
+        ]
+        sums = [k[1][1] + k[2][2], k[0][0] + k[2][2], k[0][0] + k[1][1]]
+        mixed = [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)]
+        return cls(mass, first, inertia, momentum, mixed)
+
+    def __add__(self, other: "MassMoments") -> "MassMoments":
+        return MassMoments(
+            self.mass + other.mass,
+            add_vectors(self.first_moment, other.first_moment),
+            _symmetric_from_upper(
+                lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c]
+            ),
+            add_vectors(self.momentum, other.momentum),
+            [
+                add_vectors(one, two)
+                for one, two in zip(self.moment_rate, other.moment_rate, strict=True)
+            ],
+        )
+
+    def inertial_wrench(self, acceleration: SpatialVector) -> SpatialVector:
+        """I A."""
+        a, e = acceleration
+        force = add_vectors(scale_vector(self.mass, a), cross(e, self.first_moment))
+        return force, add_vectors(cross(self.first_moment, a), matvec(self.inertia_tensor, e))
+
+    def velocity_wrench(self, angular: Vector) -> SpatialVector:
+        """B of a motion; its linear part has no effect."""
+        return cross(angular, self.momentum), matvec(self.moment_rate, angular)
+
+    def transposed_velocity_product(self, motion: SpatialVector) -> Vector:
+        """Angular part of B^T of a motion."""
+        v, w = motion
+        return add_vectors(cross(self.momentum, v), matvec(transpose(self.moment_rate), w))
+
+
+def _symmetric_from_upper(entry: Callable[[int, int], Scalar]) -> Matrix:
+    """`_symmetric_matrix` from the upper triangle: the order of operations stays the same."""
+    out: Matrix = [[0.0] * 3 for _ in range(3)]
+    for r in range(3):
+        for c in range(r, 3):
+            out[r][c] = out[c][r] = entry(r, c)
+    return out

@@ -19,6 +19,7 @@ from crane.common.package_search import (
     check_package_folders,
     use_load_options,
 )
+from crane.common.samples import read_only_copy
 from crane.description import (
     Coupling,
     LoopSpec,
@@ -34,7 +35,7 @@ from crane.formats.assembly_warnings import warn_about_assembly_modes
 from crane.formats.home_warnings import add_remedy, check_home
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.machine.drive_selection import select_free_joints, select_motors
-from crane.machine.machine import Machine, read_only_copy
+from crane.machine.machine import Machine
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
 from crane.machine.machine_checks import (
     check_frame_elements,

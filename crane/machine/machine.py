@@ -3,10 +3,11 @@
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +18,7 @@ from crane.closure.coordinates import Coordinates
 from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
-from crane.common.samples import Array, as_number, as_sample, as_samples
+from crane.common.samples import Array, as_samples, read_only_copy
 from crane.description import (
     AnyForceElement,
     Chain,
@@ -32,7 +33,6 @@ from crane.description import (
     Task,
     bundled_machines,
     example_robots,
-    inertia_problem,
 )
 from crane.description.estimation_settings import EstimationSettings
 from crane.description.external_forces import ExternalForce, PhasedWrench
@@ -41,26 +41,9 @@ from crane.description.machine_lookup import CHANGES_SEPARATOR, command_line_arg
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.hydraulics import Hydraulics
 from crane.machine.machine_checks import frame_element_problems
+from crane.machine.payload import Payload
 
 _LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
-
-
-@dataclass(frozen=True, repr=False)
-class Payload(OneLineRepr):
-    """A rigid load on a frame.
-
-    Attributes:
-        frame: A link of the machine.
-        mass: [kg].
-        com: Centre of mass in the frame [m].
-        inertia: (3, 3) about the centre of mass, in the frame's axes [kg m2]; zero for a point
-            mass.
-    """
-
-    frame: str
-    mass: float
-    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    inertia: ArrayLike = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -326,9 +309,28 @@ class Machine(OneLineRepr):
                 no limits, or has a cylinder without being active; or the frames of an element are
                 unknown, belong to one body, or coincide at home.
         """
+        self._check_elements([*(forces or ()), *(gas_springs or ()), *(ropes or ())])
         for joint in friction or {}:
             self.column(joint)
-        elements: list[AnyForceElement] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
+        for stop in end_stops or ():
+            self._check_limited(stop.joint, " to stop at, give it some")
+        for joint in hydraulics.joints if hydraulics else ():
+            if joint not in self.active:
+                hint = suggest_names(self.active, joint)
+                raise InputError(f"'{joint}' has a cylinder and is not active, {hint}")
+            self._check_limited(joint, ", a cylinder needs those of its stroke")
+        mappings = {"friction": friction, "sensors": sensors}
+        sequences = {
+            "forces": forces, "gas_springs": gas_springs, "ropes": ropes, "end_stops": end_stops,
+        }  # fmt: skip
+        changes: dict[str, Any] = {"hydraulics": hydraulics, "estimation": estimation}
+        changes |= {k: MappingProxyType(dict(x)) for k, x in mappings.items() if x is not None}
+        changes |= {k: tuple(x) for k, x in sequences.items() if x is not None}
+        return dataclasses.replace(self, **{k: x for k, x in changes.items() if x is not None})
+
+    def _check_elements(self, elements: Sequence[AnyForceElement]) -> None:
+        """Raise unless the joints and frames of force elements exist and fit."""
+        gas_springs = [item.joint for item in elements if isinstance(item, GasSpring)]
         for item in elements:
             if item.between is None:
                 self.column(item.joint)
@@ -337,36 +339,16 @@ class Machine(OneLineRepr):
                     self.frame(link)
         for problem in frame_element_problems(self.closure, elements):
             raise InputError(problem)
-        for spring in gas_springs or ():
-            if [other.joint for other in gas_springs or ()].count(spring.joint) > 1:
-                raise InputError(f"joint '{spring.joint}' has two gas springs, keep one")
-        for stop in end_stops or ():
-            column = self.column(stop.joint)
-            limits = self.coordinates.lower[column], self.coordinates.upper[column]
-            if not np.isfinite(limits).all():
-                raise InputError(f"joint '{stop.joint}' has no limits to stop at, give it some")
-        for joint in hydraulics.joints if hydraulics else ():
-            if joint not in self.active:
-                raise InputError(
-                    f"'{joint}' has a cylinder and is not active, "
-                    f"{suggest_names(self.active, joint)}"
-                )
-            i = self.active.index(joint)
-            if not np.isfinite([self.lower[i], self.upper[i]]).all():
-                raise InputError(
-                    f"joint '{joint}' has no limits, a cylinder needs those of its stroke"
-                )
-        return dataclasses.replace(
-            self,
-            friction=self.friction if friction is None else MappingProxyType(dict(friction)),
-            forces=self.forces if forces is None else tuple(forces),
-            gas_springs=self.gas_springs if gas_springs is None else tuple(gas_springs),
-            ropes=self.ropes if ropes is None else tuple(ropes),
-            end_stops=self.end_stops if end_stops is None else tuple(end_stops),
-            hydraulics=self.hydraulics if hydraulics is None else hydraulics,
-            sensors=self.sensors if sensors is None else MappingProxyType(dict(sensors)),
-            estimation=self.estimation if estimation is None else estimation,
-        )
+        for joint in gas_springs:
+            if gas_springs.count(joint) > 1:
+                raise InputError(f"joint '{joint}' has two gas springs, keep one")
+
+    def _check_limited(self, joint: str, hint: str) -> None:
+        """Raise unless a joint has limits."""
+        column = self.column(joint)
+        limits = self.coordinates.lower[column], self.coordinates.upper[column]
+        if not np.isfinite(limits).all():
+            raise InputError(f"joint '{joint}' has no limits{hint}")
 
     def with_active_joints(self, names: Sequence[str]) -> "Machine":
         """A copy with other active joints, for example the angles of its booms.
@@ -397,7 +379,7 @@ class Machine(OneLineRepr):
                 raise InputError(
                     f"joint '{name}' is named twice among the active ones, once will do"
                 )
-        return self._with_closure(names, self._create_closure(names, self.home))
+        return self._with_closure(names, self.home)
 
     def with_home_configuration(self, q: Array, names: tuple[str, ...]) -> "Machine":
         """`with_active_joints` at another home configuration, which may be on another branch.
@@ -410,24 +392,19 @@ class Machine(OneLineRepr):
             MechanismError: See `with_active_joints`.
         """
         known = self.closure.with_home_configuration(q) if names == self.active else None
-        return self._with_closure(
-            names, known or self._create_closure(names, q, keep_revolutions=True)
-        )
+        return self._with_closure(names, q, known, keep_revolutions=True)
 
-    def _create_closure(
-        self, names: tuple[str, ...], home: Array, keep_revolutions: bool = False
-    ) -> Closure:
-        equations = self.closure.equations
-        return Closure(
-            self.model,
-            equations.loops,
-            names,
-            home,
-            equations.couplings,
-            keep_revolutions=keep_revolutions,
-        )
-
-    def _with_closure(self, names: tuple[str, ...], closure: Closure) -> "Machine":
+    def _with_closure(
+        self,
+        names: tuple[str, ...],
+        home: Array,
+        closure: Closure | None = None,
+        keep_revolutions: bool = False,
+    ) -> "Machine":
+        if closure is None:
+            equations = self.closure.equations
+            arguments = self.model, equations.loops, names, home, equations.couplings
+            closure = Closure(*arguments, keep_revolutions=keep_revolutions)
         same = set(names) == set(self.active)
         return dataclasses.replace(
             self,
@@ -491,28 +468,8 @@ class Machine(OneLineRepr):
             InputError: Unknown frame, or infeasible mass and inertia.
         """
         frame = self.model.frames[self.frame(payload.frame)]
-        com = as_sample(payload.com, 3, "the payload's com")
-        tensor = as_samples(payload.inertia, 3, "the payload's inertia")
-        mass = as_number(payload.mass, "the payload's mass", "kg")
-        if mass < 0:
-            raise InputError(f"the payload's mass is {mass:g} kg, it must not be negative")
-        asymmetry = np.abs(tensor - tensor.T).max() if tensor.shape == (3, 3) else np.inf
-        if asymmetry > 1e-9 * np.abs(tensor).max():
-            raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
-        if not mass and tensor.any():
-            raise InputError("the payload has an inertia but no mass, give it a mass")
-        problem = inertia_problem(mass, tensor)
-        if problem and tensor.any():
-            raise InputError(f"the payload has {problem}")
-        load = pin.Inertia(mass, com, tensor)
+        load = payload.rigid_body()
         model = pin.Model(self.model)
         model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
         tree = add_rigid_load(self.tree, payload.frame, load)
         return dataclasses.replace(self, model=model, tree=tree)
-
-
-def read_only_copy(array: Array) -> Array:
-    """A read-only copy of an array."""
-    out = array.copy()
-    out.flags.writeable = False
-    return out

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen import Scalar, Tape
 from crane.codegen.casadi_expressions import casadi_expressions
 from crane.codegen.symbolic import add_vectors, matvec, subtract_vectors, transpose
