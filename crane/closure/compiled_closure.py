@@ -7,6 +7,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from crane.closure.closure_routines import add_closure_routines
 from crane.closure.clusters import Cluster, find_clusters
 from crane.closure.constraint_structure import ConstraintStructure, Indices
 from crane.closure.kinematics_formulas import (
@@ -19,14 +20,13 @@ from crane.closure.kinematics_formulas import (
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
-from crane.codegen import Layout, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
 # Scaled values: rad and characteristic length, as in `NewtonContinuation`.
 _LARGE_GAMMA = 1e3  # above this entry of gamma, `NewtonContinuation` checks singularity
 _NEARLY_CLOSED_TOLERANCE = 1e-6  # residual of a guess that counts as closed
-_MAX_NEWTON_ITERATIONS = 8  # Newton's method converges quadratically
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +170,8 @@ class CompiledClosure:
     def _build(self, program: Program, signs: Array) -> None:
         self.add_newton_formula(program, signs)
         self._add_predictor(program)
-        self._add_close(program)
-        self._add_follow(program)
-        self._add_close_in_place(program)
         self._add_gamma(program)
+        add_closure_routines(program, self._nq, self._n)
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
         """A further program of this machine, see `Program.from_cache`.
@@ -206,10 +204,7 @@ class CompiledClosure:
             Whether it is closed and on the branch of home.
         """
         q = np.ascontiguousarray(q)
-        layout = self.formula_outputs("newton")
-        result = np.empty(layout.size)
-        self._closure_program.call("newton", self.geometry.constants, q, result)
-        found = layout.view(result)
+        found = self._newton_step(q)
         if not (found.residual[0] <= _NEARLY_CLOSED_TOLERANCE and found.regular[0] > 0):
             return False
         cursor.state[: self._nq] = q
@@ -218,12 +213,14 @@ class CompiledClosure:
 
     def least_determinant(self, q: Array) -> float:
         """The least block determinant at a configuration (nq,), positive on the branch of home."""
+        return float(self._newton_step(np.ascontiguousarray(q)).determinant[0])
+
+    def _newton_step(self, q: Array) -> LayoutView:
+        """Outputs of the formula "newton" at a configuration (nq,)."""
         layout = self.formula_outputs("newton")
         result = np.empty(layout.size)
-        self._closure_program.call(
-            "newton", self.geometry.constants, np.ascontiguousarray(q), result
-        )
-        return float(layout.view(result).edge[0])
+        self._closure_program.call("newton", self.geometry.constants, q, result)
+        return layout.view(result)
 
     def follow_targets(self, cursor: "ContinuationCursor", targets: Array, out: Array) -> int:
         """Close the loops at targets (N, n) into out (N, nq) until one needs several steps.
@@ -244,7 +241,7 @@ class CompiledClosure:
             Number of closed configurations.
         """
         return self._closure_program.call(
-            "settle", len(q), self.geometry.constants, q, self.tolerances
+            "close_each", len(q), self.geometry.constants, q, self.tolerances
         )
 
     def evaluate_gamma(self, q: Array, out: Array) -> int:
@@ -254,7 +251,7 @@ class CompiledClosure:
             Number of evaluated configurations.
         """
         q = np.ascontiguousarray(q)
-        return self._closure_program.call("gammas", len(q), self.geometry.constants, q, out)
+        return self._closure_program.call("gamma_each", len(q), self.geometry.constants, q, out)
 
     def trace_kinematics(
         self,
@@ -275,13 +272,8 @@ class CompiledClosure:
         numbers = self.geometry.constants if folded_constants is None else folded_constants
         constants = FormulaConstants(tape, geometry_argument, numbers)
         kinematics = PositionKinematics(self.geometry, constants, coordinates)
-        loops = LoopFormulas(
-            self._equations,
-            self._structure,
-            self._active_columns,
-            self._passive_columns,
-            kinematics,
-        )
+        columns = self._active_columns, self._passive_columns
+        loops = LoopFormulas(self._equations, self._structure, *columns, kinematics)
         return coordinates, kinematics, loops
 
     def add_newton_formula(self, program: Program, signs: Array) -> None:
@@ -297,9 +289,9 @@ class CompiledClosure:
         is_translation = [not kinematics.geometry.is_revolute[joint] for joint in steps]
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._gamma_entry_pairs]
-        steepest = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
+        largest_gamma = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
         worst = maximum(
-            steepest - _LARGE_GAMMA,
+            largest_gamma - _LARGE_GAMMA,
             loops.largest_redundant_residual - self._structure.redundancy.tolerance,
         )
         least_determinant: Scalar = 1.0
@@ -313,7 +305,7 @@ class CompiledClosure:
             2,
             {
                 "residual": [loops.largest_residual],
-                "change": [
+                "step": [
                     largest_scaled_value(
                         list(steps.values()),
                         is_translation,
@@ -321,8 +313,8 @@ class CompiledClosure:
                     )
                 ],
                 "regular": [-1.0 * worst],
-                "steepest": [steepest],
-                "edge": [least_determinant],
+                "largest_gamma": [largest_gamma],
+                "determinant": [least_determinant],
                 "q": corrected,
                 "gamma": rows,
             },
@@ -342,92 +334,8 @@ class CompiledClosure:
             worst = maximum(worst, max_abs(powers[-1]) / inverse_length)
         return worst
 
-    def _add_close(self, program: Program) -> None:
-        """Add `close`: Newton's method in place; 1 if closed on the branch of home, else 0.
-
-        A step whose square is below rounding is the last one.
-        """
-        arrays = {
-            "numbers": None,
-            "q": None,
-            "result": program.formula_outputs("newton"),
-            "bounds": None,
-        }
-        with program.add_routine("close", arrays=arrays) as r:
-            q, result = r.q, r.result
-            rounded, closed, small = (r.new_variable(r.bounds[i]) for i in range(3))
-            before = r.new_variable(np.inf)
-            evaluations = r.new_variable(0)
-            with r.loop_forever():
-                r.call("newton", r.numbers, q, result)
-                residual, change = (
-                    r.new_variable(result["residual"]),
-                    r.new_variable(result["change"]),
-                )
-                stalled = (residual <= closed) & (residual > before * 0.25)
-                with r.if_then((residual <= rounded) | stalled):
-                    r.break_loop()
-                r.assign(evaluations, evaluations + 1)
-                with r.if_then(~((change < 1.0) & (evaluations < _MAX_NEWTON_ITERATIONS))):
-                    r.return_value(0)
-                r.copy(q, result.element_pointer("q"), self._nq)
-                with r.if_then(change <= small):
-                    r.break_loop()
-                r.assign(before, residual)
-            with r.if_then(result["regular"] > 0.0):
-                r.return_value(1)
-            r.return_value(0)
-
-    def _add_follow(self, program: Program) -> None:
-        """Add `follow`: one Newton continuation step per target.
-
-        It stops at the first target where a step fails; `NewtonContinuation` solves that one.
-        `cursor` holds [q, gamma] of the last sample.
-        """
-        nq, n = self._nq, self._n
-        at = Layout(q=nq, gamma=len(self._gamma_entry_pairs))
-        arrays = {"numbers": None, "targets": None, "at": at, "out": None, "bounds": None}
-        with program.add_routine("follow", counts=("count",), arrays=arrays) as r:
-            guess, verdict = (
-                r.local_array("guess", nq),
-                r.local_array("verdict", program.formula_outputs("distance")),
-            )
-            first = r.local_array("first", program.formula_outputs("predict"))
-            result = r.local_array("result", program.formula_outputs("newton"))
-            with r.loop(r.count) as i:
-                r.call("predict", r.numbers, r.at, r.targets.row_pointer(i, n), first)
-                move = r.new_variable(first["move"])
-                with r.if_then(~(move < 1.0)):
-                    r.return_value(i)
-                r.copy(guess, first.element_pointer("q"), nq)
-                closed = r.call("close", r.numbers, guess, result, r.bounds)
-                with r.if_then(closed < 1):
-                    r.return_value(i)
-                r.call("distance", r.numbers, first, guess, verdict)
-                with r.if_then(~(verdict["all"] <= move * 0.5 + 0.02)):
-                    r.return_value(i)
-                r.copy(r.at, guess, nq)
-                r.copy(
-                    r.at.element_pointer("gamma"),
-                    result.element_pointer("gamma"),
-                    at.parts["gamma"],
-                )
-                r.copy(r.out.row_pointer(i, nq), guess, nq)
-            r.return_value(r.count)
-
-    def _add_close_in_place(self, program: Program) -> None:
-        """Add `close_each`: close configurations in place, each from itself."""
-        arrays = ("numbers", "q", "bounds")
-        with program.add_routine("settle", counts=("count",), arrays=arrays) as r:
-            result = r.local_array("result", program.formula_outputs("newton"))
-            with r.loop(r.count) as i:
-                closed = r.call("close", r.numbers, r.q.row_pointer(i, self._nq), result, r.bounds)
-                with r.if_then(closed < 1):
-                    r.return_value(i)
-            r.return_value(r.count)
-
     def _add_gamma(self, program: Program) -> None:
-        """Add `gamma` from the result of `newton`, and `gamma_each` over configurations."""
+        """Add "gamma": gamma of all joints from the result of "newton"."""
         tape, n, result = Tape(), self._n, program.formula_outputs("newton")
         at = {
             pair: result.start_index("gamma") + i for i, pair in enumerate(self._gamma_entry_pairs)
@@ -439,16 +347,7 @@ class CompiledClosure:
             for k in range(n):
                 if (row, k) in at:
                     rows[column][k] = tape.load(0, at[row, k])
-        program.add_formula("whole", 1, [entry for row in rows for entry in row])
-        arrays = ("numbers", "q", "out")
-        with program.add_routine("gammas", counts=("count",), arrays=arrays) as r:
-            work = r.local_array("work", result)
-            with r.loop(r.count) as sample:
-                r.call("newton", r.numbers, r.q.row_pointer(sample, self._nq), work)
-                with r.if_then(~(work["regular"] > 0.0)):
-                    r.return_value(sample)
-                r.call("whole", work, r.out.row_pointer(sample, self._nq * n))
-            r.return_value(r.count)
+        program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:
         """Signs of the block determinants on the branch of home."""

@@ -79,7 +79,7 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
     "forward": lambda found, x: found.forward_dynamics_derivatives(x),
 }
 # before a quantity: its derivatives by q_A, v_A and the second argument
-DERIVATIVES_OF = "slopes of "
+DERIVATIVES_OF = "derivatives of "
 _FLOAT = np.dtype(np.float64)
 
 
@@ -209,7 +209,9 @@ class CompiledQuantity:
     def evaluate_closed_stack(self, q: Array, inputs: Array, out: Array) -> None:
         """The quantity at closed configurations (N, nq), inputs (N, 2 n), into out (N, size)."""
         geometry = self._compiled_closure.geometry.constants
-        self._program.call("along", len(q), geometry, self._formula_constants, q, inputs, out)
+        self._program.call(
+            "closed_each", len(q), geometry, self._formula_constants, q, inputs, out
+        )
 
 
 def _build_quantity(
@@ -383,26 +385,26 @@ def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
     "closed_each" evaluates at closed configurations. Like `follow` of `CompiledClosure`, "each"
     stops at the first sample that is too far from the previous one.
     """
-    arrays = ("geometry", "numbers", "targets", "inputs", "at", "q", "out", "bounds")
+    arrays = ("geometry", "constants", "targets", "inputs", "cursor", "q", "out", "tolerances")
     outputs = program.formula_outputs("formula").size
     with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
         with r.loop(r.count) as i:
             target = r.targets.row_pointer(i, n)
-            got = r.call("follow", 1, r.geometry, target, r.at, r.q, r.bounds)
+            got = r.call("follow", 1, r.geometry, target, r.cursor, r.q, r.tolerances)
             with r.if_then(got < 1):
                 r.return_value(i)
             out = r.out.row_pointer(i, outputs)
-            r.call("formula", r.geometry, r.numbers, r.q, r.inputs.row_pointer(i, 2 * n), out)
+            r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
         r.return_value(r.count)
-    closed = ("geometry", "numbers", "postures", "inputs", "out")
-    with program.add_routine("along", counts=("count",), arrays=closed) as r:
+    closed = ("geometry", "constants", "configurations", "inputs", "out")
+    with program.add_routine("closed_each", counts=("count",), arrays=closed) as r:
         with r.loop(r.count) as i:
             q, inputs, out = (
-                r.postures.row_pointer(i, nq),
+                r.configurations.row_pointer(i, nq),
                 r.inputs.row_pointer(i, 2 * n),
                 r.out.row_pointer(i, outputs),
             )
-            r.call("formula", r.geometry, r.numbers, q, inputs, out)
+            r.call("formula", r.geometry, r.constants, q, inputs, out)
         r.return_value(r.count)
     with program.add_routine("once", functions=("follow",), arrays=arrays) as r:
         scanned = r.local_array("scanned", program.formula_outputs("scan"))
@@ -411,7 +413,7 @@ def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
             r.return_value(0)
         r.return_value(
             r.call(
-                "each", 1, r.follow, r.geometry, r.numbers, r.targets, r.inputs, r.at, r.q, r.out,
-                r.bounds,
+                "each", 1, r.follow, r.geometry, r.constants, r.targets, r.inputs, r.cursor, r.q,
+                r.out, r.tolerances,
             )
         )  # fmt: skip

@@ -28,8 +28,8 @@ from crane.dynamics.frame_jacobians import MIN_LENGTH
 DistanceBodies = tuple[tuple[int, int], ...]
 LAW_SIZE = 22  # values of a law, see `JointForces.table`
 _SHARPNESS_INDEX = 4
-SLIP_INDEX = 7  # where the three are that change with the motion: slip, held, pace
-END_STOP_INDEX = 14  # where those of its stops are: stiffness, damping, lower, upper
+SLIP_INDEX = 7  # first of the stick-slip mode: slip sign, is held, inverse velocity
+END_STOP_INDEX = 14  # first of the end stop: stiffness, damping, lower, upper limit
 
 
 class ForceLawValues(NamedTuple):

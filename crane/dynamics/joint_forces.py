@@ -15,15 +15,15 @@ from crane.machine import Machine
 
 _LAW_FIELDS = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
-    "slip", "held", "pace",
-    "stiffness", "damping", "constant", "slack",
-    "stop", "stop_damping", "lower", "upper",
-    "gas", "gas_share", "gas_rest", "gas_exponent",
+    "slip_sign", "is_held", "inverse_velocity",
+    "stiffness", "damping", "constant", "energy_offset",
+    "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
+    "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
-_MODE_FIELDS = slice(_LAW_FIELDS.index("slip"), _LAW_FIELDS.index("pace") + 1)
-_SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("slack") + 1)
-_END_STOP_FIELDS = slice(_LAW_FIELDS.index("stop"), _LAW_FIELDS.index("upper") + 1)
-_GAS_FIELDS = slice(_LAW_FIELDS.index("gas"), len(_LAW_FIELDS))
+_MODE_FIELDS = slice(_LAW_FIELDS.index("slip_sign"), _LAW_FIELDS.index("inverse_velocity") + 1)
+_SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("energy_offset") + 1)
+_END_STOP_FIELDS = slice(_LAW_FIELDS.index("stop_stiffness"), _LAW_FIELDS.index("upper_limit") + 1)
+_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), len(_LAW_FIELDS))
 # for joints with circuit friction only, so that friction is never zero
 MIN_COULOMB_FRICTION = 1e-6
 REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
@@ -191,7 +191,7 @@ class JointForces:
         sign = np.tanh(v * sharpness)
         if use_modes:
             stick_slip = list(self.sticking)
-            sign[stick_slip] = self.table[stick_slip, _LAW_FIELDS.index("slip")]
+            sign[stick_slip] = self.table[stick_slip, _LAW_FIELDS.index("slip_sign")]
             coulomb = coulomb + self.circuit_friction
         stick_slip_columns = stiction * np.exp(-((v * stribeck) ** 2))
         return (

@@ -174,15 +174,17 @@ class PinocchioDynamics:
                 _, joint_friction, _, holding_forces = self._accelerations_with_stick_slip(
                     state, x
                 )
-                stick_slip, (slip, held, pace) = (
+                stick_slip, (slip_sign, is_held, inverse_velocity) = (
                     list(self._joint_forces.sticking),
                     self._joint_forces.stick_slip_modes,
                 )
-                is_at_rest = (np.abs(slip) < 1) | (
-                    held.any() & (np.abs(v[stick_slip]) * pace < REST_VELOCITY)
+                is_at_rest = (np.abs(slip_sign) < 1) | (
+                    is_held.any() & (np.abs(v[stick_slip]) * inverse_velocity < REST_VELOCITY)
                 )
                 friction_at_rest = np.where(
-                    is_at_rest, self._joint_forces.friction_at_rest(slip) + holding_forces, 0.0
+                    is_at_rest,
+                    self._joint_forces.friction_at_rest(slip_sign) + holding_forces,
+                    0.0,
                 )
                 return np.concatenate(
                     [
@@ -232,12 +234,15 @@ class PinocchioDynamics:
         See `DynamicsFormulas.accelerations_with_stick_slip`.
         """
         forces, stick_slip = self._joint_forces, list(self._joint_forces.sticking)
-        slip, held, pace = forces.stick_slip_modes
+        slip_sign, is_held, inverse_velocity = forces.stick_slip_modes
         joint_friction = forces.friction_forces(state.v, use_modes=True)
         bias = self._inverse_dynamics(state, state.drift, False) + state.gamma.T @ joint_friction
         a_a = self._solve_mass_matrix(state, tau_a - bias)
-        margins, holding_forces = slip * state.v[stick_slip] * pace, np.zeros(len(stick_slip))
-        held_indices = np.flatnonzero(held)
+        margins, holding_forces = (
+            slip_sign * state.v[stick_slip] * inverse_velocity,
+            np.zeros(len(stick_slip)),
+        )
+        held_indices = np.flatnonzero(is_held)
         if len(held_indices):
             rows = state.gamma[stick_slip][held_indices]
             unit_accelerations = np.array([self._solve_mass_matrix(state, row) for row in rows])

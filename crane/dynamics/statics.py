@@ -70,7 +70,9 @@ class StaticsEvaluator:
         self.dynamics = Dynamics(self.machine)
         self._n = len(machine.active)
         n = self._n
-        self.layout = Layout(moment=3, slopes=3 * n, mass=1, passive=n, tip=3, ways=3 * n)
+        self.layout = Layout(
+            moment=3, moment_jacobian=3 * n, mass=1, passive=n, tip=3, tip_jacobian=3 * n
+        )
 
     def evaluate(self, q: Array) -> StaticQuantities:
         """Static quantities at closed configurations (N, nq), without checks."""
@@ -123,6 +125,6 @@ class StaticsEvaluator:
 
         n = self._n
         return StaticQuantities(
-            part("moment", 3), part("slopes", 3, n), part("mass"), part("passive", n),
-            part("tip", 3), part("ways", 3, n),
+            part("moment", 3), part("moment_jacobian", 3, n), part("mass"), part("passive", n),
+            part("tip", 3), part("tip_jacobian", 3, n),
         )  # fmt: skip

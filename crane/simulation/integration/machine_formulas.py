@@ -36,8 +36,8 @@ _AT_REST_SUFFIX = "_rest"
 
 def exceeds_chart_limits(routine: Routine, closure_result: Place) -> RoutineValue:
     """Whether a closed posture is beyond a chart's limits, see `MachineCodeStepper.bounds`."""
-    return (closure_result["steepest"] > routine.bounds[3]) | (
-        closure_result["edge"] < routine.bounds[4]
+    return (closure_result["largest_gamma"] > routine.bounds[3]) | (
+        closure_result["determinant"] < routine.bounds[4]
     )
 
 
