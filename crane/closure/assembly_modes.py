@@ -18,7 +18,7 @@ from crane.closure.constraint_structure import Indices
 from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
-from crane.closure.multi_start_search import MultiStartSearch
+from crane.closure.multi_start_search import MultiStartSearch, low_discrepancy_steps
 from crane.common.samples import Array, solve_linear
 from crane.common.threads import single_threaded_blas
 
@@ -239,11 +239,7 @@ class _AssemblyModeSearch:
 
         They cover one revolution, the limits of a prismatic joint, or the characteristic length.
         """
-        size = len(columns)
-        phi = 2.0
-        for _ in range(40):
-            phi = (1 + phi) ** (1 / (size + 1))
-        fractions = np.outer(np.arange(count), phi ** -np.arange(1.0, size + 1)) + 0.5
+        fractions = np.outer(np.arange(count), low_discrepancy_steps(len(columns))) + 0.5
         fractions = np.remainder(fractions, 1.0) - 0.5
         coordinates = self.equations.coordinates
         lower, upper = coordinates.lower, coordinates.upper

@@ -26,12 +26,11 @@ import numpy as np
 
 from crane.closure.active_joint_selection import (
     Indices,
-    coordinate_units,
     null_space_basis,
     select_columns,
-    translational_coordinates,
 )
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.multi_start_search import damped_step
 from crane.common.samples import Array, solve_linear
 
 _STEP_SIZE = 0.02  # step as a fraction of a joint's scale
@@ -167,7 +166,8 @@ def redundant_gaps_along_motions(
         (k,), and whether each active joint moves at all.
     """
     model = equations.model
-    unit, turns = coordinate_units(model)[active], ~translational_coordinates(model)[active]
+    unit = equations.coordinate_units[active]
+    turns = ~equations.coordinates.is_translation[active]
     distances_to_limits = [
         np.abs(limit[active] - home[active])
         for limit in (equations.coordinates.lower, equations.coordinates.upper)
@@ -423,9 +423,4 @@ class RoundedConstraints(ExactConstraints):
 
 def least_squares_step(jacobian: Array, phi: Array) -> Array:
     """Damped Gauss-Newton step towards phi = 0, at most 0.3 in any joint; scaled."""
-    gram = jacobian.T @ jacobian
-    rounding = 1e-15 * float(gram.diagonal().max(initial=0.0))
-    damping = 1e-12 + rounding + 1e-3 * float(phi @ phi)
-    step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ phi)
-    largest = float(np.abs(step).max(initial=0.0))
-    return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step, dtype=np.float64)
+    return damped_step(jacobian, phi, 1e-12, 0.3, np.inf)

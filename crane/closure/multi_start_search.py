@@ -42,6 +42,35 @@ _START_RADII = (0.3, 1.0, 2.0, np.pi)  # scaled radii of the starting points
 _SAME_CONFIGURATION_TOLERANCE = 1e-3  # scaled distance of equal configurations
 
 
+def damped_step(
+    jacobian: Array,
+    residual: Array,
+    base_damping: float = 1e-14,
+    max_step: float = _MAX_STEP,
+    max_cost: float = 1.0,
+) -> Array:
+    """Levenberg-Marquardt step towards residual = 0, at most `max_step` in any joint; scaled.
+
+    The damping falls with the squared residual, which keeps quadratic convergence.
+    """
+    gram = jacobian.T @ jacobian
+    rounding = base_damping + 1e-15 * float(gram.diagonal().max(initial=0.0))
+    damping = _DAMPING * min(max_cost, float(residual @ residual)) + rounding
+    step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ residual)
+    return np.asarray(step * min(1.0, max_step / max(np.abs(step).max(initial=0.0), 1e-300)))
+
+
+def low_discrepancy_steps(count: int) -> Array:
+    """Steps (count,) of a low-discrepancy sequence of points: multiples of them modulo 1.
+
+    The powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018).
+    """
+    phi = 2.0
+    for _ in range(40):
+        phi = (1 + phi) ** (1 / (count + 1))
+    return np.asarray(phi ** -np.arange(1.0, count + 1))
+
+
 class ClosureResidual:
     """Residuals of loops and couplings that grow with the distance from closed.
 
@@ -269,10 +298,7 @@ class MultiStartSearch:
     def _starting_points(self, movable: Indices) -> Iterator[Array]:
         """The guess, and low-discrepancy points of growing boxes around it."""
         yield self.initial_guess.copy()
-        phi = 2.0
-        for _ in range(40):
-            phi = (1 + phi) ** (1 / (len(movable) + 1))
-        steps = phi ** -np.arange(1.0, len(movable) + 1)
+        steps = low_discrepancy_steps(len(movable))
         for count in itertools.count(1):
             share = 2 * np.remainder(0.5 + count * steps, 1.0) - 1
             start = self.initial_guess.copy()
@@ -316,7 +342,7 @@ class MultiStartSearch:
                 break
             step = np.zeros(len(q))
             step[free_columns] = (
-                self._levenberg_marquardt_step(
+                damped_step(
                     jacobian[:, free_columns] * self._coordinate_units[free_columns], residual
                 )
                 * self._coordinate_units[free_columns]
@@ -333,14 +359,6 @@ class MultiStartSearch:
             q, self.initial_guess, periodic, self._lower_limits, self._upper_limits
         )
         return q, float(np.abs(residual).max(initial=0.0))
-
-    @staticmethod
-    def _levenberg_marquardt_step(jacobian: Array, residual: Array) -> Array:
-        gram = jacobian.T @ jacobian
-        rounding = 1e-14 + 1e-15 * float(gram.diagonal().max(initial=0.0))
-        damping = _DAMPING * min(1.0, float(residual @ residual)) + rounding
-        step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ residual)
-        return np.asarray(step * min(1.0, _MAX_STEP / max(np.abs(step).max(initial=0.0), 1e-300)))
 
     def _line_search(
         self, q: Array, step: Array, cost: float, clip_to_limits: Callable[[Array], Array]

@@ -134,36 +134,36 @@ def _forward_rule(
         tangents.get(x, 0.0) if type(x) is int else 0.0 for x in operands
     ]
     a, da = value[0], operand_tangents[0]
-    if kind == "negate":
-        return -da
-    if kind in _UNARY_DERIVATIVES:
-        assert isinstance(a, SymbolicExpression)
-        return da * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index))
-    if kind == "dot":
-        half = len(value) // 2
-        return dot(operand_tangents[:half], value[half:]) + dot(
-            value[:half], operand_tangents[half:]
-        )
-    b, db = value[1], operand_tangents[1]
-    if kind == "add":
-        return da + db
-    if kind == "subtract":
-        return da - db
-    if kind == "multiply":
-        return da * b + a * db
-    if kind == "divide":
-        return (da - SymbolicExpression(tape, index) * db) / b
-    if kind == "maximum":
-        return where_positive(a - b, da, db)
-    if kind == "copysign":
-        # |a| with the sign of b changes as a if both have one sign, else as -a
-        assert isinstance(b, SymbolicExpression)
-        flipped = copysign(1.0, b)
-        if isinstance(a, SymbolicExpression):
-            flipped = flipped * copysign(1.0, a)
-        return da * flipped
-    assert kind == "positive"
-    return where_positive(a, db, operand_tangents[2])
+    b, db = (value[1], operand_tangents[1]) if len(value) > 1 else (0.0, 0.0)
+    half = len(value) // 2
+    match kind:
+        case "negate":
+            return -da
+        case "dot":
+            first = dot(operand_tangents[:half], value[half:])
+            return first + dot(value[:half], operand_tangents[half:])
+        case "add":
+            return da + db
+        case "subtract":
+            return da - db
+        case "multiply":
+            return da * b + a * db
+        case "divide":
+            return (da - SymbolicExpression(tape, index) * db) / b
+        case "maximum":
+            return where_positive(a - b, da, db)
+        case "copysign":
+            return da * _copysign_derivative(a, b)
+        case "positive":
+            return where_positive(a, db, operand_tangents[2])
+    assert isinstance(a, SymbolicExpression)
+    return da * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index))
+
+
+def _copysign_derivative(a: Scalar, b: Scalar) -> Scalar:
+    """Derivative of |a| with the sign of b: 1 if both have one sign, else -1."""
+    sign = copysign(1.0, b)
+    return sign * copysign(1.0, a) if isinstance(a, SymbolicExpression) else sign
 
 
 def _reverse_rule(
@@ -171,32 +171,29 @@ def _reverse_rule(
 ) -> tuple[Scalar, ...]:
     """Adjoints of the operands of an operation: the transpose of `_forward_rule`."""
     value: list[Scalar] = [SymbolicExpression(tape, x) if type(x) is int else x for x in operands]
-    a = value[0]
-    if kind == "negate":
-        return (-adjoint,)
-    if kind in _UNARY_DERIVATIVES:
-        assert isinstance(a, SymbolicExpression)
-        return (adjoint * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index)),)
-    if kind == "dot":
-        half = len(value) // 2
-        return tuple(adjoint * x for x in (*value[half:], *value[:half]))
-    b = value[1]
-    if kind == "add":
-        return adjoint, adjoint
-    if kind == "subtract":
-        return adjoint, -adjoint
-    if kind == "multiply":
-        return adjoint * b, adjoint * a
-    if kind == "divide":
-        share = adjoint / b
-        return share, -(SymbolicExpression(tape, index) * share)
-    if kind == "maximum":
-        return where_positive(a - b, adjoint, 0.0), where_positive(a - b, 0.0, adjoint)
-    if kind == "copysign":
-        assert isinstance(b, SymbolicExpression)
-        flipped = copysign(1.0, b)
-        if isinstance(a, SymbolicExpression):
-            flipped = flipped * copysign(1.0, a)
-        return adjoint * flipped, 0.0
-    assert kind == "positive"
-    return 0.0, where_positive(a, adjoint, 0.0), where_positive(a, 0.0, adjoint)
+    a, b, half = value[0], value[1] if len(value) > 1 else 0.0, len(value) // 2
+    match kind:
+        case "negate":
+            return (-adjoint,)
+        case "dot":
+            return tuple(adjoint * x for x in (*value[half:], *value[:half]))
+        case "add":
+            return adjoint, adjoint
+        case "subtract":
+            return adjoint, -adjoint
+        case "multiply":
+            return adjoint * b, adjoint * a
+        case "divide":
+            share = adjoint / b
+            return share, -(SymbolicExpression(tape, index) * share)
+        case "maximum":
+            difference = a - b
+            return where_positive(difference, adjoint, 0.0), where_positive(
+                difference, 0.0, adjoint
+            )
+        case "copysign":
+            return adjoint * _copysign_derivative(a, b), 0.0
+        case "positive":
+            return 0.0, where_positive(a, adjoint, 0.0), where_positive(a, 0.0, adjoint)
+    assert isinstance(a, SymbolicExpression)
+    return (adjoint * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index)),)
