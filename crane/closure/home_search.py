@@ -242,8 +242,8 @@ def _reversed(
         block, joints = structure.independent_rows[rows], passive[columns]
         if not np.isin(joints, search.said).all():
             continue
-        home, said = (np.linalg.slogdet(slope[np.ix_(block, joints)])[0] for slope in jacobians)
-        if home * said < 0:
+        home, guess = (np.linalg.slogdet(x[np.ix_(block, joints)])[0] for x in jacobians)
+        if home * guess < 0:
             found += [int(i) for i in equations.loop_of_row[block]]
     return tuple(equations.names[i] for i in dict.fromkeys(found))
 
@@ -304,7 +304,7 @@ def _search_by_stages(
     movable: Collection[int],
     beyond_limits: bool,
 ) -> Iterator[list[Array]]:
-    """Closed configurations of each stage of the search; beyond the limits only if asked for."""
+    """Closed configurations of each stage of the search; beyond the limits only if allowed."""
     movable_columns = np.union1d(passive, np.array(list(movable), dtype=np.intp))
     all_movable = np.union1d(movable_columns, np.setdiff1d(active, list(specified)))
     column_sets = (

@@ -86,7 +86,7 @@ class LoopEquations:
         characteristic_length: Characteristic length [m], see
             `crane.closure.active_joint_selection.characteristic_length`.
         coordinate_units: (nv,) units of the coordinates: 1 rad, and the characteristic length [m].
-        residual_units: (m,) units of the residuals, likewise.
+        residual_units: (m,) units of the residuals: 1 rad, and the characteristic length [m].
     """
 
     def __init__(

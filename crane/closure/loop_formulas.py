@@ -185,9 +185,9 @@ class LoopFormulas:
 
     def _right_side(self, row: int, known: dict[int, Vector], side: Vector) -> Vector:
         """Right-hand side of a row minus the contributions of known joints."""
-        for joint, slope in self.rows[row].jacobian.items():
+        for joint, derivative in self.rows[row].jacobian.items():
             if joint in known:
-                side = subtract_vectors(side, scale_vector(slope, known[joint]))
+                side = subtract_vectors(side, scale_vector(derivative, known[joint]))
         return side
 
     @cached_property

@@ -278,7 +278,7 @@ class ProjectedCluster:
     def __init__(
         self, recursion: RecursionInput, cluster: Cluster, articulated: ArticulatedInertias
     ):
-        self._cluster, loops, posture = cluster, recursion.loops, recursion.kinematics
+        self._cluster, loops, kinematics = cluster, recursion.loops, recursion.kinematics
         coordinates = cluster.own_coordinates(loops.active_joints)
         self._gamma = {i: [loops.gamma[i][k] for k in coordinates] for i in cluster.joints}
         articulated_inside = {i: articulated[i] for i in cluster.joints if i in articulated}
@@ -286,20 +286,22 @@ class ProjectedCluster:
         self._net_forces: list[Scalar] = [0.0] * len(coordinates)
         for i in reversed(cluster.joints):
             inertia, wrench = recursion.articulated_inertia(i, articulated_inside)
-            inertias[i], arm = inertia, posture.offsets[i]
-            force = recursion.remaining_force(i) - spatial_dot(posture.body_motion_axes(i), wrench)
+            inertias[i], arm = inertia, kinematics.offsets[i]
+            force = recursion.remaining_force(i) - spatial_dot(
+                kinematics.body_motion_axes(i), wrench
+            )
             self._net_forces = [
                 old + factor * force
                 for old, factor in zip(self._net_forces, self._gamma[i], strict=True)
             ]
             add_articulated_inertia(
                 articulated_inside,
-                posture.geometry.parents[i],
+                kinematics.geometry.parents[i],
                 inertia.shift_origin(arm),
                 shift_wrench(wrench, arm),
             )
         columns = ClusterMassColumns(
-            posture, cluster, self._gamma, inertias, recursion.rotor_inertias
+            kinematics, cluster, self._gamma, inertias, recursion.rotor_inertias
         )
         self._factorization, self._wrenches = (
             LdltFactorization(columns.mass_block),

@@ -319,12 +319,12 @@ class CompiledParameterDerivatives:
 
         def build(program: Program) -> None:
             tape = Tape()
-            q, posture, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
+            q, kinematics, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
             constants, v_a = (
                 FormulaConstants(tape, 1, folded_constants[1]),
                 tape.load_vector(3, 0, n),
             )
-            sweep = DynamicsFormulas(posture, loops, constants, q, v_a, formula_structure)
+            sweep = DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure)
             values = QUANTITIES[quantity](sweep, tape.load_vector(3, n, n))
             seeds: dict[int, Scalar] = {}
             for i in np.flatnonzero(geometry_changes).tolist():

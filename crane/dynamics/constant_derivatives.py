@@ -96,7 +96,7 @@ class ConstantDerivatives:
             two_steps,
             *map(constants_at, range(3, len(_FORWARD_DIFFERENCE_WEIGHTS) + 1)),
         ]
-        slope: Array = (
+        derivative: Array = (
             _FORWARD_DIFFERENCE_WEIGHTS @ (np.array(rows) - nominal) / (_RELATIVE_STEP * unit)
         )
-        return slope
+        return derivative

@@ -162,10 +162,7 @@ class DynamicsFormulas(InertialForceFormulas):
     def active_motion_factors(self) -> Vector:
         """(n,) 0 for active joints that are held exactly at rest, else 1."""
         out: Vector = [self._moving_factor] * self._mobility
-        is_held = {
-            i: self._joint_laws[i][SLIP_INDEX + 1]
-            for i in self.formula_structure.stick_slip_columns
-        }
+        is_held = {i: self._joint_laws[i][SLIP_INDEX + 1] for i in self._stick_slip_columns}
         for k, joint in enumerate(self.loops.active_joints):
             if joint - 1 in is_held:
                 out[k] = self._moving_factor * (1.0 - is_held[joint - 1])
@@ -191,7 +188,7 @@ class DynamicsFormulas(InertialForceFormulas):
             self._inertial_joint_forces(joint_velocities),
             self.passive_and_friction_forces(friction),
         )
-        for i in self.formula_structure.stick_slip_columns if friction else ():
+        for i in self._stick_slip_columns if friction else ():
             law, rate = self._joint_laws[i], joint_velocities[i + 1]
             sign = friction_sign(law, self.joint_velocities[i + 1], True, self._use_modes)
             negative_sign = where_positive(-REST_ACCELERATION - rate, -1.0, 0.0)
@@ -217,10 +214,8 @@ class DynamicsFormulas(InertialForceFormulas):
 
         The rows are those of the stick-slip joints; net is tau minus bias and friction.
         """
-        rows = [
-            entry for i in self.formula_structure.stick_slip_columns for entry in self.gamma[i + 1]
-        ]
-        drift = [self.drift[i + 1] for i in self.formula_structure.stick_slip_columns]
+        rows = [entry for i in self._stick_slip_columns for entry in self.gamma[i + 1]]
+        drift = [self.drift[i + 1] for i in self._stick_slip_columns]
         return [
             *(entry for row in self.mass_matrix for entry in row),
             *rows,
@@ -240,7 +235,7 @@ class DynamicsFormulas(InertialForceFormulas):
         """For each stick-slip joint, whether it is held, and its row of gamma."""
         return [
             (self._joint_laws[i][SLIP_INDEX + 1], self.gamma[i + 1])
-            for i in self.formula_structure.stick_slip_columns
+            for i in self._stick_slip_columns
         ]
 
     def accelerations_with_stick_slip(
@@ -257,14 +252,12 @@ class DynamicsFormulas(InertialForceFormulas):
             tau: (n,).
             with_joints_at_rest: Whether any joint is at rest.
         """
-        laws = [self._joint_laws[i] for i in self.formula_structure.stick_slip_columns]
+        laws = [self._joint_laws[i] for i in self._stick_slip_columns]
         slip_signs, is_held, inverse_velocities = (
             [law[SLIP_INDEX + k] for law in laws] for k in range(3)
         )
         limits = [law[0] + law[5] for law in laws]
-        velocities = [
-            self.joint_velocities[i + 1] for i in self.formula_structure.stick_slip_columns
-        ]
+        velocities = [self.joint_velocities[i + 1] for i in self._stick_slip_columns]
         slip_velocities = [
             s * v * p for s, v, p in zip(slip_signs, velocities, inverse_velocities, strict=True)
         ]
@@ -276,25 +269,10 @@ class DynamicsFormulas(InertialForceFormulas):
                 self.friction_force,
                 _minimum(slip_velocities),
             )
-        rows = [self.gamma[i + 1] for i in self.formula_structure.stick_slip_columns]
+        rows = [self.gamma[i + 1] for i in self._stick_slip_columns]
         right = self._net_force(tau)
         mass = LdltFactorization(self.mass_matrix)
-        half = [
-            scale_vector(w, mass.forward_substitute(row))
-            for w, row in zip(is_held, rows, strict=True)
-        ]
-        weighted = [
-            [x * d for x, d in zip(row, mass.inverse_diagonal, strict=True)] for row in half
-        ]
-        half_right = mass.forward_substitute(right)
-        matrix = [[dot(one, other) for other in half] for one in weighted]
-        required: Vector = []
-        for k, (i, w) in enumerate(
-            zip(self.formula_structure.stick_slip_columns, is_held, strict=True)
-        ):
-            matrix[k][k] = matrix[k][k] + (1.0 - w)
-            required.append(dot(weighted[k], half_right) + w * self.drift[i + 1])
-        holding_forces = LdltFactorization(matrix).solve(required)
+        holding_forces = self._holding_forces(mass, right, is_held)
         holding_active_forces: Vector = [0.0] * self._mobility
         for r, row in zip(holding_forces, rows, strict=True):
             holding_active_forces = add_vectors(holding_active_forces, scale_vector(r, row))
@@ -336,6 +314,27 @@ class DynamicsFormulas(InertialForceFormulas):
             add_vectors(self.friction_force, holding_active_forces),
             _minimum(margins),
         )
+
+    def _holding_forces(
+        self, mass: LdltFactorization, net_force: Vector, is_held: Sequence[Scalar]
+    ) -> Vector:
+        """Friction forces r (k,) of held joints, 0 of the others."""
+        columns = self._stick_slip_columns
+        rows = [self.gamma[i + 1] for i in columns]
+        half = [
+            scale_vector(w, mass.forward_substitute(row))
+            for w, row in zip(is_held, rows, strict=True)
+        ]
+        weighted = [
+            [x * d for x, d in zip(row, mass.inverse_diagonal, strict=True)] for row in half
+        ]
+        half_right = mass.forward_substitute(net_force)
+        matrix = [[dot(one, other) for other in half] for one in weighted]
+        required: Vector = []
+        for k, (i, w) in enumerate(zip(columns, is_held, strict=True)):
+            matrix[k][k] = matrix[k][k] + (1.0 - w)
+            required.append(dot(weighted[k], half_right) + w * self.drift[i + 1])
+        return LdltFactorization(matrix).solve(required)
 
     def _recursive_forward_dynamics(self, tau: Sequence[Scalar], friction: bool) -> Vector:
         """Forward dynamics without M_A."""

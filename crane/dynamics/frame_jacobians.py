@@ -42,8 +42,8 @@ class FrameJacobians:
             np.empty((len(q), len(placements), 3)),
         )
         configuration = self._machine.coordinates.configuration
-        for i, posture in enumerate(q):
-            pin.forwardKinematics(self._model, self._data, configuration(posture))
+        for i, one in enumerate(q):
+            pin.forwardKinematics(self._model, self._data, configuration(one))
             for k, joint in enumerate(joints):
                 placed = self._data.oMi[joint]
                 rotations[i, k], origins[i, k] = placed.rotation, placed.translation

@@ -195,9 +195,9 @@ class JointForceFormulas:
     def _passive_joint_forces(self) -> Vector:
         """f, passive forces along the joints (nb + 1,)."""
         out = [found.force for found in self._joint_law_values]
-        for slopes, found, _ in self._distance_law_values:
-            for i, slope in slopes.items():
-                out[i] = out[i] + found.force * slope
+        for derivatives, found, _ in self._distance_law_values:
+            for i, derivative in derivatives.items():
+                out[i] = out[i] + found.force * derivative
         return out
 
     @property
@@ -217,10 +217,10 @@ class JointForceFormulas:
             (self.gamma[i], self._joint_law_values[i].force_derivative)
             for i in range(1, self._body_count)
         ]
-        for slopes, found, _ in self._distance_law_values:
+        for derivatives, found, _ in self._distance_law_values:
             row: Vector = [0.0] * self._mobility
-            for i, slope in slopes.items():
-                row = add_vectors(row, scale_vector(slope, self.gamma[i]))
+            for i, derivative in derivatives.items():
+                row = add_vectors(row, scale_vector(derivative, self.gamma[i]))
             along.append((row, found.force_derivative))
         out: list[Vector] = [[0.0] * self._mobility for _ in range(self._mobility)]
         for row, stiffness in along:

@@ -169,8 +169,8 @@ class TippingStability:
         data = self._workspace.value
         still = np.zeros(self._model.nv)
         moves = v is not None or a is not None
-        for i, posture in enumerate(q):
-            at = self.machine.coordinates.configuration(posture)
+        for i, one in enumerate(q):
+            at = self.machine.coordinates.configuration(one)
             if moves:
                 rates[i] = pin.computeCentroidalMomentumTimeVariation(
                     self._model, data, at,

@@ -319,13 +319,16 @@ class Machine(OneLineRepr):
                 hint = suggest_names(self.active, joint)
                 raise InputError(f"'{joint}' has a cylinder and is not active, {hint}")
             self._check_limited(joint, ", a cylinder needs those of its stroke")
-        mappings = {"friction": friction, "sensors": sensors}
-        sequences = {
-            "forces": forces, "gas_springs": gas_springs, "ropes": ropes, "end_stops": end_stops,
+        changes: dict[str, Any] = {
+            "friction": friction, "sensors": sensors, "hydraulics": hydraulics,
+            "estimation": estimation, "forces": forces, "gas_springs": gas_springs,
+            "ropes": ropes, "end_stops": end_stops,
         }  # fmt: skip
-        changes: dict[str, Any] = {"hydraulics": hydraulics, "estimation": estimation}
-        changes |= {k: MappingProxyType(dict(x)) for k, x in mappings.items() if x is not None}
-        changes |= {k: tuple(x) for k, x in sequences.items() if x is not None}
+        for name, value in changes.items():
+            if isinstance(value, Mapping):
+                changes[name] = MappingProxyType(dict(value))
+            elif isinstance(value, list):
+                changes[name] = tuple(value)
         return dataclasses.replace(self, **{k: x for k, x in changes.items() if x is not None})
 
     def _check_elements(self, elements: Sequence[AnyForceElement]) -> None:
@@ -431,7 +434,7 @@ class Machine(OneLineRepr):
         every = (*self.external_forces, *forces)
         for force in forces:
             if not isinstance(force, ExternalForce):
-                raise InputError(f"{force!r} is no force from outside, give a crane.Wrench")
+                raise InputError(f"{force!r} is no external force, give a crane.Wrench")
             if not self.model.frames[self.frame(force.frame)].parentJoint:
                 raise InputError(f"'{force.frame}' does not move, a load on it does nothing")
             if [other.name for other in every].count(force.name) > 1:
@@ -447,18 +450,15 @@ class Machine(OneLineRepr):
         Raises:
             InputError: A phased force without a clock.
         """
-        phased_forces = [
-            force for force in self.external_forces if isinstance(force, PhasedWrench)
-        ]
-        if not phased_forces:
+        phased = [force for force in self.external_forces if isinstance(force, PhasedWrench)]
+        if not phased:
             return self
         if clock is None:
             raise InputError(
-                f"the load '{phased_forces[0].name}' counts phases, simulate it with the task "
-                f"of levers "
+                f"the load '{phased[0].name}' counts phases, simulate it with the task of levers "
                 "that has them"
             )
-        every = (x.with_clock(clock) if x in phased_forces else x for x in self.external_forces)
+        every = (x.with_clock(clock) if x in phased else x for x in self.external_forces)
         return dataclasses.replace(self, external_forces=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":

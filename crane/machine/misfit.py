@@ -29,11 +29,11 @@ from crane.description.parameter_changes import parameter_value, tree_parameters
 from crane.machine.drive_selection import specified_active_joints
 from crane.machine.machine_assembly import assemble_tree
 
-_LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not say
+_LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not specify
 _ITERATIONS, _CHANGES, _EVALUATIONS = 25, 6, 30
-_LEVER = 0.1  # share of a length's slope along the gap, below which it does not close it
-_CLEAR = 0.05  # [rad], shares: joints are where they are said to be
-_ALIKE, _DIGIT = 2.0, 2e-3  # ratio of distances that decides nothing, and digits of a home
+_LEVER = 0.1  # least cosine of a length's derivative and the gap that it closes
+_CLEAR = 0.05  # scaled distance of joints at their specified coordinates
+_ALIKE, _DIGIT = 2.0, 2e-3  # ratio of indecisive distances, and rounding of a home in a file
 _LISTED = 2
 
 
@@ -129,7 +129,7 @@ def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
     return Misfit(spec.loops[worst].name, float(gaps[worst]), tuple(alike[:_LISTED]))
 
 
-# at a posture (nq,) and a change of a number, all in shares: phi (m,), dphi/dq, dphi/dp
+# from q (nq,) and the scaled change of a parameter: phi (m,), dphi/dq, dphi/dp, all scaled
 Changed = Callable[[Array, float], tuple[Array, Array, Array]]
 
 
@@ -146,14 +146,14 @@ def _numbers(
 
     def length(other: LoopEquations) -> Changed:
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
-            (phi, slopes), (there, others) = equations.evaluate(q), other.evaluate(q)
-            shares = equations.residual_units
-            slopes = (
-                (slopes + change * (others - slopes))
-                / shares[:, None]
+            (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
+            units = equations.residual_units
+            jacobian = (
+                (jacobian + change * (other_jacobian - jacobian))
+                / units[:, None]
                 * equations.coordinate_units
             )
-            return (phi + change * (there - phi)) / shares, slopes, (there - phi) / shares
+            return (phi + change * (other_phi - phi)) / units, jacobian, (other_phi - phi) / units
 
         return changed
 
@@ -161,8 +161,8 @@ def _numbers(
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
             there = q.copy()
             there[column] += change * equations.coordinate_units[column]
-            phi, slopes = equations.evaluate_scaled(there)
-            return phi, slopes, slopes[:, column]
+            phi, jacobian = equations.evaluate_scaled(there)
+            return phi, jacobian, jacobian[:, column]
 
         return changed
 
@@ -219,9 +219,9 @@ def _change(
     for _ in range(_ITERATIONS):
         q = guess.copy()
         q[passive] += x[:-1] * units
-        gap, jacobian, slope = changed(q, float(x[-1]))
-        slopes = np.column_stack([jacobian[:, passive], slope])
-        wanted = np.linalg.lstsq(slopes / weights, slopes @ x - gap, rcond=1e-12)[0] / weights
+        gap, jacobian, derivative = changed(q, float(x[-1]))
+        matrix = np.column_stack([jacobian[:, passive], derivative])
+        wanted = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
         step = np.abs(wanted - x).max()
         if not step < 1.0:  # also NaN
             return None
@@ -243,11 +243,11 @@ def _least(
     q, change = guess.copy(), 0.0
     for _ in range(_CHANGES):
         q = _nearest(equations, q, passive, changed, change)
-        phi, _, slope = changed(q, change)
+        phi, _, derivative = changed(q, change)
         if np.abs(phi).max() < FILE_PRECISION:
             return change, abs(change)
-        lever = float(phi @ slope)
-        if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(slope)):
+        lever = float(phi @ derivative)
+        if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(derivative)):
             return None
         change -= float(phi @ phi) / lever
     return None
@@ -270,7 +270,7 @@ def _nearest(
     def gap(x: Array) -> Array:
         return changed(there(x), change)[0]
 
-    def slope(x: Array) -> Array:
+    def jacobian(x: Array) -> Array:
         return changed(there(x), change)[1][:, free]
 
-    return there(least_squares(gap, np.zeros(len(free)), slope, max_nfev=_EVALUATIONS).x)
+    return there(least_squares(gap, np.zeros(len(free)), jacobian, max_nfev=_EVALUATIONS).x)
