@@ -1,8 +1,8 @@
 """`Closure`: solves the loops of a machine, q = f(q_A), v = gamma v_A, a = gamma a_A + drift.
 
-Newton's method for one configuration is `NewtonContinuation.solve_newton` in
-`crane.closure.newton_continuation`; in machine code the routine `close` of
-`crane.closure.compiled_closure`.
+A loop is closed by Newton's method in `NewtonContinuation.solve_newton`
+(`crane.closure.newton_continuation`), and in machine code by the routine "close" of
+`crane.closure.closure_routines`.
 """
 
 import copy
