@@ -1,8 +1,8 @@
 """Dynamics as symbolic formulas: one forward sweep over the bodies (Kane's equations).
 
-`DynamicsFormulas.accelerations_with_stick_slip` computes accelerations with joints held by stiction,
-and the margin whose sign change is a stick-slip transition. Which joints slip, rest or are held is
-decided in `crane.simulation.integration.stick_slip_modes`.
+`DynamicsFormulas.accelerations_with_stick_slip` computes accelerations with joints held by
+stiction, and the margin whose sign change is a stick-slip transition. Which joints slip, rest or
+are held is decided in `crane.simulation.integration.stick_slip_modes`.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,7 @@
 """Forces along joints and distances: friction, springs, dampers, gas, end stops, ropes.
 
-Stick-slip friction has modes, see `JointForces.set_stick_slip_modes`; a simulation switches them at
-stick-slip transitions in `crane.simulation.integration.stick_slip_modes`.
+Stick-slip friction has modes, see `JointForces.set_stick_slip_modes`; a simulation switches them
+at stick-slip transitions in `crane.simulation.integration.stick_slip_modes`.
 """
 
 from collections import Counter
