@@ -72,7 +72,6 @@ class BranchSolver:
             return None
 
     def _cursor(self, compiled: CompiledClosure) -> ContinuationCursor:
-        """The cursor of this thread."""
         try:
             return self._thread_local.cursor
         except AttributeError:

@@ -157,7 +157,6 @@ class Closure(OneLineRepr):
         return self.equations.cache_key
 
     def _one_line(self) -> str:
-        """Loops and active joints."""
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
         return (
             f"Closure of {loops}: {len(self.passive)} passive joints from "

@@ -321,7 +321,6 @@ class CompiledClosure:
         )
 
     def _largest_gamma_entry(self, rows: Sequence[Scalar], inverse_length: Scalar) -> Scalar:
-        """The largest scaled entry of gamma."""
         turns = self.geometry.is_revolute
         powers: dict[int, list[Scalar]] = {0: [], 1: [], -1: []}  # power of a length in an entry
         for (row, k), entry in zip(self._gamma_entry_pairs, rows, strict=True):

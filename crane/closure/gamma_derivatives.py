@@ -216,7 +216,6 @@ class GammaDerivatives:
         return out
 
     def _loop_rows(self, cluster: Cluster) -> list[int]:
-        """Indices of the loop equations of a cluster."""
         return [
             r
             for r, row in enumerate(self._loops.rows)

@@ -400,7 +400,6 @@ class NewtonContinuation:
         )
 
     def _format_gap(self, row: int, scaled_residual: float) -> str:
-        """The gap of an equation as text."""
         gap = scaled_residual * self._equations.residual_units[row]
         return f"{gap:.3g} {self._equations.unit_of_row(row)}"
 

@@ -6,6 +6,7 @@ It does not depend on the target language; an emitter translates it.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partialmethod
 from typing import Any, Literal
 
 from crane.codegen.symbolic import Scalar
@@ -97,39 +98,6 @@ class RoutineValue:
     def _is_zero(self) -> bool:
         return self.kind == "integer" and self.operation == "constant" and not self.operands[0]
 
-    def __add__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("+", other)
-
-    def __sub__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("-", other)
-
-    def __mul__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("*", other)
-
-    def __truediv__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("/", other)
-
-    def __lt__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation("<", other)
-
-    def __le__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation("<=", other)
-
-    def __gt__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation(">", other)
-
-    def __ge__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation(">=", other)
-
-    def __and__(self, other: "RoutineValue") -> "RoutineValue":
-        return RoutineValue("truth", "and", (self, other))
-
-    def __or__(self, other: "RoutineValue") -> "RoutineValue":
-        return RoutineValue("truth", "or", (self, other))
-
-    def __invert__(self) -> "RoutineValue":
-        return RoutineValue("truth", "not", (self,))
-
     def _arithmetic_operation(self, operator: str, other: "Operand") -> "RoutineValue":
         second = as_value(other, self.kind)
         if self.kind == "integer" and self.operation == second.operation == "constant":
@@ -141,6 +109,24 @@ class RoutineValue:
 
     def _comparison_operation(self, operator: str, other: "Operand") -> "RoutineValue":
         return RoutineValue("truth", operator, (self, as_value(other, self.kind)))
+
+    __add__ = partialmethod(_arithmetic_operation, "+")
+    __sub__ = partialmethod(_arithmetic_operation, "-")
+    __mul__ = partialmethod(_arithmetic_operation, "*")
+    __truediv__ = partialmethod(_arithmetic_operation, "/")
+    __lt__ = partialmethod(_comparison_operation, "<")
+    __le__ = partialmethod(_comparison_operation, "<=")
+    __gt__ = partialmethod(_comparison_operation, ">")
+    __ge__ = partialmethod(_comparison_operation, ">=")
+
+    def __and__(self, other: "RoutineValue") -> "RoutineValue":
+        return RoutineValue("truth", "and", (self, other))
+
+    def __or__(self, other: "RoutineValue") -> "RoutineValue":
+        return RoutineValue("truth", "or", (self, other))
+
+    def __invert__(self) -> "RoutineValue":
+        return RoutineValue("truth", "not", (self,))
 
 
 Operand = RoutineValue | float | int

@@ -23,7 +23,6 @@ class OneLineRepr:
         return shorten_to_line(self._one_line())
 
     def _repr_html_(self) -> str | None:
-        """HTML for notebooks."""
         return to_html(self)
 
     def _one_line(self) -> str:

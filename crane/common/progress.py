@@ -108,7 +108,6 @@ def progress_reporter(progress: Callable[[float], None] | None) -> Callable[[flo
 
 
 def _is_on_stack(call: FrameType, frame: FrameType | None) -> bool:
-    """Whether a call is on a stack."""
     while frame is not None and frame is not call:
         frame = frame.f_back
     return frame is call

@@ -373,7 +373,6 @@ def _state_derivatives(
 
 
 def _tape_index(loaded: Scalar) -> int:
-    """Tape index of a loaded value."""
     assert isinstance(loaded, SymbolicExpression)
     return loaded.index
 

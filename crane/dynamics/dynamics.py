@@ -66,7 +66,6 @@ class Dynamics(QuantityEvaluator):
     """
 
     def _one_line(self) -> str:
-        """Machine and backend."""
         return f"Dynamics of '{self.machine.name}', {self.backend}"
 
     @property

@@ -96,12 +96,10 @@ class DynamicsDerivatives:
 
     @cached_property
     def _body_velocities(self) -> list[SpatialVector]:
-        """Velocities of all bodies."""
         return self._formulas.body_motions([0.0] * len(self._parents))[0]
 
     @cached_property
     def _body_moments(self) -> dict[int, MassMoments]:
-        """Mass moments of every body."""
         bodies = enumerate(self._formulas.body_inertias, start=1)
         return {i: MassMoments.rigid_body(*body, self._body_velocities[i]) for i, body in bodies}
 

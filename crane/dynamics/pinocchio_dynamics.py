@@ -269,7 +269,6 @@ class PinocchioDynamics:
             ) from None
 
     def _kinetic_and_potential_energy(self, state: ClosedState) -> Array:
-        """Kinetic and potential energy."""
         configuration = self._coordinates.configuration(state.q)
         kinetic, memory = 0.5 * float(self._armature @ state.v**2), self._workspace.value
         for part in memory.subtrees:

@@ -231,7 +231,6 @@ class Reactions(OneLineRepr):
         wrenches: Mapping[str, ArrayLike] | None,
         friction: bool,
     ) -> tuple[Array, Array]:
-        """Joint wrenches and drive forces."""
         rows, stacked = self._as_stack(q, "q")
         velocities = np.zeros_like(rows) if v is None else self._as_matching_stack(v, rows, "v")
         if a is not None:

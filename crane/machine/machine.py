@@ -121,7 +121,6 @@ class Machine(OneLineRepr):
     arguments: Mapping[str, str]
 
     def _one_line(self) -> str:
-        """Name, degrees of freedom, numbers of joints and loops, hydraulics, free joints."""
         words = [
             repr(self.name),
             format_count(len(self.active), "degree of freedom", "degrees of freedom"),
@@ -347,7 +346,6 @@ class Machine(OneLineRepr):
                 raise InputError(f"joint '{joint}' has two gas springs, keep one")
 
     def _check_limited(self, joint: str, hint: str) -> None:
-        """Raise unless a joint has limits."""
         column = self.column(joint)
         limits = self.coordinates.lower[column], self.coordinates.upper[column]
         if not np.isfinite(limits).all():

@@ -350,7 +350,6 @@ def _emit_vector_call(name: str, width: int, calls: list[tuple[int, Any]]) -> li
 
 
 def _emit_scalar_operation(index: int, kind: str, *operands: Any) -> str:
-    """One scalar operation."""
     words = [format_operand(operand) for operand in operands]
     if kind == "negate":
         return f"  %v{index} = fneg double {words[0]}"

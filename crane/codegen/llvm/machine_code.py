@@ -132,7 +132,6 @@ def compiler_settings() -> str:
 
 
 def _host_cpu() -> tuple[str, str]:
-    """Name and features of this processor."""
     import llvmlite.binding as llvm
 
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
