@@ -40,7 +40,7 @@ from crane.description.kinematic_tree import Tree
 from crane.description.machine_lookup import CHANGES_SEPARATOR, command_line_arguments
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.hydraulics import Hydraulics
-from crane.machine.machine_checks import frame_element_problems
+from crane.machine.machine_checks import check_force_elements, check_limited
 from crane.machine.payload import Payload
 
 _LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
@@ -304,20 +304,19 @@ class Machine(OneLineRepr):
         """A copy with other friction, force elements, stops, hydraulics, sensors or settings.
 
         Raises:
-            InputError: A joint is unknown, has two gas springs, has an end stop or a cylinder but
-                no limits, or has a cylinder without being active; or the frames of an element are
-                unknown, belong to one body, or coincide at home.
+            InputError: A joint or frame is unknown or does not fit the element.
         """
-        self._check_elements([*(forces or ()), *(gas_springs or ()), *(ropes or ())])
+        elements: list[AnyForceElement] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
+        check_force_elements(self.closure, elements, self.frame)
         for joint in friction or {}:
             self.column(joint)
         for stop in end_stops or ():
-            self._check_limited(stop.joint, " to stop at, give it some")
+            check_limited(self.coordinates, stop.joint, " to stop at, give it some")
         for joint in hydraulics.joints if hydraulics else ():
             if joint not in self.active:
                 hint = suggest_names(self.active, joint)
                 raise InputError(f"'{joint}' has a cylinder and is not active, {hint}")
-            self._check_limited(joint, ", a cylinder needs those of its stroke")
+            check_limited(self.coordinates, joint, ", a cylinder needs those of its stroke")
         changes: dict[str, Any] = {
             "friction": friction, "sensors": sensors, "hydraulics": hydraulics,
             "estimation": estimation, "forces": forces, "gas_springs": gas_springs,
@@ -329,27 +328,6 @@ class Machine(OneLineRepr):
             elif isinstance(value, list):
                 changes[name] = tuple(value)
         return dataclasses.replace(self, **{k: x for k, x in changes.items() if x is not None})
-
-    def _check_elements(self, elements: Sequence[AnyForceElement]) -> None:
-        """Raise unless the joints and frames of force elements exist and fit."""
-        gas_springs = [item.joint for item in elements if isinstance(item, GasSpring)]
-        for item in elements:
-            if item.between is None:
-                self.column(item.joint)
-            else:
-                for link in item.between:
-                    self.frame(link)
-        for problem in frame_element_problems(self.closure, elements):
-            raise InputError(problem)
-        for joint in gas_springs:
-            if gas_springs.count(joint) > 1:
-                raise InputError(f"joint '{joint}' has two gas springs, keep one")
-
-    def _check_limited(self, joint: str, hint: str) -> None:
-        column = self.column(joint)
-        limits = self.coordinates.lower[column], self.coordinates.upper[column]
-        if not np.isfinite(limits).all():
-            raise InputError(f"joint '{joint}' has no limits{hint}")
 
     def with_active_joints(self, names: Sequence[str]) -> "Machine":
         """A copy with other active joints, for example the angles of its booms.
@@ -452,10 +430,8 @@ class Machine(OneLineRepr):
         if not phased:
             return self
         if clock is None:
-            raise InputError(
-                f"the load '{phased[0].name}' counts phases, simulate it with the task of levers "
-                "that has them"
-            )
+            hint = "simulate it with the task of levers that has them"
+            raise InputError(f"the load '{phased[0].name}' counts phases, {hint}")
         every = (x.with_clock(clock) if x in phased else x for x in self.external_forces)
         return dataclasses.replace(self, external_forces=tuple(every))
 

@@ -5,15 +5,16 @@ Massless bodies are allowed if the mass matrix is definite.
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
 
 from crane.closure import Closure, frame_id
-from crane.common.errors import CraneWarning, DescriptionError
+from crane.closure.coordinates import Coordinates
+from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.samples import Array
-from crane.description import AnyForceElement, MachineSpec
+from crane.description import AnyForceElement, GasSpring, MachineSpec
 from crane.description.findings import is_strict, report_error
 from crane.description.inertia_feasibility import (
     InertiaProblem,
@@ -190,6 +191,39 @@ def check_frame_elements(spec: MachineSpec, closure: Closure) -> None:
         for problem in frame_element_problems(closure, getattr(spec, section)):
             place = spec.source_locations.get(section, spec.path.name)
             report_error(DescriptionError(f"{place}: {problem}"), harmless=True)
+
+
+def check_force_elements(
+    closure: Closure, elements: Sequence[AnyForceElement], find_frame: Callable[[str], int]
+) -> None:
+    """Check that the joints and frames of force elements exist and fit.
+
+    Raises:
+        InputError: They do not, or a joint has two gas springs.
+    """
+    gas_springs = [item.joint for item in elements if isinstance(item, GasSpring)]
+    for item in elements:
+        if item.between is None:
+            closure.equations.coordinates.column(item.joint)
+        else:
+            for link in item.between:
+                find_frame(link)
+    for problem in frame_element_problems(closure, elements):
+        raise InputError(problem)
+    for joint in gas_springs:
+        if gas_springs.count(joint) > 1:
+            raise InputError(f"joint '{joint}' has two gas springs, keep one")
+
+
+def check_limited(coordinates: Coordinates, joint: str, hint: str) -> None:
+    """Check that a joint has limits.
+
+    Raises:
+        InputError: It has none.
+    """
+    column = coordinates.column(joint)
+    if not np.isfinite([coordinates.lower[column], coordinates.upper[column]]).all():
+        raise InputError(f"joint '{joint}' has no limits{hint}")
 
 
 def frame_element_problems(closure: Closure, items: Iterable[AnyForceElement]) -> Iterator[str]:
