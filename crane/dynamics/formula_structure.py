@@ -121,7 +121,7 @@ class FormulaStructure:
     """What the formulas of a machine depend on besides its loops and constants.
 
     Attributes:
-        carrier_bodies: See `crane.dynamics.formulation`.
+        carrier_bodies: See `carrier_bodies`.
         recursion_plan: How forward dynamics reduces the machine's clusters; see
             `crane.dynamics.cluster_recursion`.
         distance_bodies: Bodies of the two ends of each distance of `JointForces.lengths`.

@@ -37,7 +37,7 @@ class JointForces:
     A passive force acts along a coordinate: that of a joint, or the distance of two frames. The
     law is the same; a force F along a distance l acts on the joints with F dl/dv.
 
-    `crane.dynamics.force_law_formulas.evaluate_force_law` has the same laws as formulas, on
+    `crane.dynamics.joint_force_formulas.evaluate_force_law` has the same laws as formulas, on
     purpose: each checks the other.
 
     Args:
