@@ -101,7 +101,8 @@ def formula(dynamics, quantity, q, v_a, x):
         fast._equations, fast._structure, fast._active_columns, fast._passive_columns, posture
     )
     sweep = DynamicsFormulas(
-        posture, loops, Floats(dynamics.formula_constants), q.tolist(), v_a.tolist(), dynamics.formula_structure,
+        posture, loops, Floats(dynamics.formula_constants), q.tolist(), v_a.tolist(),
+        dynamics.formula_structure,
         quantity in STICK_SLIP_QUANTITIES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)

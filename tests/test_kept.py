@@ -321,7 +321,7 @@ def another(*_):
 @pytest.mark.parametrize(
     "owner, name, value",
     [
-        (crane.dynamics.dynamics_formulas, "evaluate_force_law", another),
+        (crane.dynamics.joint_force_formulas, "evaluate_force_law", another),
         (DynamicsFormulas, "mass_matrix", property(another)),
         (PositionKinematics, "loop_frame", staticmethod(another)),
         (DynamicsFormulas, "kinetic", cached_property(another)),

@@ -44,7 +44,7 @@ class QuantityEvaluator(OneLineRepr):
         formula_structure: What the formulas depend on besides constants.
         backend: "compiled" or "pinocchio".
         tree_dynamics: The quantities by Pinocchio.
-        numbers: Constants of the formulas, see `dynamics_constants`.
+        formula_constants: Constants of the formulas, see `dynamics_constants`.
         constant_pattern: Constants to fold into formulas, NaN for those that change.
     """
 
@@ -69,12 +69,14 @@ class QuantityEvaluator(OneLineRepr):
         self._parameter_derivatives: dict[
             tuple[str, tuple[str, ...]], CompiledParameterDerivatives
         ] = {}
-        self.numbers = np.zeros(0)
+        self.formula_constants = np.zeros(0)
         if self.backend == "compiled":
             geometry = machine.closure.compiled_closure.geometry
-            self.numbers = np.ascontiguousarray(dynamics_constants(machine, geometry, self.forces))
+            self.formula_constants = np.ascontiguousarray(
+                dynamics_constants(machine, geometry, self.forces)
+            )
         # constants to fold into formulas; NaN for those that change with the motion
-        self.constant_pattern = self.numbers.copy()
+        self.constant_pattern = self.formula_constants.copy()
         self._mode_indices = (
             stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
         )
@@ -125,7 +127,7 @@ class QuantityEvaluator(OneLineRepr):
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
         if self._mode_indices:
-            self.numbers[self._mode_indices] = [
+            self.formula_constants[self._mode_indices] = [
                 *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
                 is_moving,
             ]
@@ -137,7 +139,7 @@ class QuantityEvaluator(OneLineRepr):
         """
         self.forces.set_circuit_friction(circuit_friction)
         if self.backend == "compiled":
-            self.numbers[self._circuit_friction_indices] = circuit_friction
+            self.formula_constants[self._circuit_friction_indices] = circuit_friction
 
     def result_shape(self, quantity: str) -> tuple[int, ...]:
         """Shape of one sample of a quantity of `derivatives`."""
@@ -169,7 +171,7 @@ class QuantityEvaluator(OneLineRepr):
                     made = CompiledQuantity(
                         quantity,
                         self.machine,
-                        self.numbers,
+                        self.formula_constants,
                         self.constant_pattern,
                         self.formula_structure,
                     )
@@ -222,7 +224,7 @@ class QuantityEvaluator(OneLineRepr):
             self._parameter_derivatives[key] = CompiledParameterDerivatives(
                 quantity,
                 self.machine,
-                self.numbers,
+                self.formula_constants,
                 self.constant_pattern,
                 self.formula_structure,
                 geometry,
