@@ -267,7 +267,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     dynamics = crane.Dynamics(clad(bare(mini), 3))
     closure, n = mini.closure, 3
     tape = Tape()
-    q, posture, loops = closure.compiled_closure.trace(tape, 0, 2)
+    q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
     constants, v_a = (
         FormulaConstants(tape, 1, dynamics.formula_constants),
         tape.load_vector(3, 0, n),
@@ -679,7 +679,7 @@ def test_operations_of_machines_without_elements_read_none():
         and dynamics.formula_structure.distance_bodies == ()
     )
     sizes = [
-        len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
+        len(crane.Dynamics(machine.replace(ropes=ropes)).formula_constants)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)
     ]
     assert [two - one for one, two in pairwise(sizes)] == [28, 28]

@@ -126,7 +126,7 @@ def _dynamics_quantity(
         dynamics_formulas, x
     )
     zeros = [0.0] * n
-    arguments = [geometry, ("q",), dynamics.numbers, *((name,) for name in names)]
+    arguments = [geometry, ("q",), dynamics.formula_constants, *((name,) for name in names)]
     arguments += [zeros] * (2 - len(names))
     sizes = {"q": len(q)} | dict.fromkeys(names, n)
     return sizes, arguments, {quantity: (formulas, dynamics.result_shape(quantity))}
@@ -181,7 +181,7 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
     )
     numbers = (
         machine.closure.compiled_closure.geometry.constants,
-        chart.dynamics.numbers,
+        chart.dynamics.formula_constants,
         drive.settings,
     )
     sizes = {

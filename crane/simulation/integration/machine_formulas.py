@@ -265,7 +265,7 @@ class MachineCodeStepper:
         machine = chart.machine
         self.closure_code, self._dynamics_constants = (
             machine.closure.compiled_closure,
-            chart.dynamics.numbers,
+            chart.dynamics.formula_constants,
         )
         self._chart, self._control = chart, control
         self.bounds = np.concatenate([self.closure_code.tolerances, chart.chart_limits, [0.0]])
