@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,7 +34,7 @@ def fresh(monkeypatch):
     """Say that this is a process that has imported nothing."""
 
     def begin():
-        monkeypatch.setattr(program_cache, "sys", SimpleNamespace(modules={}))
+        monkeypatch.setattr(program_cache, "sys", SimpleNamespace(modules={}, version=sys.version))
 
     yield begin
 
