@@ -11,7 +11,7 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import crane  # noqa: E402
-from crane.codegen import package_digest  # noqa: E402
+from crane.codegen import program_cache  # noqa: E402
 from crane.codegen.llvm import machine_code  # noqa: E402
 from crane.common import file_cache  # noqa: E402
 
@@ -64,13 +64,13 @@ def place(tmp_path, monkeypatch):
     """A folder of its own for programs, in a process that has just loaded the package."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(crane, "LOADED", time.time() + 60.0)
-    package_digest._files_digest.cache_clear()
+    program_cache._files_digest.cache_clear()
     monkeypatch.setattr(machine_code, "_OPTIMIZATION_LEVEL", 1)  # as another process has it
     machine_code.compiler_settings.cache_clear()
     if tmp_path not in file_cache.cache_folder().parents:
         pytest.skip("folders of the user are elsewhere here")
     yield file_cache.cache_folder()
-    package_digest._files_digest.cache_clear()
+    program_cache._files_digest.cache_clear()
     machine_code.compiler_settings.cache_clear()
 
 

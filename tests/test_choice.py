@@ -224,7 +224,7 @@ def test_two_rods_in_line_lock_up(tmp_path):
 
 def test_a_linkage_in_line_that_moves_on_is_no_lock(tmp_path):
     """A parallelogram lying flat may leave its posture in two ways: home is singular, no more."""
-    with pytest.raises(MechanismError, match=r"home posture \(one = 0\) is singular"):
+    with pytest.raises(MechanismError, match=r"home configuration \(one = 0\) is singular"):
         crane.load(cranks(tmp_path, (0.2, 0.2, 0.2), turned=False, home={"one": 0.0}))
 
 
@@ -267,7 +267,7 @@ def test_a_dead_centre_names_who_drives_through_it(tmp_path):
     with pytest.raises(MechanismError) as caught:
         crane.load(path)
     said = re.search(r"or drive it by (.*)$", str(caught.value))[1]
-    assert "at the edge of the assembly branch" in str(caught.value) and "[crank]" in said
+    assert "at the edge of the branch" in str(caught.value) and "[crank]" in said
     path.write_text(path.read_text().replace("[rocker]", "[crank]"))
     assert crane.load(path).closure.degrees_of_freedom == 1
 
@@ -275,7 +275,8 @@ def test_a_dead_centre_names_who_drives_through_it(tmp_path):
 def test_a_file_that_says_nothing_of_a_singular_posture_gets_another(tmp_path):
     """The two above, whose active joint is at zero only because nothing is said of it."""
     flat = cranks(tmp_path, (0.2, 0.2, 0.2), turned=False)
-    with pytest.warns(CraneWarning, match="the posture is singular; moving one, too, the nearest"):
+    text = "configuration is singular; moving one, too, the nearest"
+    with pytest.warns(CraneWarning, match=text):
         machine = crane.load(flat)
     assert float(machine.closure.condition_number(machine.home)) < 20
 

@@ -205,8 +205,8 @@ def test_guesses_do_not_change_the_answer(mini):
         assert np.abs(mini.closure.solve(target, initial_guess=guess) - alone).max() < 1e-12
         near = mini.closure.solve(target, initial_guess=alone + 1e-4)  # beside the answer
         assert np.abs(near - alone).max() < 1e-12
-    assert np.abs(mini.closure.solve(targets, initial_guess=guesses[0]) - mini.closure.solve(targets)
-                  ).max() < 1e-12  # fmt: skip
+    found = mini.closure.solve(targets, initial_guess=guesses[0])
+    assert np.abs(found - mini.closure.solve(targets)).max() < 1e-12
 
 
 def test_stacks_equal_single_samples(mini):
@@ -587,7 +587,7 @@ def test_four_bar_cut_in_the_middle_of_its_coupler(tmp_path):
     ("changes", "text"),
     [
         (("revolute", "fixed"), "'wrist' .* open"),
-        (("theta: 1.0, phi: -0.5, s: 0.37", "s: 0.4", "[theta]", "[s]"), "edge of the assembly"),
+        (("theta: 1.0, phi: -0.5, s: 0.37", "s: 0.4", "[theta]", "[s]"), "edge of the branch"),
         (
             ("theta: 1.0, phi: -0.5, s: 0.37", "s: 0.45", "[theta]", "[s]"),
             r"'wrist' .*\(s = 0\.45\): it stays",

@@ -13,7 +13,8 @@ from test_compiled import off
 from typed import typed
 
 import crane
-from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen import Program, Tape
 from crane.codegen.differentiation import differentiate
 from crane.common.errors import CraneWarning, InputError
@@ -678,7 +679,7 @@ def test_operations_of_machines_without_elements_read_none():
         and dynamics.formula_structure.distance_bodies == ()
     )
     sizes = [
-        len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
+        len(crane.Dynamics(machine.replace(ropes=ropes)).formula_constants)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)
     ]
     assert [two - one for one, two in pairwise(sizes)] == [28, 28]

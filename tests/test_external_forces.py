@@ -253,7 +253,7 @@ def test_what_is_no_load_is_refused():
         (lambda: crane.Wrench(tip, axes="tip"), "give 'world' or 'frame'"),
         (lambda: crane.WrenchFunction(tip, lambda *_: [np.nan] * 6), "six numbers"),
         (lambda: crane.WrenchFunction(tip, lambda *_: [1.0, 2.0]), "six numbers"),
-        (lambda: 3.0, "no force from outside"),
+        (lambda: 3.0, "no external force"),
         (lambda: crane.Wrench(machine.model.frames[1].name, (1, 0, 0)), "does not move"),
     ):
         with pytest.raises(CraneError, match=text):

@@ -17,7 +17,7 @@ import pytest
 
 import crane
 from crane.closure.kinematics_formulas import PositionKinematics
-from crane.codegen import FormulaTooLongError, package_digest, program
+from crane.codegen import FormulaTooLongError, program, program_cache
 from crane.codegen.llvm import machine_code
 from crane.codegen.program_cache import cache_entry_name
 from crane.common import file_cache
@@ -282,7 +282,7 @@ def test_a_changed_package_finds_nothing(place, tmp_path):
     assert run() == "built"  # just changed: who knows what was loaded
     assert not files(place, "note")
     assert run("late") == "built" and run("late") == "found"
-    file = copy / "dynamics" / "traced.py"
+    file = copy / "dynamics" / "dynamics_formulas.py"
     text, times = file.read_text(), file.stat()
     changed = text.replace("Dynamics", "dynamics", 1)
     assert len(changed) == len(text) and changed != text
@@ -310,7 +310,7 @@ def test_a_package_that_changed_before_it_was_read_finds_nothing(place, monkeypa
     """What its files say is kept, but it is not what was loaded."""
     assert ask() and not ask()
     monkeypatch.setattr(crane, "LOADED", 0.0)
-    package_digest._files_digest.cache_clear()
+    program_cache._files_digest.cache_clear()
     assert ask() and ask()
 
 
@@ -321,7 +321,7 @@ def another(*_):
 @pytest.mark.parametrize(
     "owner, name, value",
     [
-        (crane.dynamics.dynamics_formulas, "evaluate_force_law", another),
+        (crane.dynamics.joint_force_formulas, "evaluate_force_law", another),
         (DynamicsFormulas, "mass_matrix", property(another)),
         (PositionKinematics, "loop_frame", staticmethod(another)),
         (DynamicsFormulas, "kinetic", cached_property(another)),
@@ -334,7 +334,7 @@ def test_a_patched_package_finds_nothing(place, owner, name, value):
     assert ask() and not ask()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(owner, name, value)
-        assert package_digest.package_digest() is None
+        assert program_cache.package_digest() is None
     assert not ask()
 
 
@@ -343,10 +343,10 @@ def test_nor_does_one_with_another_entry_or_module(place, monkeypatch):
     table = crane.dynamics.compiled_dynamics.QUANTITIES
     with monkeypatch.context() as patch:
         patch.setitem(table, next(iter(table)), another)
-        assert package_digest.package_digest() is None
+        assert program_cache.package_digest() is None
     other = ModuleType("crane.dynamics.compiled_dynamics")
     other.effects = another
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, other.__name__, other)
-        assert package_digest.package_digest() is None
-    assert package_digest.package_digest()
+        assert program_cache.package_digest() is None
+    assert program_cache.package_digest()

@@ -19,7 +19,7 @@ from crane.closure import compiled_closure as loops
 from crane.closure.constraint_tolerances import RedundancyGap
 from crane.closure.kinematics_formulas import folding_pattern
 from crane.codegen import Program
-from crane.codegen.llvm.module_emitter import emit_module
+from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.program_cache import cache_entry_name
 from crane.dynamics import compiled_dynamics as quantities
 from crane.motion.kinematics import _CompiledFrame, _CompiledPoint
@@ -39,7 +39,7 @@ READ = {
     "redundancy": {"tolerance"},
     "geometry": {
         "parents", "is_revolute", "floating_bases", "body_rotations", "constants", "frame_bodies",
-        "reference_body", "floating_bodies", "massless_bodies",
+        "reference_body", "floating_bodies", "massless_bodies", "supporting_bodies",
     },
 }  # fmt: skip
 
@@ -204,7 +204,7 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, 2.0, 0.3, -0.7, np.nan, np.inf, 1e300)
 def test_numbers_that_are_not_told_change_no_formula(name, dressed_crank):
     """Where numbers say the same to the key, the formulas are the same to the letter."""
     fast, dynamics = dressed_crank.closure.compiled_closure, crane.Dynamics(dressed_crank)
-    base = fast.geometry.constants if name == "loops" else dynamics.constants
+    base = fast.geometry.constants if name == "loops" else dynamics.formula_constants
     random, texts = np.random.default_rng(3), {}
     for _ in range(60):
         some = random.integers(len(base), size=random.integers(1, 4))

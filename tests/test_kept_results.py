@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from work import at_most
 
 import crane
 from crane.closure.constraint_tolerances import RedundancyGap
-from crane.codegen import cached_result, result_cache
+from crane.codegen import cached_result, program_cache
 from crane.codegen.program_cache import cache_entry_name
 from crane.common import file_cache
 from crane.common.serialization import serialize
@@ -33,7 +34,7 @@ def fresh(monkeypatch):
     """Say that this is a process that has imported nothing."""
 
     def begin():
-        monkeypatch.setattr(result_cache, "sys", SimpleNamespace(modules={}))
+        monkeypatch.setattr(program_cache, "sys", SimpleNamespace(modules={}, version=sys.version))
 
     yield begin
 

@@ -142,8 +142,8 @@ MECHANISM = [
     ),
     case(
         "home singular",
-        "four_bar.yaml:14: the home posture (crank = 0) is at the edge of the "
-        "assembly branch: choose another under 'home'",
+        "four_bar.yaml:14: the home configuration (crank = 0) is at the edge of the "
+        "branch: choose another under 'home'",
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.2 0 0"/>', ROCKER),
         swap(
             "  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5", "  crank: 0\n  coupler: 0\n  rocker: 0"
@@ -151,8 +151,8 @@ MECHANISM = [
     ),
     case(
         "home near singular",
-        "four_bar.yaml:14: the home posture (crank = 0) is at the edge of the "
-        "assembly branch: choose another under 'home'",
+        "four_bar.yaml:14: the home configuration (crank = 0) is at the edge of the "
+        "branch: choose another under 'home'",
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.2 0 0"/>', ROCKER),
         swap(
             "  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5",

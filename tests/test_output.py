@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from killed import killed_at
 
-import crane.common.folder_exchange
+import crane.common.temporary_files
 from crane.common.atomic_output import check_folder_is_writable, replace_file, replace_folder
 from crane.common.errors import OutputError
 
@@ -136,7 +136,7 @@ def kernel(request, monkeypatch):
     """As it is, and one that exchanges no folders."""
     if request.param == "two renames":
         monkeypatch.setattr(
-            crane.common.folder_exchange, "_exchange_atomically", lambda *paths: False
+            crane.common.temporary_files, "_exchange_atomically", lambda *paths: False
         )
     return request.param
 

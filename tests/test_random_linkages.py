@@ -103,7 +103,7 @@ def driven(path):
             for words, reason in (
                 ("no freedom to move", "rigid"),
                 ("locks nothing", "pin that locks nothing"),
-                ("home posture", "singular at home"),
+                ("home configuration", "singular at home"),
                 ("closes at home only", "locks up"),
             ):
                 if words in str(refused):

@@ -9,7 +9,7 @@ from broken import DATA
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.dynamics.dynamics import BACKENDS
+from crane.dynamics.quantity_evaluator import BACKENDS
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
 

@@ -466,7 +466,7 @@ def test_who_has_none_computes_what_was_computed_before(tmp_path, monkeypatch):
     counts = [operations(machine) for machine in (plain, seals, brakes)]
     monkeypatch.setattr(ValveCylinderEquations, "circuit_friction", lambda *_: 0.0)
     assert operations(plain) == counts[0] < min(counts[1:])
-    numbers = [Dynamics(machine).numbers.size for machine in (plain, seals)]
+    numbers = [Dynamics(machine).formula_constants.size for machine in (plain, seals)]
     assert numbers[1] == numbers[0] + 1
     assert not find_stick_slip_columns(plain) and find_stick_slip_columns(
         seals

@@ -1,14 +1,15 @@
-"""Which joints to drive: how well a choice of active joints determines the others.
+"""Selection of active joints, and the condition number of a selection.
 
-With J the Jacobian of the loop equations at a closed posture, D = diag(scales) and N (nv, n) an
-orthonormal basis of the null space of J D, the motions of the machine are v = D N y. A choice A of
-n joints has v_A = D_A N_A y, so that the scaled Jacobian of all joints by the chosen ones is
+With the Jacobian J of the loop equations at a closed configuration, D = diag(scales) and an
+orthonormal basis N (nv, n) of the null space of J D, the motions of the machine are v = D N y.
+For n active joints A, v_A = D_A N_A y, so that the scaled derivative of all joints with respect
+to the active ones is
 
-    D^-1 gamma D_A = N N_A^-1,    condition = ||D^-1 gamma D_A||_2 = 1 / sigma_min(N_A),
+    D^-1 gamma D_A = N N_A^-1,    condition number = ||D^-1 gamma D_A||_2 = 1 / sigma_min(N_A).
 
-which is 1 where no other joint moves, and infinite at a dead centre: sigma_min(N_A) is also the
-least singular value of J_P once the rows of J D are made orthonormal. It does not depend on how
-equations are written, nor on units: see `motion_scales`.
+It is 1 where no other joint moves, and infinite at a dead centre: sigma_min(N_A) is also the least
+singular value of J_P once the rows of J D are orthonormal. It depends neither on how the equations
+are written nor on units, see `motion_scales`.
 """
 
 import re
@@ -24,22 +25,21 @@ from crane.common.samples import Array
 
 Indices = NDArray[np.intp]
 
-# sigma_min of a choice that drives nothing at home, see `crane.closure.constraint_structure`
+# sigma_min below which a selection drives nothing at home, see `constraint_structure`
 DEAD_CENTRE_TOLERANCE = 1e-5
-_UNDRIVEN_NAME = re.compile("passive|free", re.IGNORECASE)  # names of joints that nothing drives
-_MAX_ACTUATOR_CONDITION = (
-    100.0  # condition up to which actuators are proposed before better joints
-)
+_UNDRIVEN_NAME = re.compile("passive|free", re.IGNORECASE)  # names of undriven joints
+# condition number up to which actuators are preferred
+_MAX_ACTUATOR_CONDITION = 100.0
 _MAX_EXCHANGES = 200
-_ROUNDING_TOLERANCE = 1e-9  # share by which what differs only by rounding does
+_ROUNDING_TOLERANCE = 1e-9  # relative difference that counts as rounding
 
 
 @dataclass(frozen=True)
 class ActiveJointSelection:
-    """Active joints, and how well they drive the machine at home.
+    """A set of active joints with its condition number at home.
 
     Attributes:
-        joints: Their names, in the order of the tree.
+        joints: Names of the joints, in the order of the tree.
         condition_number: See the module.
     """
 
@@ -51,15 +51,15 @@ class ActiveJointSelection:
 
 
 def translational_coordinates(model: pin.Model) -> NDArray[np.bool_]:
-    """(nv,) whether a coordinate is a length."""
+    """Mask (nv,) of the coordinates that are lengths."""
     return Coordinates(model).is_translation
 
 
 def characteristic_length(model: pin.Model) -> float:
-    """The size of a machine: the largest distance between neighbouring joints [m].
+    """The characteristic length of a machine [m]: the largest distance between adjacent joints.
 
-    Where all joints are in one place, that of a link from its joint, or else the farthest limit of
-    a slide; 1 m for a machine without any length.
+    Where all joints coincide: the largest distance of a link from its joint, else the largest
+    limit of a prismatic joint, else 1 m.
     """
     joints = (place.translation for place in list(model.jointPlacements)[1:])
     links = (frame.placement.translation for frame in model.frames)
@@ -74,14 +74,15 @@ def characteristic_length(model: pin.Model) -> float:
 
 
 def coordinate_units(model: pin.Model) -> Array:
-    """(nv,) units of coordinates that compare: 1 rad, and the size of the machine."""
+    """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length [m]."""
     return np.where(translational_coordinates(model), characteristic_length(model), 1.0)
 
 
 def motion_scales(model: pin.Model) -> Array:
-    """(nv,) ways of the joints that compare: their ranges, of at most 1 rad or the machine's size.
+    """(nv,) comparable displacements of the joints.
 
-    Those also stand for the ranges of joints without limits.
+    The range of a joint, at most 1 rad or the characteristic length; that bound for joints without
+    limits.
     """
     units_of_coordinates = coordinate_units(model)
     coordinates = Coordinates(model)
@@ -90,12 +91,12 @@ def motion_scales(model: pin.Model) -> Array:
 
 
 def null_space_basis(jacobian: Array, scales_of_motion: Array, tolerance: float) -> Array:
-    """N (nv, n): an orthonormal basis of the scaled motions that equations allow to first order.
+    """N (nv, n): orthonormal basis of the scaled motions that the equations allow to first order.
 
     Args:
         jacobian: (m, nv).
         scales_of_motion: (nv,).
-        tolerance: Singular values below this share of the largest count as zero.
+        tolerance: Singular values below this fraction of the largest one count as zero.
     """
     if not jacobian.size:
         return np.eye(len(scales_of_motion))
@@ -104,10 +105,10 @@ def null_space_basis(jacobian: Array, scales_of_motion: Array, tolerance: float)
 
 
 def condition_number(gamma: Array, scales_of_motion: Array, active: Indices) -> Array:
-    """Condition numbers of a drive.
+    """Condition numbers of a selection of active joints.
 
     Args:
-        gamma: (nv, n) or (N, nv, n) of closed postures.
+        gamma: (nv, n) or (N, nv, n), of closed configurations.
         scales_of_motion: (nv,), see `motion_scales`.
         active: (n,) columns of the active joints.
 
@@ -121,20 +122,20 @@ def condition_number(gamma: Array, scales_of_motion: Array, active: Indices) -> 
 def select_columns(
     basis: Array, candidates: Sequence[int], required: Sequence[int] = ()
 ) -> Indices | None:
-    """Joints of the largest |det N_A|, or near it.
+    """Select the joints A with (nearly) the largest |det N_A|.
 
-    A QR factorisation with column pivoting of N^T starts; then a chosen joint i gives way to any
-    other j that it moves by more than itself, |N N_A^-1|_ji > 1, which multiplies |det N_A| by
-    that (Goreinov and Tyrtyshnikov 2001). At the end no joint is moved by more than its scale when
-    one of the chosen ones moves by its own, so condition <= sqrt(1 + n (nv - n)).
+    Starts from a QR factorization of N^T with column pivoting. Then a selected joint i is
+    exchanged for the joint j with the largest |N N_A^-1|_ji > 1, which multiplies |det N_A| by
+    this factor (Goreinov and Tyrtyshnikov 2001). At the end no joint moves by more than its scale
+    when one selected joint moves by its own, so that condition number <= sqrt(1 + n (nv - n)).
 
     Args:
         basis: N (nv, n).
-        candidates: Columns to choose from.
-        required: Columns that are chosen in any case.
+        candidates: Columns to select from.
+        required: Columns that are selected in any case.
 
     Returns:
-        (n,) columns in ascending order; None where no choice drives the machine.
+        (n,) columns in ascending order; None if no selection drives the machine.
     """
     count = basis.shape[1]
     free = [i for i in candidates if i not in required]
@@ -143,7 +144,9 @@ def select_columns(
         if np.linalg.matrix_rank(basis[list(required)], DEAD_CENTRE_TOLERANCE) < len(required):
             return None
         _, _, right = np.linalg.svd(basis[list(required)])
-        rows = rows @ right[len(required) :].T  # what the kept ones leave free
+        rows = (
+            rows @ right[len(required) :].T
+        )  # motions that are left with the required joints held
     missing = count - len(required)
     if len(free) < missing:
         return None
@@ -163,7 +166,7 @@ def select_columns(
 
 
 def _pivot_rows(rows: Array, count: int) -> list[int]:
-    """Of a QR factorisation of rows^T with column pivoting."""
+    """Pivots of a QR factorization of rows^T with column pivoting."""
     remaining, found = rows.copy(), []
     for _ in range(count):
         sizes = np.linalg.norm(remaining, axis=1)
@@ -174,7 +177,7 @@ def _pivot_rows(rows: Array, count: int) -> list[int]:
 
 
 def _argmax_up_to_rounding(values: Array) -> int:
-    """Index of the largest, of equal ones the first: rounding does not choose."""
+    """Index of the largest value; the first one of values that differ by rounding only."""
     return int(np.argmax(values >= (1.0 - _ROUNDING_TOLERANCE) * values.max()))
 
 
@@ -185,20 +188,19 @@ def propose_active_joints(
     candidates: Sequence[int] | None = None,
     required: Sequence[int] = (),
 ) -> list[ActiveJointSelection]:
-    """Choices of active joints for a machine at a posture, at most two.
+    """Propose at most two selections of active joints at a configuration.
 
-    Actuators come first where their condition is below 100: joints that slide, and those whose
-    effort is limited; pins that only hold parts together usually have no limits. Those whose names
-    say that nothing drives them are left out if the others are enough. Second comes the
-    best-conditioned choice of any joints, or what is best without the joint of the first that the
-    others need least.
+    Actuators are preferred if their condition number is below 100: prismatic joints, and joints
+    with an effort limit. Joints whose name contains "passive" or "free" are only used if the
+    others do not suffice. The second proposal is the selection with the best condition number of
+    all joints, or the best one without that joint of the first proposal that is needed least.
 
     Args:
         model: The spanning tree.
         jacobian: (m, nv) of all loop equations.
-        coupled: Columns of joints that follow others by a coupling, which are taken last.
-        candidates: Columns to choose from; all if not given.
-        required: Columns that are chosen in any case.
+        coupled: Columns of joints in couplings, which are used last.
+        candidates: Columns to select from; all if not given.
+        required: Columns that are selected in any case.
     """
     scale = motion_scales(model)
     basis = null_space_basis(jacobian, scale, DEAD_CENTRE_TOLERANCE)
@@ -249,5 +251,5 @@ def propose_active_joints(
 
 
 def format_selections(selections: Sequence[ActiveJointSelection]) -> str:
-    """Choices as an error proposes them."""
+    """The selections as text for error messages."""
     return ", or ".join(str(choice) for choice in selections)

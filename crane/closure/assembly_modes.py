@@ -1,9 +1,9 @@
-"""Other assemblies: postures that close the loops at the same active coordinates.
+"""Assembly-mode search: other configurations that close the loops at the same active coordinates.
 
-Equations that solve one after the other (see `crane.closure.block_triangular_form`) have their
-alternatives one after the other, too: a triangle or a four-bar linkage has two, mirror images of
-each other. So each block is solved anew from starts all over its unknowns, with what was solved
-before it as at home; what comes after it follows, from where the guess has it.
+The blocks of equations (see `crane.closure.constraint_structure`) are solved one after another,
+and each has its own assembly modes: a triangle or a four-bar linkage has two, mirror images of
+each other. Each block is solved again from starting points over the range of its unknowns, with
+the blocks before it as at home; the blocks after it are solved from the initial guess.
 """
 
 import itertools
@@ -18,36 +18,36 @@ from crane.closure.constraint_structure import Indices
 from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
-from crane.closure.multi_start_search import MultiStartSearch
+from crane.closure.multi_start_search import MultiStartSearch, low_discrepancy_steps
 from crane.common.samples import Array, solve_linear
 from crane.common.threads import single_threaded_blas
 
-_CLOSED_TOLERANCE = 1e-9  # residual, in shares of the machine's size
-_SAME_CONFIGURATION_TOLERANCE = (
-    1e-3  # [rad], or share of the machine's size: postures that are not different
-)
-_MAX_STEP = 1.0  # the same, of an iteration at most
+_CLOSED_TOLERANCE = 1e-9  # scaled residual
+# [rad] or scaled: distance of equal configurations
+_SAME_CONFIGURATION_TOLERANCE = 1e-3
+_MAX_STEP = 1.0  # largest scaled step of an iteration
 _MAX_ITERATIONS = 15
-_CERTAIN_DEVIATION = 0.05  # the same, off the guess: other assemblies are farther
-_LARGE_DEVIATION = 0.5  # the same: a guess that is farther says little
+_CERTAIN_DEVIATION = 0.05  # scaled distance from the guess below which home is certain
+_LARGE_DEVIATION = 0.5  # scaled distance beyond which a guess is not decisive
 _DISTANCE_RATIO, _LOOSE_DISTANCE_RATIO = (
     2.0,
     5.0,
-)  # of distances from the guess, up to which it does not decide
-_STARTS_PER_UNKNOWN = 8  # for each unknown of a block
+)  # ratio of distances from the guess up to which it does not decide
+_STARTS_PER_UNKNOWN = 8  # starting points per unknown of a block
 
 
 @dataclass(frozen=True)
 class AssemblyMode:
-    """Another way to assemble a machine, which the guess does not rule out.
+    """Another assembly mode of a machine that the initial guess does not rule out.
 
     Attributes:
-        q: (nq,) the posture.
-        loops: Names of the loops that are assembled the other way.
-        changed_columns: Joints that are elsewhere than at home.
-        largest_deviation: The joint that is farthest from the guess, and by how much [m], [rad].
-        home_deviation: The same of the home posture.
-        home_outside_limits: Whether the home posture is outside of limits that this one keeps.
+        q: (nq,) configuration.
+        loops: Names of the loops that are assembled differently.
+        changed_columns: Columns of the joints whose coordinates differ from home.
+        largest_deviation: Column of the joint farthest from the guess, and its distance [m],
+            [rad].
+        home_deviation: The same for the home configuration.
+        home_outside_limits: Whether home violates joint limits that this configuration satisfies.
     """
 
     q: Array
@@ -61,19 +61,18 @@ class AssemblyMode:
 def find_alternative_assembly_modes(
     closure: Closure, initial_guess: Array, specified: Indices, max_starts: int
 ) -> list[AssemblyMode]:
-    """Assemblies that a guess leaves open, at most one for each block of equations.
+    """Find assembly modes that the initial guess does not rule out, at most one per block.
 
-    Distances from the guess are compared at the joints that differ from home, at those that the
-    file names if it names one of them. An assembly is told where it is less than twice as far as
-    home; five times where none is named, or home is 0.5 rad off; or where it keeps limits that
-    home does not.
+    Distances from the guess are compared over the joints that differ from home, or over those of
+    them that the file specifies, if any. An assembly mode is returned if its distance is less than
+    twice that of home; less than five times if no joint is specified or home is 0.5 rad from the
+    guess; or if it satisfies joint limits that home violates.
 
     Args:
         closure: The loops, closed at home.
-        initial_guess: (nq,) what they were closed from.
-        specified: Columns for which it is the file that says so.
-        max_starts: Starts in one block, which bounds the work; an assembly that is not found from
-            there is not told.
+        initial_guess: (nq,) initial guess of the home configuration.
+        specified: Columns whose value in the guess comes from the file.
+        max_starts: Number of starting points per block, which bounds the work.
     """
     with single_threaded_blas(closure.model.nv):
         return _find_alternatives(
@@ -129,7 +128,7 @@ class _AssemblyModeSearch:
         self._massless = not any(inertia.mass > 0 for inertia in list(self.model.inertias)[1:])
 
     def coordinate_differences(self, first: Array, second: Array) -> Array:
-        """(nq,) how far apart two postures are, in units of 1 rad or the machine's size."""
+        """(nq,) distances of two configurations by coordinate, in units of 1 rad or `length`."""
         difference = first - second
         angle_difference = np.remainder(difference + np.pi, 2 * np.pi) - np.pi
         return np.asarray(
@@ -141,20 +140,20 @@ class _AssemblyModeSearch:
         )
 
     def distance_from_guess(self, q: Array, columns: Indices) -> float:
-        """How far some joints are from the guess."""
+        """Largest distance of some joints from the guess."""
         return float(self.coordinate_differences(q, self.guess)[columns].max(initial=0.0))
 
     def specified_among(self, columns: Indices) -> Indices:
-        """Those of some joints that the file names; all where it names none."""
+        """Those of some columns that the file specifies; all of them if it specifies none."""
         specified = columns[np.isin(columns, self.specified_columns)]
         return specified if len(specified) else columns
 
     def are_within_limits(self, q: Array, columns: Indices) -> bool:
-        """Whether some joints are."""
+        """Whether some joints are within their limits."""
         return bool(within_limits(self.equations, q)[columns].all())
 
     def find_block_solutions(self, block: int, max_starts: int) -> list[Array]:
-        """Solutions of a block with what is before it as at home, without that of home."""
+        """Solutions of a block other than home's, with the blocks before it as at home."""
         rows, columns = self._block_indices(block)
         found = [self.home]
         sign = self._determinant_sign(self.home, rows, columns)
@@ -172,17 +171,17 @@ class _AssemblyModeSearch:
                 continue
             found.append(q)
             if two_solutions and self._determinant_sign(q, rows, columns) != sign:
-                break  # mirror images, of which there are two
+                break  # mirror images: there are no others
         return found[1:]
 
     def passive_groups(self) -> list[Indices]:
-        """Columns of passive joints that loops tie together, directly or through others."""
+        """Columns of passive joints that loops connect, directly or through others."""
         passive = self.closure.passive
         group, group_of_row = self.equations.coupled_groups(passive)
         return [passive[group == i] for i in np.unique(group_of_row[group_of_row >= 0])]
 
     def independent_rows_of(self, columns: Indices) -> Indices:
-        """Independent rows of the loops that some joints are in."""
+        """Independent rows of the loops that contain some joints."""
         involved = (
             np.vstack([self.equations.sign, self.equations.coupling_factors])[:, columns] != 0
         ).any(1)
@@ -190,7 +189,7 @@ class _AssemblyModeSearch:
         return rows[involved[self.equations.loop_of_row[rows]]]
 
     def find_group_solutions(self, columns: Indices, max_starts: int) -> list[Array]:
-        """Closed postures with all joints but some as at home, the nearest to the guess first."""
+        """Closed configurations with all other joints as at home, nearest to the guess first."""
         initial_guess = self.home.copy()
         initial_guess[columns] = self.guess[columns]
         rows = self.independent_rows_of(columns)
@@ -204,7 +203,7 @@ class _AssemblyModeSearch:
         return [q for q in closed if q is not None]
 
     def _equations_of_rows(self, rows: Indices) -> tuple[LoopEquations, Indices]:
-        """The equations of the loops that some rows belong to alone, and these rows in them."""
+        """Equations of the loops that contain some rows, and the indices of the rows in them."""
         loop_of_row = self.equations.loop_of_row
         loop_indices = tuple(np.unique(loop_of_row[rows]).tolist())
         if loop_indices not in self._loop_subsets:
@@ -220,13 +219,13 @@ class _AssemblyModeSearch:
         return self.closure.structure.independent_rows[rows], self.closure.passive[columns]
 
     def _is_dyad(self, block: int) -> bool:
-        """Whether a block is about translations of one loop: two circles or lines that cross."""
+        """Whether a block has translations of one loop only: circles or lines that intersect."""
         rows, _ = self._block_indices(block)
         loops = set(self.equations.loop_of_row[rows].tolist())
         return len(loops) == 1 and bool(self.equations.is_translation[rows].all())
 
     def _starts_across_home(self, rows: Indices, columns: Indices) -> Array:
-        """(4, nq) postures on both sides of home, where its equations determine least."""
+        """(4, nq) configurations on both sides of home, along the least determined direction."""
         jacobian = self.equations.evaluate_scaled(self.home)[1][np.ix_(rows, columns)]
         least_determined_direction = np.linalg.svd(jacobian)[2][-1]
         out = np.tile(self.home, (4, 1))
@@ -236,16 +235,11 @@ class _AssemblyModeSearch:
         return out
 
     def _starting_points(self, columns: Indices, count: int) -> Array:
-        """(count, nq) postures all over the unknowns: a low-discrepancy sequence about the guess.
+        """(count, nq) configurations of a low-discrepancy sequence around the guess.
 
-        Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018),
-        over a turn, the limits of a slide, or the machine's size.
+        They cover one revolution, the limits of a prismatic joint, or the characteristic length.
         """
-        size = len(columns)
-        phi = 2.0
-        for _ in range(40):
-            phi = (1 + phi) ** (1 / (size + 1))
-        fractions = np.outer(np.arange(count), phi ** -np.arange(1.0, size + 1)) + 0.5
+        fractions = np.outer(np.arange(count), low_discrepancy_steps(len(columns))) + 0.5
         fractions = np.remainder(fractions, 1.0) - 0.5
         coordinates = self.equations.coordinates
         lower, upper = coordinates.lower, coordinates.upper
@@ -261,11 +255,11 @@ class _AssemblyModeSearch:
     def _solve_newton(
         self, q: Array, rows: Indices, columns: Indices, known_solutions: Sequence[Array] = ()
     ) -> Array | None:
-        """Newton's method on some rows for some columns, None where it does not converge.
+        """Newton's method for some rows and columns; None where it does not converge.
 
-        Solutions that are known are deflated (Farrell, Birkisson, Funke 2015): for m phi instead
-        of phi, m = prod 1 / r^2 + 1 with r the distance from one of them, it is the Newton step d
-        divided by 1 - (grad m . d) / m, which turns round near them.
+        Known solutions are deflated (Farrell, Birkisson, Funke 2015): for m phi instead of phi,
+        with m = prod 1 / r^2 + 1 and the distance r from a known solution, the Newton step d is
+        divided by 1 - (grad m . d) / m, which turns it around near known solutions.
         """
         q = q.copy()
         equations, rows = self._equations_of_rows(rows)
@@ -303,7 +297,7 @@ class _AssemblyModeSearch:
         return float(np.linalg.slogdet(jacobian)[0])
 
     def _block_solutions_from_guesses(self, q: Array, block: int) -> list[Array]:
-        """Solutions of a block with all else as it is, from where it was guessed and at home."""
+        """Solutions of a block with all else fixed, started from the guess and from home."""
         rows, columns = self._block_indices(block)
         found = []
         for start in (self.guess, self.home):
@@ -314,7 +308,7 @@ class _AssemblyModeSearch:
         return found
 
     def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
-        """An assembly with a block elsewhere, None where it is none or the guess rules it out."""
+        """The assembly mode with another solution of a block, or None."""
         for later_block in range(block + 1, len(self.blocks)):
             solutions, (_, columns) = (
                 self._block_solutions_from_guesses(q, later_block),
@@ -326,7 +320,7 @@ class _AssemblyModeSearch:
         return self.assess_assembly_mode(q, self._block_indices(block)[0])
 
     def assess_assembly_mode(self, q: Array, rows: Indices) -> AssemblyMode | None:
-        """Likewise of a whole posture, in which some rows are solved another way."""
+        """The assembly mode of a configuration that solves some rows differently, or None."""
         passive = self.closure.passive
         if (
             np.abs(self.equations.evaluate_scaled(q)[0]).max()
@@ -370,12 +364,12 @@ class _AssemblyModeSearch:
         return column, float(differences.max() * self._coordinate_units[column])
 
     def is_same_for_masses(self, first: Array, second: Array) -> bool:
-        """Whether all that has a mass is in one place in both: other angles of a ball, say."""
+        """Whether all bodies with mass have the same poses in two configurations."""
         difference = np.abs(self._placements_of_masses(first) - self._placements_of_masses(second))
         return bool(difference.max(initial=0.0) < _SAME_CONFIGURATION_TOLERANCE)
 
     def _placements_of_masses(self, q: Array) -> Array:
-        """Rotations and origins (b, 3, 4) of the bodies that have a mass."""
+        """Rotations and scaled origins (b, 3, 4) of the bodies with mass."""
         key = q.tobytes()
         if key not in self._body_placements:
             data = self.equations.data

@@ -1,8 +1,12 @@
-"""Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
+"""`Closure`: solves the loops of a machine, q = f(q_A), v = gamma v_A, a = gamma a_A + drift.
+
+A loop is closed by Newton's method in `NewtonContinuation.solve_newton`
+(`crane.closure.newton_continuation`), and in machine code by the routine "close" of
+`crane.closure.closure_routines`.
+"""
 
 import copy
 import dataclasses
-import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import Any
@@ -16,42 +20,29 @@ from crane.closure.active_joint_selection import (
     condition_number,
     propose_active_joints,
 )
+from crane.closure.branch_solver import BranchSolver
 from crane.closure.compiled_closure import CompiledClosure, ContinuationCursor
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import (
     CLOSED_TOLERANCE,
     ExactConstraints,
-    RedundancyGap,
     RoundedConstraints,
 )
-from crane.closure.home_search import HomeSearchResult, find_home
+from crane.closure.home_search import HomeSearchResult, find_cached_home
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.motion_continuation import follow_motion
-from crane.closure.newton_continuation import NewtonContinuation
-from crane.codegen import FormulaTooLongError, cached_result, run_with_fallback
+from crane.codegen import FormulaTooLongError
 from crane.common.errors import (
     InputError,
     MechanismError,
-    SingularConfigurationError,
-    WrongBranchError,
 )
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, apply_per_sample, as_samples, solve_linear
-from crane.common.threads import single_threaded_blas
+from crane.common.samples import Array, apply_per_sample, as_samples
 from crane.description import Coupling, LoopSpec
 
-_MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = (
-    100,
-    0.1,
-)  # samples worth sorting: how many, how far apart as a share of the range
-_SAME_CONFIGURATION_TOLERANCE = (
-    1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
-)
-_MIN_SINGULAR_VALUE_SHARE = (
-    0.1  # share of the least singular value of all equations that independent ones keep
-)
-_CONTINUATION_STEPS = 8  # from home to a target that is far from the one before it
+# least singular value of the independent equations over that of all, for the same coordinates
+_MIN_SINGULAR_VALUE_SHARE = 0.1
 
 
 class Closure(OneLineRepr):
@@ -60,7 +51,7 @@ class Closure(OneLineRepr):
     Park, Choi, Ploen (1999); equations (3) and (4) of the reduced-scale forwarder paper, for any
     machine. With J = dphi/dq split into active and passive columns and independent rows,
 
-        q = f(q_A)                 phi(q) = 0, on the assembly branch of the home posture
+        q = f(q_A)                 phi(q) = 0, on the branch of the home configuration
         gamma = df/dq_A            rows of active joints: identity; passive: -J_P^-1 J_A
         drift = gammadot v_A       rows of active joints: zero; passive: -J_P^-1 (Jdot v)
 
@@ -68,34 +59,25 @@ class Closure(OneLineRepr):
         model: The spanning tree.
         loops: The loops that close it.
         active: Names of the active joints, in the order of q_A.
-        initial_guess: (nq,) active coordinates of the home posture, and a first guess of the
-            others.
+        initial_guess: (nq,) active coordinates of the home configuration, and an initial guess of
+            the others.
         couplings: Linear constraints of joints.
-        specified: Names of joints whose home is said to be that of the guess; where the loops do
-            not close from the guess, the others are sought. None: all are said, and none is
-            sought.
-        movable: Names of active joints that nothing holds at the guess while the others are
-            sought.
-        keep_revolutions: Whether pins keep the whole turns of the guess, which else are taken out.
+        specified: Names of joints whose home coordinate the file specifies. Where the loops do not
+            close from the guess, home is searched for with the other joints. None: no search.
+        movable: Names of active joints that may move during this search.
+        keep_revolutions: Whether the full revolutions of the guess are kept; removed if not.
 
     Raises:
         MechanismError: The loops cannot be closed, or the active joints do not fit the degrees of
             freedom.
 
     Attributes:
-        home: (nq,) the closed home posture.
-        initial_guess: (nq,) what it was closed from.
-        specified: Columns for which it is the file that says so.
+        home: (nq,) closed home configuration.
+        initial_guess: (nq,) configuration from which it was closed.
+        specified_columns: Columns whose home coordinate the file specifies.
         active: Columns of the active joints.
         passive: Columns of the passive joints.
-        structure: Independent equations and the order in which they solve.
-        characteristic_length: Of the machine [m], see
-            `crane.closure.active_joint_selection.characteristic_length`.
-        coordinate_units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size
-            [m].
-        characteristic_time: Unit of time [s] of what moves by its weight, 1 s for a machine of 1
-            m: motions of similar machines in the same gravity take times like the roots of their
-            sizes (Froude).
+        structure: Independent equations and the order in which they are solved.
         home_search: How home was found where it did not follow from the guess, else None.
     """
 
@@ -118,12 +100,6 @@ class Closure(OneLineRepr):
     ):
         self.model = model
         self.equations = LoopEquations(model, loops, couplings)
-        self.characteristic_length, self.units = (
-            self.equations.characteristic_length,
-            self.equations.coordinate_units,
-        )
-        self.characteristic_time = float(np.sqrt(self.characteristic_length))
-        self._thread_local = threading.local()
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
@@ -135,72 +111,52 @@ class Closure(OneLineRepr):
 
         self.initial_guess = initial_guess
         self.specified_columns = np.array(sorted(columns(specified or ())), dtype=np.intp)
-        where = None if specified is None else columns(specified), columns(movable)
-        self.structure, self.home_search = self._find_home(*where)
+        self.structure, self.home_search = find_cached_home(
+            self.equations,
+            self.active,
+            self.passive,
+            initial_guess,
+            None if specified is None else columns(specified),
+            columns(movable),
+        )
         if keep_revolutions:
             revolutions = np.round((initial_guess - self.structure.home) / (2 * np.pi))
             revolutions[coordinates.is_translation] = 0.0
             home = self.structure.home + 2 * np.pi * revolutions
             self.structure = dataclasses.replace(self.structure, home=home)
-        ranges = (coordinates.upper - coordinates.lower)[self.active]
-        limited = np.isfinite(ranges) & (ranges > 0)
-        self._active_ranges = np.where(
-            limited, ranges, self.equations.coordinate_units[self.active]
-        )
-        self._continuation = NewtonContinuation(
-            self.equations,
-            self.structure,
-            self._names,
-            self.active,
-            self.passive,
-            self._active_ranges,
-        )
-        self.home = self._continuation.home.q.copy()
+        self._start_solver()
+
+    def _start_solver(self, with_machine_code: bool = True) -> None:
+        """Close home, from which the branch is followed."""
+        parts = self.equations, self.structure, self.active, self.passive
+        self._solver = BranchSolver(*parts, with_machine_code)
+        self.home = self._solver.continuation.home.q.copy()
         self.home.flags.writeable = False
 
-    def _find_home(
-        self, specified: list[int] | None, movable: list[int]
-    ) -> tuple[ConstraintStructure, HomeSearchResult | None]:
-        def find() -> tuple[ConstraintStructure, HomeSearchResult | None]:
-            import scipy.linalg  # noqa: F401 - which brings a library of its own
+    @property
+    def characteristic_length(self) -> float:
+        """Characteristic length of the machine [m]."""
+        return self.equations.characteristic_length
 
-            with single_threaded_blas(self.model.nv):
-                return find_home(
-                    self.equations,
-                    self.active,
-                    self.passive,
-                    self.initial_guess,
-                    specified,
-                    movable,
-                )
+    @property
+    def characteristic_time(self) -> float:
+        """Characteristic time [s] of motions under gravity, 1 s for a machine of 1 m.
 
-        if not self.equations.names:
-            return find_home(
-                self.equations, self.active, self.passive, self.initial_guess, specified, movable
-            )
-        specified_key = None if specified is None else tuple(specified)
-        depends = (self.cache_key, self.active, self.initial_guess, specified_key, tuple(movable))
-        return cached_result(
-            ("home", depends),
-            find,
-            "scipy.linalg",
-            (ConstraintStructure, RedundancyGap, HomeSearchResult),
-        )
+        Times of similar machines scale with the square root of the length (Froude).
+        """
+        return float(np.sqrt(self.characteristic_length))
+
+    @property
+    def units(self) -> Array:
+        """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length."""
+        return self.equations.coordinate_units
 
     @property
     def cache_key(self) -> tuple[Any, ...]:
-        """All that its equations are made of, see `crane.codegen.cached_result`."""
-        loops = tuple(
-            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
-            for x in self.equations.loops
-        )
-        couplings = tuple(
-            (x.name, tuple(x.factors.items()), x.offset) for x in self.equations.couplings
-        )
-        return self.model.saveToString(), loops, couplings
+        """Everything that the equations depend on, see `crane.codegen.cached_result`."""
+        return self.equations.cache_key
 
     def _one_line(self) -> str:
-        """Its loops, and what drives them."""
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
         return (
             f"Closure of {loops}: {len(self.passive)} passive joints from "
@@ -210,7 +166,7 @@ class Closure(OneLineRepr):
     def with_other_masses(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure | None":
-        """This closure, of a tree that differs in masses alone; None where more differs.
+        """This closure for a tree that differs in masses only; None if it differs in more.
 
         Args:
             model: The tree, of the same structure.
@@ -220,15 +176,15 @@ class Closure(OneLineRepr):
         if not _has_same_geometry(LoopEquations(model, loops, couplings), self.equations):
             return None
         other = copy.copy(self)
-        other._thread_local = threading.local()  # where a thread begins is no one else's
+        other._solver = self._solver.with_new_cursors()
         return other
 
     def with_perturbed_model(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure":
-        """The closure of a tree whose numbers differ little, by its structure and on its branch.
+        """The closure of a slightly different tree, with this structure and on this branch.
 
-        A look at a machine beside this one: it has no machine code of its own.
+        It is used for finite differences and has no machine code.
 
         Args:
             model: The tree.
@@ -236,45 +192,29 @@ class Closure(OneLineRepr):
             couplings: Its couplings.
 
         Raises:
-            MechanismError: The loops do not close there, or lock up.
+            MechanismError: The loops do not close there, or lock.
         """
         equations = LoopEquations(model, loops, couplings)
         if _has_same_geometry(equations, self.equations):
             return self
         other = copy.copy(self)
-        other.model, other.equations, other._thread_local = model, equations, threading.local()
-        other.characteristic_length, other.units = (
-            equations.characteristic_length,
-            equations.coordinate_units,
-        )
-        other.characteristic_time = float(np.sqrt(other.characteristic_length))
-        other.__dict__["_optional_compiled_closure"] = None
-        other._continuation = NewtonContinuation(
-            equations, self.structure, self._names, self.active, self.passive, self._active_ranges
-        )
-        other.home = other._continuation.home.q.copy()
-        other.home.flags.writeable = False
-        exact = (
-            ExactConstraints
-            if self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
-            else RoundedConstraints
-        )(equations)
+        other.model, other.equations = model, equations
+        other._start_solver(with_machine_code=False)
         rows = self.structure.independent_rows, self.structure.redundant_rows
-        if (
-            not exact.is_closed(other.home)
-            or exact.assess_redundancy(other.home, *rows, self.active)[0]
-        ):
+        constraints = other._constraints
+        lock, _ = constraints.assess_redundancy(other.home, *rows, self.active)
+        if not constraints.is_closed(other.home) or lock:
             raise MechanismError("the loops do not close there, or lock up")
         return other
 
     def with_home_configuration(self, q: Array) -> "Closure | None":
-        """The same coordinates on the branch of another closed posture.
+        """The same coordinates on the branch of another closed configuration.
 
         Args:
-            q: (nq,) its home, whose whole turns stay.
+            q: (nq,) the other home configuration, whose full revolutions are kept.
 
         Returns:
-            None where other independent equations determine the passive joints better there.
+            None where other independent equations determine the passive joints much better.
 
         Raises:
             MechanismError: The loops do not close there.
@@ -287,143 +227,90 @@ class Closure(OneLineRepr):
         if not least > _MIN_SINGULAR_VALUE_SHARE * best:
             return None
         other = copy.copy(self)
-        other._thread_local, other.home_search, other.initial_guess = threading.local(), None, q
-        other.__dict__.pop("_optional_compiled_closure", None)
+        other.home_search, other.initial_guess = None, q
         other.structure = dataclasses.replace(self.structure, home=q)
-        other._continuation = NewtonContinuation(
-            self.equations,
-            other.structure,
-            self._names,
-            self.active,
-            self.passive,
-            self._active_ranges,
-        )
-        other.home = other._continuation.home.q.copy()
-        other.home.flags.writeable = False
-        exact = (
-            ExactConstraints
-            if self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
-            else RoundedConstraints
-        )(self.equations)
-        if not exact.is_closed(other.home):
+        other._start_solver()
+        if not other._constraints.is_closed(other.home):
             raise MechanismError("the loops do not close there")
         return other
 
-    @cached_property
-    def _optional_compiled_closure(self) -> CompiledClosure | None:
-        branch = self._continuation
-        try:
-            return CompiledClosure(
-                self.equations,
-                self.structure,
-                self.active,
-                self.passive,
-                branch.home,
-                branch.rounding_scale(branch.home.q),
-            )
-        except FormulaTooLongError:
-            return None
+    @property
+    def _constraints(self) -> ExactConstraints:
+        is_exact = self.structure.redundancy.tolerance <= CLOSED_TOLERANCE
+        return (ExactConstraints if is_exact else RoundedConstraints)(self.equations)
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is machine code for these loops."""
-        return self._optional_compiled_closure is not None
+        """Whether the loops are solved by machine code."""
+        return self._solver.compiled_closure is not None
 
     @property
     def compiled_closure(self) -> CompiledClosure:
-        """Machine code for these loops, made when it is first needed.
+        """Machine code of the loops, compiled on first use.
 
         Raises:
-            TooLongError: The machine is too large for it.
+            FormulaTooLongError: The machine is too large for it.
         """
-        if self._optional_compiled_closure is None:
+        if self._solver.compiled_closure is None:
             raise FormulaTooLongError
-        return self._optional_compiled_closure
-
-    @property
-    def _cursor(self) -> ContinuationCursor:
-        """This thread's cursor."""
-        try:
-            return self._thread_local.cursor
-        except AttributeError:
-            self._thread_local.cursor = self.compiled_closure.new_cursor()
-            return self._thread_local.cursor
+        return self._solver.compiled_closure
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Number of active joints n."""
+        """Number n of active joints."""
         return len(self.active)
 
     def solve(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
         """Close the loops: q = f(q_A), equation (3) of the reduced-scale forwarder paper.
 
-        Newton's method from the last posture this thread solved (or the guess), in one step where
-        that follows the branch; else from home, along the straight line of q_A, in steps that are
-        halved whenever Newton hesitates or would change the assembly branch. A stack is tracked
-        like a path; one of far samples is sorted for that. The result is closed to rounding, on
-        the home posture's branch whatever was solved before, or an error is raised.
+        Newton's method starts from the last configuration that this thread solved (or the guess),
+        in one step where that stays on the branch; else from home, along the straight line of q_A,
+        in steps that are halved where Newton's method converges slowly or would leave the branch.
+        A stack is followed like a path; a stack of distant samples is sorted first. The result is
+        closed to rounding and on the branch of home, independently of earlier calls, or an error
+        is raised.
 
         Args:
             q_a: (n,) or (N, n) active coordinates [m], [rad]. Limits are not checked here.
-            initial_guess: (nq,) posture to start from, on the home posture's branch.
+            initial_guess: (nq,) configuration to start from, on the branch of home.
 
         Returns:
             q, (nq,) or (N, nq).
 
         Raises:
             InputError: Wrong shape or not finite.
-            OutOfReachError: No posture closes the loops.
-            BranchEdgeError: The passive joints are not determined there.
+            OutOfReachError: No configuration closes the loops.
+            SingularConfigurationError: The passive joints are not determined there.
             WrongBranchError: The guess belongs to another branch.
         """
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
-        guessed_configuration = None
+        guess = None
         if initial_guess is not None:
-            guessed_configuration = as_samples(initial_guess, self.model.nv, "guess", self._names)
-            if guessed_configuration.ndim != 1:
-                raise InputError(
-                    f"guess has the shape {guessed_configuration.shape}, give one "
-                    f"({self.model.nv},)"
-                )
-            if self.is_compiled and not self.compiled_closure.start_cursor_at(
-                self._cursor, guessed_configuration
-            ):
-                self._cursor.start_from(
-                    self._continuation.nearest_closed_configuration(guessed_configuration)
-                )
+            guess = as_samples(initial_guess, self.model.nv, "guess", self._names)
+            if guess.ndim != 1:
+                raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
         out = np.empty((*targets.shape[:-1], self.model.nv))
-        if not self.is_compiled:
-            known = (
-                self._continuation.home
-                if guessed_configuration is None
-                else self._continuation.nearest_closed_configuration(guessed_configuration)
-            )
-            for i, target in enumerate(np.atleast_2d(targets)):
-                sample = f" (sample {i})" if targets.ndim == 2 else ""
-                known = self._continuation.continue_to(target, known, sample)
-                out[(i,) if targets.ndim == 2 else ()] = known.q
-            return out
-        self._solve_stack(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
+        self._solver.solve(np.atleast_2d(targets), guess, targets.ndim == 2, np.atleast_2d(out))
         return out
 
     def follow_motion(self, q_a: ArrayLike, initial_guess: ArrayLike | None = None) -> Array:
-        """Closed postures along a recorded motion, also behind its dead centres.
+        """Closed configurations along a recorded motion, also beyond dead centres.
 
-        `solve` keeps to the branch of home. A motion that passes a dead centre of its active
-        joints leaves it, while q_A turns and comes back; here postures go on as the motion does.
+        `solve` keeps to the branch of home. A motion through a dead centre of its active joints
+        leaves this branch, while q_A turns back; here the configurations continue with the motion.
 
         Args:
-            q_a: (N, n) active coordinates, from sample to sample as dense as the motion is smooth.
-            initial_guess: (nq,) near the first posture; home if not given.
+            q_a: (N, n) active coordinates, sampled densely enough to extrapolate.
+            initial_guess: (nq,) near the first configuration; home if not given.
 
         Returns:
             (N, nq).
 
         Raises:
             InputError: Wrong shape or not finite.
-            ClosureError: The loops do not close, or the motion does not go on.
+            ClosureError: The loops do not close, or the motion does not continue to a sample.
         """
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.ndim != 2 or not len(targets):
@@ -433,124 +320,53 @@ class Closure(OneLineRepr):
             self.equations, self.active, self.equations.motion_scales, targets, first
         )
 
-    def _solve_stack(self, targets: Array, out: Array, stacked: bool) -> None:
-        """Close the loops at targets (N, n) into out (N, nq)."""
-        order = self._sort_samples(targets) if len(targets) > _MIN_SAMPLES_TO_SORT else None
-        sorted_targets = np.ascontiguousarray(targets if order is None else targets[order])
-        closed = out if order is None else np.empty_like(out)
-
-        def continue_from_home(i: int) -> None:
-            sample = f" (sample {i if order is None else order[i]})" if stacked else ""
-            closed[i] = self.continue_from_home(self._cursor, sorted_targets[i], sample)
-
-        run_with_fallback(
-            len(targets),
-            lambda i, _: self.compiled_closure.follow_targets(
-                self._cursor, sorted_targets[i:], closed[i:]
-            ),
-            continue_from_home,
-        )
-        if order is not None:
-            out[order] = closed
-
-    def _sort_samples(self, targets: Array) -> NDArray[np.intp] | None:
-        """An order of far samples in which neighbours are near; None for what is a path already.
-
-        Cells of all coordinates but one, along the last one within a cell. Coordinates that move
-        no passive joint do not count.
-        """
-        moves_passive_joints = (
-            np.abs(self._continuation.home.passive_gamma).max(axis=0, initial=0.0) > 0
-        )
-        scaled = (targets / self._active_ranges)[:, moves_passive_joints]
-        if (
-            not scaled.size
-            or np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE
-        ):
-            return None
-        cells = np.floor(scaled * len(targets) ** (1 / scaled.shape[1]))
-        order: NDArray[np.intp] = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
-        return order
-
     def is_on_branch(self, q: Array) -> bool:
-        """Whether a closed posture (nq,) lies on the assembly branch of home."""
-        if self.is_compiled:
-            return self.compiled_closure.start_cursor_at(self._cursor, q)
-        try:
-            solution = self._continuation.nearest_closed_configuration(q)
-        except WrongBranchError:
-            return False
-        return bool(np.abs((solution.q - q) / self.units).max() < _SAME_CONFIGURATION_TOLERANCE)
+        """Whether a closed configuration (nq,) lies on the branch of home."""
+        return self._solver.is_on_branch(q)
 
     def continue_from_home(
         self, cursor: ContinuationCursor, target: Array, sample: str = ""
     ) -> Array:
-        """The posture at a target that is too far for one step, where the cursor is left.
+        """Close the loops at a target that is too far for one step, and move the cursor there.
 
-        In several steps from home, or as `NewtonContinuation` can.
+        In several steps from home, or else by `NewtonContinuation`.
 
         Args:
-            cursor: Where to go on from afterwards.
+            cursor: Cursor to move.
             target: (n,).
-            sample: What to call the target in errors.
+            sample: Name of the target in errors.
 
         Returns:
             q (nq,).
         """
-        home = self._continuation.home
-        line = home.q_a + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (
-            target - home.q_a
-        )
-        line[-1] = target
-        out = np.empty((_CONTINUATION_STEPS, self.model.nv))
-        for waypoints in (line[-1:], line[1::2], line):
-            cursor.start_from(home)
-            if self.compiled_closure.follow_targets(cursor, waypoints, out) == len(waypoints):
-                return out[len(waypoints) - 1]
-        solution = self._continuation.continue_to(target, home, sample)
-        cursor.start_from(solution)
-        return solution.q
+        return self._solver.continue_from_home(self.compiled_closure, cursor, target, sample)
 
     def gamma(self, q: ArrayLike) -> Array:
         """Derivative of f, equation (4) of the reduced-scale forwarder paper.
 
         Args:
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
 
         Returns:
             gamma, (nv, n) or (N, nv, n): v = gamma v_A.
 
         Raises:
             InputError: Wrong shape or not finite.
-            BranchEdgeError: The passive joints are not determined there.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
-        if not self.is_compiled:
-            return apply_per_sample(self._gamma_of_sample, q)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")
         rows = np.atleast_2d(np.ascontiguousarray(q))
         out = np.empty((len(rows), self.model.nv, len(self.active)))
-
-        def pivoted(i: int) -> None:  # what looks singular
-            try:
-                out[i] = self._gamma_of_sample(rows[i])
-            except SingularConfigurationError as error:
-                sample = f" (sample {i})" if q.ndim == 2 else ""
-                raise SingularConfigurationError(f"{error}{sample}") from None
-
-        run_with_fallback(
-            len(rows),
-            lambda i, _: self.compiled_closure.evaluate_gamma(rows[i:], out[i:]),
-            pivoted,
-        )
+        self._solver.gamma(rows, q.ndim == 2, out)
         return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Acceleration of the tree at a_A = 0: drift = gammadot v_A, a = gamma a_A + drift.
+        """Accelerations of the joints at a_A = 0: drift = gammadot v_A, a = gamma a_A + drift.
 
         Args:
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
             v: (nv,) or (N, nv) velocities v = gamma v_A.
 
         Returns:
@@ -558,14 +374,14 @@ class Closure(OneLineRepr):
 
         Raises:
             InputError: Wrong shape or not finite.
-            BranchEdgeError: The passive joints are not determined there.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         q = as_samples(q, self.model.nv, "q", self._names)
         v = as_samples(v, self.model.nv, "v", self._names)
-        return apply_per_sample(self._drift_of_sample, q, v)
+        return apply_per_sample(self._solver.continuation.drift, q, v)
 
     def residual(self, q: ArrayLike) -> Array:
-        """Largest absolute residual of all loop equations, redundant ones too.
+        """Largest absolute residual of all loop equations, redundant ones included.
 
         Args:
             q: (nq,) or (N, nq).
@@ -579,13 +395,13 @@ class Closure(OneLineRepr):
         )
 
     def condition_number(self, q: ArrayLike) -> Array:
-        """How well the active joints drive the machine: ||D^-1 gamma D_A||_2, D = diag(scales).
+        """Condition number of the active joints: ||D^-1 gamma D_A||_2, D = diag(scales).
 
-        1 where no other joint moves, infinite where the branch ends; see
+        1 where no other joint moves, infinite at the end of the branch; see
         `crane.closure.active_joint_selection`.
 
         Args:
-            q: (nq,) or (N, nq) closed postures.
+            q: (nq,) or (N, nq) closed configurations.
 
         Returns:
             () or (N,).
@@ -594,74 +410,27 @@ class Closure(OneLineRepr):
 
     @cached_property
     def proposed_active_joints(self) -> list[ActiveJointSelection]:
-        """Possible choices of active joints at home, see `active_joint_selection`."""
+        """Possible selections of active joints at home, see `active_joint_selection`."""
         coupled = np.flatnonzero((self.equations.coupling_factors != 0).any(axis=0)).tolist()
-        rows = (
-            self.structure.independent_rows
-        )  # the others contradict them by the digits of a file
+        rows = self.structure.independent_rows  # the others contradict these by the file precision
         jacobian = self.equations.evaluate(self.home)[1] / self.equations.residual_units[:, None]
         return propose_active_joints(self.model, jacobian[rows], coupled)
 
     def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
-        """gamma, v = gamma v_A and drift of one sample, at less cost than one by one.
+        """gamma, v = gamma v_A and drift of one sample in one evaluation.
 
         Args:
-            q: (nq,) closed posture.
+            q: (nq,) closed configuration.
             v_a: (n,) [m/s], [rad/s].
 
         Returns:
             (nv, n), (nv,), (nv,).
         """
-        jacobian = self.equations.evaluate_scaled(q)[1][self.structure.independent_rows]
-        gamma = self._insert_passive_gamma(self._passive_gamma(jacobian, q))
-        v = gamma @ v_a
-        return gamma, v, self._drift_from_jacobian(jacobian, q, v)
-
-    def _gamma_of_sample(self, q: Array) -> Array:
-        return self._insert_passive_gamma(
-            self._passive_gamma(
-                self.equations.evaluate_scaled(q)[1][self.structure.independent_rows], q
-            )
-        )
-
-    def _passive_gamma(self, jacobian: Array, q: Array) -> Array:
-        """(passive, n) of gamma, from a Jacobian in shares of the machine's size."""
-        rows = self._solve_passive(jacobian, jacobian[:, self.active], q)
-        coordinate_units = self.equations.coordinate_units
-        return rows * coordinate_units[self.passive, None] / coordinate_units[self.active]
-
-    def _drift_of_sample(self, q: Array, v: Array) -> Array:
-        return self._drift_from_jacobian(
-            self.equations.evaluate_scaled(q)[1][self.structure.independent_rows], q, v
-        )
-
-    def _insert_passive_gamma(self, passive: Array) -> Array:
-        gamma = np.zeros((self.model.nv, len(self.active)))
-        gamma[self.active] = np.eye(len(self.active))
-        gamma[self.passive] = passive
-        return gamma
-
-    def _drift_from_jacobian(self, jacobian: Array, q: Array, v: Array) -> Array:
-        drift = np.zeros(self.model.nv)
-        acceleration_bias = (
-            self.equations.acceleration_bias(q, v) / self.equations.residual_units
-        )[self.structure.independent_rows]
-        passive_drift = self._solve_passive(jacobian, acceleration_bias, q)
-        drift[self.passive] = passive_drift * self.equations.coordinate_units[self.passive]
-        return drift
-
-    def _solve_passive(self, jacobian: Array, right_side: Array, q: Array) -> Array:
-        """-J_P^-1 right, all in shares of the machine's size."""
-        try:
-            solution = solve_linear(jacobian[:, self.passive], -right_side)
-        except np.linalg.LinAlgError:
-            raise self._continuation.singularity_error(jacobian, q[self.active]) from None
-        self._continuation.check_singularity(jacobian, solution, q[self.active])
-        return solution
+        return self._solver.continuation.gamma_velocity_drift(q, v_a)
 
 
 def _has_same_geometry(first: LoopEquations, second: LoopEquations) -> bool:
-    """Whether joints, limits and loops of two trees of one structure are at the same places."""
+    """Whether two trees of one structure have equal joint frames, limits and loop frames."""
     pairs = [
         [
             x.coupling_factors,

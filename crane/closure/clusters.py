@@ -1,4 +1,4 @@
-"""Clusters: joints that loops and couplings tie together, and what hangs on them."""
+"""Clusters: joints that loops and couplings tie together."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,26 +10,26 @@ from crane.closure.loop_equations import LoopEquations
 
 @dataclass(frozen=True)
 class Cluster:
-    """Joints none of which moves without others of them moving, or one joint alone.
+    """Joints that only move together, or a single joint.
 
-    The joints form a connected part of the tree; two clusters share no joint, so the clusters form
-    a tree themselves.
+    The joints form a connected part of the tree. No joint is in two clusters, so that the clusters
+    form a tree as well.
 
     Attributes:
-        base: The body that carries them.
-        joints: Their numbers, parents first; body i is moved by joint i.
+        base: The body that carries the cluster.
+        joints: Indices of the joints, parents first; joint i moves body i.
     """
 
     base: int
     joints: tuple[int, ...]
 
     def own_coordinates(self, active_joints: Sequence[int]) -> list[int]:
-        """Which of the active joints are its own."""
+        """Indices k of the active joints that belong to the cluster."""
         return [k for k, joint in enumerate(active_joints) if joint in self.joints]
 
 
 def find_clusters(equations: LoopEquations) -> list[Cluster]:
-    """The clusters of a machine, each behind the one that carries it."""
+    """The clusters of a machine, each after the one that carries it."""
     coupled_joints = (
         np.flatnonzero(row) + 1 for row in (*equations.sign, *equations.coupling_factors)
     )
@@ -41,13 +41,13 @@ def find_clusters(equations: LoopEquations) -> list[Cluster]:
 def group_into_clusters(
     parents: Sequence[int], coupled_joints: Iterable[Iterable[int]]
 ) -> list[Cluster]:
-    """The clusters of a tree, each behind the one that carries it.
+    """The clusters of a tree, each after the one that carries it.
 
-    What lies on the way between tied joints belongs to them.
+    Joints on the path between tied joints belong to the cluster as well.
 
     Args:
         parents: (nb + 1,) parent body of every body; 0 is the world.
-        coupled_joints: Sets of joints that an equation ties together.
+        coupled_joints: Sets of joints that one equation ties together.
     """
     representative = list(range(len(parents)))
 
@@ -68,7 +68,7 @@ def group_into_clusters(
 
 
 def _joints_between(parents: Sequence[int], joints: set[int]) -> list[int]:
-    """The joints and those between them."""
+    """Some joints and all joints on the paths between them."""
     paths = [_path_to_world(parents, parents[joint]) for joint in joints]
     common = set(paths[0]).intersection(*paths[1:])
     between = {body for way in paths for body in way if body not in common}
@@ -76,7 +76,7 @@ def _joints_between(parents: Sequence[int], joints: set[int]) -> list[int]:
 
 
 def _path_to_world(parents: Sequence[int], body: int) -> list[int]:
-    """A body and all that carry it, the world last."""
+    """A body and all bodies that carry it, up to the world."""
     path = [body]
     while path[-1]:
         path.append(parents[path[-1]])

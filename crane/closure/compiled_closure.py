@@ -1,4 +1,4 @@
-"""Closing loops in machine code made for one machine."""
+"""Machine code that closes the loops of one machine by Newton's method."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,34 +7,34 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from crane.closure.closure_routines import add_closure_routines
 from crane.closure.clusters import Cluster, find_clusters
 from crane.closure.constraint_structure import ConstraintStructure, Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
-    LoopFormulas,
     PositionKinematics,
     folding_pattern,
     largest_scaled_value,
     tree_geometry,
 )
 from crane.closure.loop_equations import LoopEquations
+from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
-from crane.codegen import Layout, Program, Scalar, Tape, max_abs, maximum
+from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.symbolic import minimum
 from crane.common.samples import Array
 
-# All in rad and shares of the machine's size, as `Branch` has them.
-_LARGE_GAMMA = 1e3  # an entry of gamma above this is looked at closely by `NewtonContinuation`
-_NEARLY_CLOSED_TOLERANCE = 1e-6  # residual of a guess that is as good as closed
-_MAX_NEWTON_ITERATIONS = 8  # of Newton's method, which doubles its digits
+# Scaled values: rad and characteristic length, as in `NewtonContinuation`.
+_LARGE_GAMMA = 1e3  # above this entry of gamma, `NewtonContinuation` checks singularity
+_NEARLY_CLOSED_TOLERANCE = 1e-6  # residual of a guess that counts as closed
 
 
 @dataclass(frozen=True, eq=False)
 class ContinuationCursor:
-    """Where following a stack has got to; every thread and every formula has its own.
+    """Start of the next continuation step; every thread and every compiled quantity has one.
 
     Attributes:
-        state: (nq + entries,) posture and entries of gamma that the next sample starts from.
+        state: (nq + entries,) configuration and entries of gamma that the next step starts from.
         gamma_entries: Rows (passive joints) and columns of these entries; the others are zero.
     """
 
@@ -42,17 +42,17 @@ class ContinuationCursor:
     gamma_entries: tuple[Indices, Indices]
 
     def start_from(self, configuration: ClosedConfiguration) -> None:
-        """Let the next sample start from a posture."""
+        """Start the next step from a closed configuration."""
         self.state[: len(configuration.q)] = configuration.q
         self.state[len(configuration.q) :] = configuration.passive_gamma[self.gamma_entries]
 
 
 class _SharedCode:
-    """Machine code of all machines whose formulas are the same.
+    """Machine code that all machines with equal formulas share.
 
     Attributes:
-        closure_program: What closes loops.
-        programs: Further machine code, by what it depends on.
+        closure_program: Program that closes the loops.
+        programs: Further programs, by what they depend on.
     """
 
     def __init__(self, closure_program: Program):
@@ -60,31 +60,30 @@ class _SharedCode:
         self.programs: dict[tuple, Program] = {}
 
 
-# As long as one of these machines is in use. Two threads may both make one; either serves.
+# Kept while a machine uses it. Two threads may both create an entry; either is valid.
 _SHARED_CODE: WeakValueDictionary[tuple, _SharedCode] = WeakValueDictionary()
 
 
 class CompiledClosure:
-    """Machine code for the loops of one machine.
+    """Machine code of the loops of one machine.
 
-    Machines with the same formulas, which may have different numbers in them, share it.
+    Machines with equal formulas share it; their constants may differ.
 
     Args:
-        equations: All equations.
-        structure: Which of them count.
+        equations: All loop equations.
+        structure: Independent equations.
         active: Columns of the active joints.
-        passive: Columns of the others.
-        home: The home posture, whose branch is followed.
-        rounding_scale: How much larger than the machine's size is what rounds, see
-            `NewtonContinuation.rounding_scale`.
+        passive: Columns of the other joints.
+        home: The home configuration, whose branch is followed.
+        rounding_scale: See `NewtonContinuation.rounding_scale`.
 
     Attributes:
-        geometry: What the formulas were traced from.
-        programs: Further machine code for this machine, by what it depends on.
-        tolerances: Residuals that count as rounding, and as closed if they no longer fall; a small
-            change.
-        follow_address: Of the function `follow_targets`, for other machine code to call.
-        close_address: Likewise of `close`.
+        geometry: Geometry that the formulas were traced from.
+        programs: Further programs of this machine, by what they depend on.
+        tolerances: (3,) scaled residual that counts as rounding; that counts as closed if it no
+            longer decreases; scaled step whose square is rounding.
+        follow_address: Address of the function `follow_targets`, for other machine code.
+        close_address: Address of the function `close`.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class CompiledClosure:
         if shared is None:
             loops = Program.from_cache(("loops", key), lambda program: self._build(program, signs))
             shared = _SHARED_CODE[key] = _SharedCode(loops)
-        self._shared_code = shared  # the functions live as long as it
+        self._shared_code = shared  # keeps the machine code alive
         self._formula_key = key
         program, self.programs = shared.closure_program, shared.programs
         self._closure_program = program
@@ -117,7 +116,7 @@ class CompiledClosure:
         self.tolerances = np.array([1e-15 * rounding_scale, 1e-13 * rounding_scale, 1e-9])
 
     def _find_gamma_entries(self) -> tuple[Indices, Indices]:
-        """Passive joints and active ones that move them: others of their cluster."""
+        """Rows and columns of the nonzero entries of gamma: joints of the same cluster."""
         rows, columns = [], []
         for cluster in self.clusters:
             joints = np.array(cluster.joints) - 1
@@ -129,17 +128,17 @@ class CompiledClosure:
 
     @cached_property
     def clusters(self) -> list[Cluster]:
-        """Of its joints, each behind the one that carries it."""
+        """Clusters of the joints, each after the one that carries it."""
         return find_clusters(self._equations)
 
     @property
     def _gamma_entry_pairs(self) -> list[tuple[int, int]]:
-        """The same, one by one."""
+        """The entries of gamma as pairs (row, column)."""
         rows, columns = self._gamma_entries
         return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
     def _cache_key(self, signs: Array) -> tuple:
-        """All that the formulas depend on."""
+        """Everything that the formulas depend on."""
         geometry, equations, structure = self.geometry, self._equations, self._structure
         arrays = (
             geometry.body_rotations,
@@ -171,29 +170,27 @@ class CompiledClosure:
     def _build(self, program: Program, signs: Array) -> None:
         self.add_newton_formula(program, signs)
         self._add_predictor(program)
-        self._add_close(program)
-        self._add_follow(program)
-        self._add_close_in_place(program)
         self._add_gamma(program)
+        add_closure_routines(program, self._nq, self._n)
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
-        """Further machine code for this machine, see `Program.cached_program`.
+        """A further program of this machine, see `Program.from_cache`.
 
         Args:
             key: What it depends on besides the loops.
             build: Adds formulas and routines.
 
         Raises:
-            TooLongError: It would take too long to compile.
+            FormulaTooLongError: It would take too long to compile.
         """
         return Program.from_cache((self._formula_key, key), build)
 
     def formula_outputs(self, formula: str) -> Layout:
-        """Parts of what a formula of the loops' own program writes."""
+        """Layout of the outputs of a formula of the closure program."""
         return self._closure_program.formula_outputs(formula)
 
     def new_cursor(self) -> "ContinuationCursor":
-        """A place to follow stacks from, at home."""
+        """A new cursor at home."""
         cursor = ContinuationCursor(
             np.empty(self._nq + len(self._gamma_entries[0])), self._gamma_entries
         )
@@ -201,16 +198,13 @@ class CompiledClosure:
         return cursor
 
     def start_cursor_at(self, cursor: "ContinuationCursor", q: Array) -> bool:
-        """Put a cursor on a posture (nq,) that is closed to 1e-6 or better.
+        """Move a cursor to a configuration (nq,) that is closed to 1e-6 or better.
 
         Returns:
-            Whether it is, and on the home branch.
+            Whether it is closed and on the branch of home.
         """
         q = np.ascontiguousarray(q)
-        layout = self.formula_outputs("newton")
-        result = np.empty(layout.size)
-        self._closure_program.call("newton", self.geometry.constants, q, result)
-        found = layout.view(result)
+        found = self._newton_step(q)
         if not (found.residual[0] <= _NEARLY_CLOSED_TOLERANCE and found.regular[0] > 0):
             return False
         cursor.state[: self._nq] = q
@@ -218,42 +212,46 @@ class CompiledClosure:
         return True
 
     def least_determinant(self, q: Array) -> float:
-        """The least determinant at a posture (nq,), positive on the home branch."""
+        """The least block determinant at a configuration (nq,), positive on the branch of home."""
+        return float(self._newton_step(np.ascontiguousarray(q)).determinant[0])
+
+    def _newton_step(self, q: Array) -> LayoutView:
+        """Outputs of the formula "newton" at a configuration (nq,)."""
         layout = self.formula_outputs("newton")
         result = np.empty(layout.size)
-        self._closure_program.call(
-            "newton", self.geometry.constants, np.ascontiguousarray(q), result
-        )
-        return float(layout.view(result).edge[0])
+        self._closure_program.call("newton", self.geometry.constants, q, result)
+        return layout.view(result)
 
     def follow_targets(self, cursor: "ContinuationCursor", targets: Array, out: Array) -> int:
-        """Close the loops at targets (N, n) into out (N, nq) until one needs more than a step.
+        """Close the loops at targets (N, n) into out (N, nq) until one needs several steps.
 
         Returns:
-            How many were closed.
+            Number of closed samples.
         """
         targets = np.ascontiguousarray(targets)
         arrays = (self.geometry.constants, targets, cursor.state, out, self.tolerances)
         return self._closure_program.call("follow", len(targets), *arrays)
 
     def close_in_place(self, q: Array) -> int:
-        """Close the loops of postures (N, nq) in place, each from itself, until one does not.
+        """Close the loops of configurations (N, nq) in place until one does not converge.
+
+        Each is its own initial guess.
 
         Returns:
-            How many were closed.
+            Number of closed configurations.
         """
         return self._closure_program.call(
-            "settle", len(q), self.geometry.constants, q, self.tolerances
+            "close_each", len(q), self.geometry.constants, q, self.tolerances
         )
 
     def evaluate_gamma(self, q: Array, out: Array) -> int:
-        """Evaluate gamma at closed postures (N, nq) into out (N, nv, n), while they are regular.
+        """Evaluate gamma at closed q (N, nq) into out (N, nv, n) until one is singular.
 
         Returns:
-            How many were done.
+            Number of evaluated configurations.
         """
         q = np.ascontiguousarray(q)
-        return self._closure_program.call("gammas", len(q), self.geometry.constants, q, out)
+        return self._closure_program.call("gamma_each", len(q), self.geometry.constants, q, out)
 
     def trace_kinematics(
         self,
@@ -262,43 +260,38 @@ class CompiledClosure:
         q_argument: int,
         folded_constants: Array | None = None,
     ) -> tuple[list[Scalar], PositionKinematics, LoopFormulas]:
-        """Coordinates, bodies and loops, read from two arguments of a function to be.
+        """Trace coordinates, position kinematics and loops from two arguments of a formula.
 
         Args:
-            tape: Where to.
-            geometry_argument: Which argument has the geometry's numbers.
-            q_argument: Which has the coordinates.
-            folded_constants: The geometry's numbers, NaN where none may become part of the
-                formulas.
+            tape: Tape to trace on.
+            geometry_argument: Index of the argument with the geometry constants.
+            q_argument: Index of the argument with the coordinates.
+            folded_constants: Geometry constants, NaN where they must stay arguments.
         """
         coordinates = tape.load_vector(q_argument, 0, self._nq)
         numbers = self.geometry.constants if folded_constants is None else folded_constants
         constants = FormulaConstants(tape, geometry_argument, numbers)
         kinematics = PositionKinematics(self.geometry, constants, coordinates)
-        loops = LoopFormulas(
-            self._equations,
-            self._structure,
-            self._active_columns,
-            self._passive_columns,
-            kinematics,
-        )
+        columns = self._active_columns, self._passive_columns
+        loops = LoopFormulas(self._equations, self._structure, *columns, kinematics)
         return coordinates, kinematics, loops
 
     def add_newton_formula(self, program: Program, signs: Array) -> None:
-        """newton(numbers, q) -> residual, change, regular, steepest, edge, corrected q, gamma.
+        """Add `newton`: one Newton step with residual, gamma and singularity checks.
 
-        regular is positive on the home branch away from its edge, with surplus equations closed;
-        steepest is the largest entry of gamma, whose rows are those of passive joints; edge the
-        least determinant of a block, with its sign on the home branch.
+        "regular" is positive on the branch of home away from singular configurations, with
+        redundant equations closed; "largest_gamma" is the largest entry of gamma (rows of passive
+        joints); "determinant" is the least determinant of a block, with its sign on the branch of
+        home.
         """
         q, kinematics, loops = self.trace_kinematics(Tape(), 0, 1)
         steps = loops.newton_step
         is_translation = [not kinematics.geometry.is_revolute[joint] for joint in steps]
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._gamma_entry_pairs]
-        steepest = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
+        largest_gamma = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
         worst = maximum(
-            steepest - _LARGE_GAMMA,
+            largest_gamma - _LARGE_GAMMA,
             loops.largest_redundant_residual - self._structure.redundancy.tolerance,
         )
         least_determinant: Scalar = 1.0
@@ -312,7 +305,7 @@ class CompiledClosure:
             2,
             {
                 "residual": [loops.largest_residual],
-                "change": [
+                "step": [
                     largest_scaled_value(
                         list(steps.values()),
                         is_translation,
@@ -320,17 +313,16 @@ class CompiledClosure:
                     )
                 ],
                 "regular": [-1.0 * worst],
-                "steepest": [steepest],
-                "edge": [least_determinant],
+                "largest_gamma": [largest_gamma],
+                "determinant": [least_determinant],
                 "q": corrected,
                 "gamma": rows,
             },
         )
 
     def _largest_gamma_entry(self, rows: Sequence[Scalar], inverse_length: Scalar) -> Scalar:
-        """The largest entry of gamma."""
         turns = self.geometry.is_revolute
-        powers: dict[int, list[Scalar]] = {0: [], 1: [], -1: []}  # of a length in an entry
+        powers: dict[int, list[Scalar]] = {0: [], 1: [], -1: []}  # power of a length in an entry
         for (row, k), entry in zip(self._gamma_entry_pairs, rows, strict=True):
             one, two = turns[self._passive_columns[row] + 1], turns[self._active_columns[k] + 1]
             powers[int(two) - int(one)].append(entry)
@@ -341,93 +333,8 @@ class CompiledClosure:
             worst = maximum(worst, max_abs(powers[-1]) / inverse_length)
         return worst
 
-    def _add_close(self, program: Program) -> None:
-        """Newton's method in place: 1 where it closes the loops on the home branch, else 0.
-
-        A change so small that its square is rounding is the last one.
-        """
-        arrays = {
-            "numbers": None,
-            "q": None,
-            "result": program.formula_outputs("newton"),
-            "bounds": None,
-        }
-        with program.add_routine("close", arrays=arrays) as r:
-            q, result = r.q, r.result
-            rounded, closed, small = (r.new_variable(r.bounds[i]) for i in range(3))
-            before = r.new_variable(np.inf)
-            evaluations = r.new_variable(0)
-            with r.loop_forever():
-                r.call("newton", r.numbers, q, result)
-                residual, change = (
-                    r.new_variable(result["residual"]),
-                    r.new_variable(result["change"]),
-                )
-                stalled = (residual <= closed) & (residual > before * 0.25)
-                with r.if_then((residual <= rounded) | stalled):
-                    r.break_loop()
-                r.assign(evaluations, evaluations + 1)
-                with r.if_then(~((change < 1.0) & (evaluations < _MAX_NEWTON_ITERATIONS))):
-                    r.return_value(0)
-                r.copy(q, result.element_pointer("q"), self._nq)
-                with r.if_then(change <= small):
-                    r.break_loop()
-                r.assign(before, residual)
-            with r.if_then(result["regular"] > 0.0):
-                r.return_value(1)
-            r.return_value(0)
-
-    def _add_follow(self, program: Program) -> None:
-        """Follow a stack of targets by one Newton continuation step each.
-
-        Stops where it does not: `NewtonContinuation` takes that sample. `at` holds [q, gamma] of
-            the last
-        sample.
-        """
-        nq, n = self._nq, self._n
-        at = Layout(q=nq, gamma=len(self._gamma_entry_pairs))
-        arrays = {"numbers": None, "targets": None, "at": at, "out": None, "bounds": None}
-        with program.add_routine("follow", counts=("count",), arrays=arrays) as r:
-            guess, verdict = (
-                r.local_array("guess", nq),
-                r.local_array("verdict", program.formula_outputs("distance")),
-            )
-            first = r.local_array("first", program.formula_outputs("predict"))
-            result = r.local_array("result", program.formula_outputs("newton"))
-            with r.loop(r.count) as i:
-                r.call("predict", r.numbers, r.at, r.targets.row_pointer(i, n), first)
-                move = r.new_variable(first["move"])
-                with r.if_then(~(move < 1.0)):
-                    r.return_value(i)
-                r.copy(guess, first.element_pointer("q"), nq)
-                closed = r.call("close", r.numbers, guess, result, r.bounds)
-                with r.if_then(closed < 1):
-                    r.return_value(i)
-                r.call("distance", r.numbers, first, guess, verdict)
-                with r.if_then(~(verdict["all"] <= move * 0.5 + 0.02)):
-                    r.return_value(i)
-                r.copy(r.at, guess, nq)
-                r.copy(
-                    r.at.element_pointer("gamma"),
-                    result.element_pointer("gamma"),
-                    at.parts["gamma"],
-                )
-                r.copy(r.out.row_pointer(i, nq), guess, nq)
-            r.return_value(r.count)
-
-    def _add_close_in_place(self, program: Program) -> None:
-        """Close one posture after the other in place, each from itself."""
-        arrays = ("numbers", "q", "bounds")
-        with program.add_routine("settle", counts=("count",), arrays=arrays) as r:
-            result = r.local_array("result", program.formula_outputs("newton"))
-            with r.loop(r.count) as i:
-                closed = r.call("close", r.numbers, r.q.row_pointer(i, self._nq), result, r.bounds)
-                with r.if_then(closed < 1):
-                    r.return_value(i)
-            r.return_value(r.count)
-
     def _add_gamma(self, program: Program) -> None:
-        """whole(result of newton) -> gamma of all joints, and `gammas` over postures."""
+        """Add "gamma": gamma of all joints from the result of "newton"."""
         tape, n, result = Tape(), self._n, program.formula_outputs("newton")
         at = {
             pair: result.start_index("gamma") + i for i, pair in enumerate(self._gamma_entry_pairs)
@@ -439,19 +346,10 @@ class CompiledClosure:
             for k in range(n):
                 if (row, k) in at:
                     rows[column][k] = tape.load(0, at[row, k])
-        program.add_formula("whole", 1, [entry for row in rows for entry in row])
-        arrays = ("numbers", "q", "out")
-        with program.add_routine("gammas", counts=("count",), arrays=arrays) as r:
-            work = r.local_array("work", result)
-            with r.loop(r.count) as sample:
-                r.call("newton", r.numbers, r.q.row_pointer(sample, self._nq), work)
-                with r.if_then(~(work["regular"] > 0.0)):
-                    r.return_value(sample)
-                r.call("whole", work, r.out.row_pointer(sample, self._nq * n))
-            r.return_value(r.count)
+        program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:
-        """Of the blocks' determinants on the home branch."""
+        """Signs of the block determinants on the branch of home."""
         blocks = (
             home.jacobian[np.ix_(rows, self._passive_columns[columns])]
             for rows, columns in self._structure.blocks
@@ -459,9 +357,10 @@ class CompiledClosure:
         return np.array([np.linalg.slogdet(block)[0] for block in blocks])
 
     def _add_predictor(self, program: Program) -> None:
-        """predict(numbers, at, target) -> q, largest move of a passive joint; distance likewise.
+        """Add `predict` and `distance`.
 
-        distance(numbers, q, q').
+        predict(constants, cursor, target) -> q, largest scaled step of a passive joint;
+        distance(constants, q, q') -> largest scaled difference of a passive joint.
         """
         is_translation = [
             not self.geometry.is_revolute[column + 1] for column in self._passive_columns
@@ -495,5 +394,5 @@ class CompiledClosure:
         )
 
     def inverse_characteristic_length(self, tape: Tape) -> Scalar:
-        """One over the machine's size, from the numbers as the first argument."""
+        """One over the characteristic length, from the geometry constants as first argument."""
         return FormulaConstants(tape, 0, self.geometry.constants)[len(self.geometry.constants) - 1]

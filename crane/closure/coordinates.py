@@ -1,4 +1,4 @@
-"""Coordinates of a tree: as many as velocities, whatever Pinocchio's model has."""
+"""Coordinates of the spanning tree, and their conversion to Pinocchio's configurations."""
 
 from functools import cached_property
 
@@ -13,22 +13,22 @@ FREE_FLYER = "JointModelFreeFlyer"
 
 
 class Coordinates:
-    """Names, limits and kinds of a tree's coordinates (nv,), and the way to Pinocchio's (nq,).
+    """Names, limits and kinds of the coordinates (nv,), converted to and from Pinocchio's (nq,).
 
-    Both are the same but for bodies that float: those have place and rotation vector here, place
-    and quaternion in Pinocchio's model; see `crane.description.floating_bases`.
+    Both are the same except for floating bases: position and rotation vector here, position and
+    quaternion in Pinocchio; see `crane.description.floating_bases`.
 
     Args:
-        model: The tree. The coordinates of a free-flyer B are called B_x, B_y, B_z, B_rx, B_ry,
+        model: The tree. The coordinates of a floating base B are named B_x, B_y, B_z, B_rx, B_ry,
             B_rz.
 
     Attributes:
         names: (nv,) in the order of Pinocchio's velocities.
-        joint_of_coordinate: (nv,) index of the joint that each belongs to.
-        floating_base_columns: First column of each free-flyer.
-        parents: (nv + 1,) what carries what, as if each coordinate i moved a body i + 1 of its
-            own: the six of a free-flyer in a row; 0 is the world.
-        body_of_joint: By joint of the model its body in that count.
+        joints: (nv,) index of Pinocchio's joint of each coordinate.
+        floating_base_columns: First column of each floating base.
+        parents: (nv + 1,) parent bodies, where coordinate i moves body i + 1; the six coordinates
+            of a floating base are a series; 0 is the world.
+        body_of_joint: Body of each joint of Pinocchio's model in this numbering.
     """
 
     def __init__(self, model: pin.Model):
@@ -36,9 +36,7 @@ class Coordinates:
         self.names: tuple[str, ...] = ()
         self.floating_base_columns: tuple[int, ...] = ()
         joint_of_coordinate: list[int] = []
-        configuration_indices: list[
-            int
-        ] = []  # in Pinocchio's q, of a free-flyer those of its place
+        configuration_indices: list[int] = []  # in Pinocchio's q; the position of a floating base
         for i in range(1, model.njoints):
             joint, name = model.joints[i], model.names[i]
             if joint.shortname() == FREE_FLYER:
@@ -62,7 +60,7 @@ class Coordinates:
         """Index of a coordinate.
 
         Raises:
-            InputError: There is none of that name.
+            InputError: Unknown name.
         """
         if name not in self._columns_by_name:
             raise InputError(f"joint '{name}' is unknown, {suggest_names(self.names, name)}")
@@ -90,8 +88,13 @@ class Coordinates:
                 found[joint.idx_v] = joint.shortname().startswith("JointModelP")
         return found
 
+    def format_values(self, columns: NDArray[np.intp], values: Array) -> str:
+        """Values of some coordinates as text, "lift = 0.5, tilt = 0.1"."""
+        pairs = zip(columns, values, strict=True)
+        return ", ".join(f"{self.names[int(i)]} = {value:.6g}" for i, value in pairs)
+
     def configuration(self, q: Array) -> Array:
-        """Pinocchio's configuration (nq,) or (N, nq) of coordinates (nv,) or (N, nv)."""
+        """Pinocchio's configuration (nq,) or (N, nq) from coordinates (nv,) or (N, nv)."""
         if not self.floating_base_columns:
             return q
         out = np.zeros((*q.shape[:-1], self.model.nq))
@@ -102,7 +105,7 @@ class Coordinates:
         return out
 
     def from_configuration(self, configuration: Array) -> Array:
-        """The way back: coordinates (nv,) or (N, nv) of Pinocchio's configuration."""
+        """Coordinates (nv,) or (N, nv) from Pinocchio's configuration."""
         if not self.floating_base_columns:
             return configuration
         out: Array = configuration[..., self._configuration_indices]
@@ -113,9 +116,9 @@ class Coordinates:
         return out
 
     def coordinate_derivatives(self, q: Array, v: Array) -> Array:
-        """Time derivatives (nv,) of coordinates (nv,) at velocities (nv,).
+        """Time derivatives (nv,) of the coordinates (nv,) at velocities (nv,).
 
-        Of a free-flyer p' = R V_lin, r' = (1 + r x / 2 + c (r x)^2) V_ang.
+        For a floating base p' = R V_lin, r' = (1 + r x / 2 + c (r x)^2) V_ang.
         """
         if not self.floating_base_columns:
             return v
@@ -124,7 +127,7 @@ class Coordinates:
             r, angular = q[column + 3 : column + 6], v[column + 3 : column + 6]
             out[column : column + 3] = pin.exp3(r) @ v[column : column + 3]
             half = 0.5 * float(np.linalg.norm(r))
-            # the series in t^2 where the closed form cancels
+            # series in t^2 where the closed form suffers from cancellation
             c = (
                 (1 - half / np.tan(half)) / (4 * half * half)
                 if half > 1e-3
@@ -135,7 +138,7 @@ class Coordinates:
         return out
 
     def wrap_rotations(self, q: Array) -> Array:
-        """The same posture (nv,) with rotation vectors of at most pi."""
+        """The same configuration (nv,) with rotation vectors of length pi or less."""
         if not self.floating_base_columns:
             return q
         out = q.copy()
@@ -154,13 +157,13 @@ class Coordinates:
 
 
 def _quaternion(r: Array) -> Array:
-    """x, y, z, w of rotation vectors (..., 3)."""
+    """Quaternions (x, y, z, w) of rotation vectors (..., 3)."""
     half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(half / np.pi) * r, np.cos(half)], axis=-1)
 
 
 def _rotation_vector(quaternion: Array) -> Array:
-    """Rotation vectors (..., 3) of at most pi, of x, y, z, w, which need not have length 1."""
+    """Rotation vectors (..., 3), at most pi long, from quaternions (x, y, z, w) of any length."""
     sign = np.where(quaternion[..., 3:] < 0, -1.0, 1.0)
     x, w = sign * quaternion[..., :3], sign * quaternion[..., 3:]
     length = np.linalg.norm(x, axis=-1, keepdims=True)

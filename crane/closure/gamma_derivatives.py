@@ -1,21 +1,22 @@
-"""How gamma changes as a machine moves, as formulas.
+"""Derivatives of gamma by coordinates and time, as symbolic formulas.
 
-A row w of the loop equations has w . (J_2,j - J_1,j) = 0 for the columns J_j = dV/dv_j of the two
-bodies that it joins. Moved along q_k, and along the motion once and twice:
+A row w of the loop equations satisfies w . (J_2,j - J_1,j) = 0 for the columns J_j = dV/dv_j of
+the two bodies that it joins. Differentiated along q_k, and twice along the motion:
 
     (d_k w) . dJ_j + w . d_k dJ_j = 0,
-    w'' . dJ_j + 2 w' . dJ_j' + w . dJ_j'' = 0,    dJ_j = J_2,j - J_1,j,
+    w'' . dJ_j + 2 w' . dJ_j' + w . dJ_j'' = 0,    dJ_j = J_2,j - J_1,j.
 
-which are equations for d_k gamma_j and gamma_j'', each solved like gamma itself. Coordinates move
-the joints of their own cluster alone (`crane.closure.clusters`), so motions count from the body
-that carries it.
+These are equations for d_k gamma_j and gamma_j'', each with the same matrix as gamma. Coordinates
+move joints of their own cluster only (`crane.closure.clusters`), so that motions are taken
+relative to the body that carries the cluster.
 """
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import LoopEquationFormula, LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import PositionKinematics
+from crane.closure.loop_formulas import LoopEquationFormula, LoopFormulas
 from crane.closure.spatial_vectors import (
     ZERO_VECTOR,
     SpatialVector,
@@ -33,19 +34,19 @@ JointRates = dict[int, Scalar]  # by joint
 
 
 class GammaDerivatives:
-    """Derivatives of gamma at a traced closed posture, of holonomic coordinates.
+    """Derivatives of gamma at a closed configuration, for holonomic coordinates.
 
     Args:
-        kinematics: Bodies.
-        loops: Loops at that posture.
-        clusters: All of them, each behind the one that carries it.
+        kinematics: Position kinematics.
+        loops: Loop formulas at that configuration.
+        clusters: All clusters, each after the one that carries it.
         v_a: (n,).
 
     Attributes:
-        coordinates_of_cluster: Coordinates of each cluster.
+        own: Coordinates of each cluster.
         twists: By coordinate, columns J_j of the bodies of its cluster.
         partial_derivatives: d gamma_j / d q_k by (k, j), k <= j of one cluster, by joint.
-        time_derivatives: gamma_j' by coordinate, by joint.
+        first: gamma_j' by coordinate, by joint.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class GammaDerivatives:
 
         Args:
             joint_velocities: (nb + 1,) velocities of the joints.
-            joint_accelerations: (nb + 1,).
+            joint_accelerations: (nb + 1,) accelerations of the joints.
         """
         n, loops = len(self._v_a), self._loops
         right_sides: list[Vector] = [[0.0] * n for _ in loops.rows]
@@ -142,7 +143,7 @@ class GammaDerivatives:
         joint_velocities: Sequence[Scalar],
         joint_accelerations: Sequence[Scalar],
     ) -> tuple[BodyMotions, BodyMotions]:
-        """Velocities and accelerations of a cluster's bodies, from the one that carries it."""
+        """Velocities and accelerations of a cluster's bodies relative to its base."""
         velocity: BodyMotions = {cluster.base: ZERO_VECTOR}
         acceleration: BodyMotions = {cluster.base: ZERO_VECTOR}
         for i in cluster.joints:
@@ -160,7 +161,7 @@ class GammaDerivatives:
         velocities: Mapping[int, SpatialVector],
         accelerations: Mapping[int, SpatialVector],
     ) -> dict[int, tuple[SpatialVector, SpatialVector]]:
-        """Of a cluster's joints, whose bodies move so, s' and s'' of their columns s."""
+        """Derivatives s', s'' of a cluster's joint columns s, from the motions of its bodies."""
         out = {}
         for i in cluster.joints:
             once = cross_motion(velocities[i], self._joint_axes[i])
@@ -178,11 +179,11 @@ class GammaDerivatives:
         axis_derivatives: Mapping[int, tuple[SpatialVector, SpatialVector]],
         second_time_derivative: Mapping[int, Scalar],
     ) -> tuple[BodyMotions, BodyMotions]:
-        """J_j' and J_j'' of a cluster's bodies, from the one that carries it.
+        """J_j' and J_j'' of a cluster's bodies, relative to the body that carries it.
 
         Args:
-            cluster: Which.
-            coordinate: One of its own coordinates.
+            cluster: The cluster.
+            coordinate: One of its coordinates.
             axis_derivatives: s' and s'' by joint.
             second_time_derivative: gamma_j'' by joint.
         """
@@ -208,14 +209,13 @@ class GammaDerivatives:
     def sum_along_cluster(
         self, cluster: Cluster, joint_motions: Mapping[int, SpatialVector]
     ) -> BodyMotions:
-        """Sums of motions that joints add, from the body that carries the cluster."""
+        """Sums of joint motions along the tree, from the body that carries the cluster."""
         out: BodyMotions = {cluster.base: ZERO_VECTOR}
         for i in cluster.joints:
             out[i] = add_spatial(out[self._kinematics.geometry.parents[i]], joint_motions[i])
         return out
 
     def _loop_rows(self, cluster: Cluster) -> list[int]:
-        """Loop equations of a cluster."""
         return [
             r
             for r, row in enumerate(self._loops.rows)
@@ -251,7 +251,7 @@ class GammaDerivatives:
 def _wrench_time_derivatives(
     row: LoopEquationFormula, velocities: BodyMotions, accelerations: BodyMotions
 ) -> tuple[SpatialVector, SpatialVector]:
-    """First and second time derivative of a row's wrench, w' and w''."""
+    """First and second time derivative w' and w'' of a row's wrench."""
     one, two = row.bodies
     first, second = _motion_of(velocities, one), _motion_of(velocities, two)
     (_, e1), (a2, e2) = _motion_of(accelerations, one), _motion_of(accelerations, two)
@@ -271,7 +271,7 @@ def _wrench_time_derivatives(
 def _power_between_bodies(
     wrench: SpatialVector, motions: BodyMotions, row: LoopEquationFormula
 ) -> Scalar:
-    """What a wrench does between the two bodies of a row."""
+    """Power of a wrench on the relative motion of the two bodies of a row."""
     one, two = row.bodies
     return spatial_dot(
         wrench, subtract_spatial(_motion_of(motions, two), _motion_of(motions, one))
@@ -279,5 +279,5 @@ def _power_between_bodies(
 
 
 def _motion_of(motions: BodyMotions, body: int) -> SpatialVector:
-    """A body's motion; none of what no joint of the cluster moves."""
+    """Motion of a body; zero for bodies that no joint of the cluster moves."""
     return motions.get(body, ZERO_VECTOR)

@@ -1,28 +1,26 @@
-"""The home posture of a machine: from what its file says of it, or from anywhere.
+"""The home configuration of a machine: closed from the initial guess, or by a multi-start search.
 
-Where the loops do not close from the guess, they are closed from anywhere
-(see `crane.closure.multi_start_search`):
+Where the loops do not close from the guess, they are closed by a multi-start search (see
+`crane.closure.multi_start_search`):
 
-1. with the driven joints held, all others within their limits;
-2. with active joints free, too, whose home the file does not say, within their limits;
+1. with the active joints held, all others within their limits;
+2. with those active joints free, too, whose home the file does not specify;
 3. the same two with passive joints beyond their limits.
 
-So are they where the active joints are too few or too many where it closes, and where home as it
-closes from the guess is outside of limits or more than 0.5 rad (or half of the machine's size)
-from what the file says. Then home is kept where none that is found is nearer, and told if it is
-far off.
+The first stage that closes decides; of its configurations the one nearest to the guess is taken,
+see `MultiStartSearch.find_configurations`. The search also runs where the number of active joints
+does not fit the mobility at the configuration that closes, and where home as closed from the guess
+violates limits or is more than 0.5 rad (or half of the characteristic length) from the file's
+values. In that case home is only replaced by a configuration nearer to the guess.
 
-The first of these that closes counts, and of the postures that it finds the one that is nearest to
-the guess, see `Search.postures`.
+Deviations from the file are measured by the joints of links in loops, see
+`MultiStartSearch.largest_specified_deviation`, and by the orientation of the loops. In a plane the
+determinant of the two equations of a loop for its two passive joints is
 
-Whether a posture is what the file says shows in its links: in how far those that are in loops turn
-or slide on what carries them, see `Search.off_said`, and in the orientation of the loops. In a
-plane the determinant of the two equations of a loop for its two passive joints is
+    det dphi / d(q_1, q_2) = l_1 l_2 sin(angle between the links).
 
-    det dphi / d(q_1, q_2) = l_1 l_2 sin(angle between the links),
-
-whose sign is the side on which their pin lies: it changes where the loop is assembled the other
-way round.
+Its sign is the side on which their pin lies: it changes where the loop is in its other assembly
+mode.
 """
 
 from collections.abc import Collection, Iterator
@@ -42,32 +40,35 @@ from crane.closure.constraint_tolerances import (
     CLOSED_TOLERANCE,
     FILE_PRECISION,
     ExactConstraints,
+    RedundancyGap,
     RoundedConstraints,
 )
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import MultiStartSearch
+from crane.codegen import cached_result
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
+from crane.common.threads import single_threaded_blas
 
-_MAX_CANDIDATES = 4  # of the postures that are found
-_SAME_CONFIGURATION_TOLERANCE = (
-    1e-3  # difference of postures that is none [rad], or share of the machine's size
-)
-FAR = 0.5  # [rad], or share of the machine's size: a home that is farther off is doubted
+_MAX_CANDIDATES = 4  # configurations that are tried as home
+# scaled distance of equal configurations
+_SAME_CONFIGURATION_TOLERANCE = 1e-3
+FAR = 0.5  # scaled distance from the file's values beyond which home is doubtful
 
 
 @dataclass(frozen=True)
 class HomeSearchResult:
-    """How a home posture was found that did not follow from the guess.
+    """How home was found where it did not follow from the initial guess.
 
     Attributes:
-        reason: Why it did not.
-        configuration_count: How many postures were found.
-        moved_columns: Columns of joints that are elsewhere than guessed.
-        largest_deviation: The joint that is farthest from the guess, and by how much [m], [rad].
-        off_said: The joint that is farthest from what the file says, and by how much [rad], in
-            shares of the machine's size; see `Search.off_said`.
-        reversed: Names of loops that are the other way round than in the guess.
+        reason: Why it did not follow.
+        configuration_count: Number of configurations that were found.
+        moved_columns: Columns of joints whose coordinate differs from the guess.
+        largest_deviation: Column of the joint farthest from the guess, and its distance [m],
+            [rad].
+        off_said: Column of the joint farthest from the file's value, and its scaled distance; see
+            `MultiStartSearch.largest_specified_deviation`.
+        reversed: Names of loops in the other assembly mode than the guess.
     """
 
     reason: str
@@ -79,7 +80,7 @@ class HomeSearchResult:
 
     @property
     def is_far(self) -> bool:
-        """Whether home is another posture than what the file says."""
+        """Whether home is far from the configuration that the file specifies."""
         return self.off_said[1] > FAR
 
 
@@ -96,14 +97,13 @@ def find_home(
     Args:
         equations: All loop equations.
         active: Columns of the active joints.
-        passive: Columns of the others.
-        initial_guess: (nq,) what is known of the home posture.
-        specified: Columns for which it is the file that says so; None: home follows from the guess
-            or not at all.
-        movable: Columns of active joints that move like passive ones while home is sought.
+        passive: Columns of the other joints.
+        initial_guess: (nq,) initial guess of home.
+        specified: Columns that the file specifies; None: no search.
+        movable: Columns of active joints that may move during the search.
 
     Raises:
-        MechanismError: There is no home posture, or see `analyse`.
+        MechanismError: There is no home configuration, or see `analyse_constraints`.
     """
     search = MultiStartSearch(
         equations, initial_guess, np.array(sorted(specified or ()), dtype=np.intp)
@@ -114,7 +114,7 @@ def find_home(
     except HomeError as error:
         rejection: MechanismError = error
         reason = error.reason
-    except ActiveJointError as error:  # or it is where the linkage collapses
+    except ActiveJointError as error:  # perhaps because the linkage collapses there
         rejection, reason = error, "the joints have other freedoms where it closes"
         if not len(active) or ExactConstraints(equations).is_closed(initial_guess):
             raise
@@ -147,8 +147,32 @@ def find_home(
     return first, _search_result(search, equations, reason, alternative_count + 1, passive, first)
 
 
+def find_cached_home(
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    initial_guess: Array,
+    specified: Collection[int] | None,
+    movable: Collection[int] = (),
+) -> tuple[ConstraintStructure, HomeSearchResult | None]:
+    """`find_home`, from the cache if an earlier process has found it; the arguments are equal."""
+
+    def find() -> tuple[ConstraintStructure, HomeSearchResult | None]:
+        import scipy.linalg  # noqa: F401 - loads the BLAS library to limit
+
+        with single_threaded_blas(equations.model.nv):
+            return find_home(equations, active, passive, initial_guess, specified, movable)
+
+    if not equations.names:
+        return find_home(equations, active, passive, initial_guess, specified, movable)
+    columns = None if specified is None else tuple(specified), tuple(movable)
+    dependencies = ("home", (equations.cache_key, active, initial_guess, *columns))
+    classes = ConstraintStructure, RedundancyGap, HomeSearchResult
+    return cached_result(dependencies, find, "scipy.linalg", classes)
+
+
 def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
-    """(nv,) whether the joints of a posture (nq,) are within their limits, but for rounding."""
+    """(nv,) whether joints of a configuration (nq,) are within their limits, up to rounding."""
     coordinates, slack = equations.coordinates, CLOSED_TOLERANCE * equations.coordinate_units
     inside: NDArray[np.bool_] = (q >= coordinates.lower - slack) & (q <= coordinates.upper + slack)
     return inside
@@ -157,7 +181,7 @@ def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
 def _home_problem(
     search: MultiStartSearch, equations: LoopEquations, passive: Indices, home: Array
 ) -> str:
-    """What speaks against home as it closes from the guess, nothing where all is well."""
+    """Why home as closed from the guess is doubtful; empty if it is not."""
     names = equations.coordinates.names
     columns = passive[~within_limits(equations, home)[passive]]
     if len(columns):
@@ -173,7 +197,7 @@ def _configurations_nearer_than_home(
     found: list[Array],
     home: Array,
 ) -> list[Array]:
-    """Of some postures those that are nearer to what is said than home is, if it is in limits."""
+    """Those of some configurations that are nearer to the guess than a home within limits."""
     if not within_limits(equations, home)[passive].all():
         return found
     return [
@@ -211,15 +235,15 @@ def _reversed(
     passive: Indices,
     structure: ConstraintStructure,
 ) -> tuple[str, ...]:
-    """Loops that home has the other way round than what the file says, see the module."""
+    """Names of loops in the other assembly mode than the guess, see the module."""
     jacobians = [equations.evaluate_scaled(q)[1] for q in (structure.home, search.initial_guess)]
     found: list[int] = []
     for rows, columns in structure.blocks:
         block, joints = structure.independent_rows[rows], passive[columns]
         if not np.isin(joints, search.said).all():
             continue
-        home, said = (np.linalg.slogdet(slope[np.ix_(block, joints)])[0] for slope in jacobians)
-        if home * said < 0:
+        home, guess = (np.linalg.slogdet(x[np.ix_(block, joints)])[0] for x in jacobians)
+        if home * guess < 0:
             found += [int(i) for i in equations.loop_of_row[block]]
     return tuple(equations.names[i] for i in dict.fromkeys(found))
 
@@ -227,7 +251,7 @@ def _reversed(
 def _first_usable(
     equations: LoopEquations, active: Indices, passive: Indices, found: list[Array]
 ) -> ConstraintStructure | ActiveJointError | None:
-    """The first of some closed postures that can be home; else why it has other freedoms."""
+    """The structure of the first configuration that can be home; else an `ActiveJointError`."""
     rejection: ActiveJointError | None = None
     for q in found:
         try:
@@ -242,7 +266,7 @@ def _first_usable(
 def _analyse_to_file_precision(
     equations: LoopEquations, active: Indices, passive: Indices, initial_guess: Array
 ) -> ConstraintStructure:
-    """See `analyse`; to the digits of the file where equations contradict each other."""
+    """`analyse_constraints`, to the file precision where equations contradict each other."""
     try:
         return analyse_constraints(
             equations, active, passive, initial_guess, ExactConstraints(equations)
@@ -258,7 +282,7 @@ def _analyse_to_file_precision(
         active_joint_error = error
     except MechanismError:
         raise exact_error from None
-    # other active joints are told where the machine moves with them
+    # other active joints are proposed only if the machine moves with them
     names = equations.coordinates.names
     others = np.array(
         [names.index(joint) for joint in active_joint_error.selections[0].joints], dtype=np.intp
@@ -280,7 +304,7 @@ def _search_by_stages(
     movable: Collection[int],
     beyond_limits: bool,
 ) -> Iterator[list[Array]]:
-    """Closed postures, one list for each of the steps above; the last only where it may go on."""
+    """Closed configurations of each stage of the search; beyond the limits only if allowed."""
     movable_columns = np.union1d(passive, np.array(list(movable), dtype=np.intp))
     all_movable = np.union1d(movable_columns, np.setdiff1d(active, list(specified)))
     column_sets = (

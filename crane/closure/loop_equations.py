@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -31,12 +32,12 @@ def rotation_with_z_axis(axis: Sequence[float]) -> Array:
 
 
 def _as_jacobian(jacobian: Array) -> Array:
-    """(6, nv) also of one joint, for which Pinocchio gives (6,)."""
+    """(6, nv), also for a single joint, where Pinocchio returns (6,)."""
     return jacobian.reshape(6, -1)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Row-wise cross product; numpy's own costs several times more on a few rows."""
+    """Row-wise cross product; several times faster than numpy's for few rows."""
     out = np.empty_like(a)
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
@@ -45,13 +46,13 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _supporting_columns(model: pin.Model, joint: int) -> list[int]:
-    """Columns of the joints that move a joint's body."""
+    """Columns of the joints that move the body of a joint."""
     supports = [model.joints[i] for i in model.supports[joint] if i > 0]
     return [column for x in supports for column in range(x.idx_v, x.idx_v + x.nv)]
 
 
 def aligned_axes(loop_type: str) -> list[int]:
-    """Axes of the two frames of a loop that point the same way when it is closed."""
+    """Axes of the two frames of a loop that point in the same direction when it is closed."""
     locked = LOOP_TYPES[loop_type][3:]
     if all(locked):
         return [0, 1, 2]
@@ -59,18 +60,18 @@ def aligned_axes(loop_type: str) -> list[int]:
 
 
 class LoopEquations:
-    """All equations of all loops and couplings of a machine.
+    """All equations of the loops and couplings of a machine.
 
-    A loop joins frame 1 (predecessor) and frame 2 (successor), both turned so that the loop's
-    axis is their z. With their axes a_i, b_k and origins p_1, p_2 in the world, its equations are
+    A loop joins frame 1 (predecessor) and frame 2 (successor), both rotated so that z is the axis
+    of the loop. With their axes a_i, b_k and origins p_1, p_2 in the world, its equations are
 
         a_i . (p_2 - p_1) = 0    for every locked translation i,
         a_i . b_k = 0            for locked rotations: two rows with b_k the free axis, or
                                  (x, y), (y, z), (z, x) where all three are locked.
 
-    Row by row there is a wrench w = [a_i; p_2 x a_i] or [0; b_k x a_i] at the world's origin, so
-    that phi' = w . (V_2 - V_1) with the spatial velocities V. Columns of joints that carry both
-    frames therefore cancel exactly. Couplings of joints follow, sum c_j q_j - offset = 0 each.
+    Each row has a wrench w = [a_i; p_2 x a_i] or [0; b_k x a_i] at the world's origin, so that
+    phi' = w . (V_2 - V_1) with the spatial velocities V. Columns of joints that carry both frames
+    therefore cancel exactly. Couplings follow, with sum c_j q_j - offset = 0 each.
 
     Args:
         model: The spanning tree.
@@ -78,15 +79,14 @@ class LoopEquations:
         couplings: Linear constraints of joints.
 
     Attributes:
-        coordinates: Of the tree.
-        names: Of what the equations belong to: loops, then couplings.
+        coordinates: Coordinates of the tree.
+        names: Names of loops, then couplings.
         loop_of_row: (m,) index in `names` of every equation.
-        is_translation: (m,) whether it is about a length.
-        characteristic_length: Of the machine [m], see
+        is_translation: (m,) whether the equation is a length.
+        characteristic_length: Characteristic length [m], see
             `crane.closure.active_joint_selection.characteristic_length`.
-        coordinate_units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size
-            [m].
-        residual_units: (m,) of the equations, likewise.
+        coordinate_units: (nv,) units of the coordinates: 1 rad, and the characteristic length [m].
+        residual_units: (m,) units of the residuals: 1 rad, and the characteristic length [m].
     """
 
     def __init__(
@@ -140,13 +140,13 @@ class LoopEquations:
         self.residual_units = np.where(self.is_translation, self.characteristic_length, 1.0)
 
     def coupled_groups(self, columns: Indices) -> tuple[Indices, Indices]:
-        """Joints that equations tie together, directly or through others, as groups by number.
+        """Groups of joints that equations connect, directly or through others.
 
         Args:
             columns: (k,) the joints.
 
         Returns:
-            The groups of the joints (k,) and of the rows (m,), -1 of a row without such joints.
+            Group indices of the joints (k,) and of the rows (m,), -1 for rows without such joints.
         """
         involved = np.vstack([self.sign, self.coupling_factors])[:, columns] != 0
         group = np.arange(len(columns), dtype=np.intp)
@@ -158,13 +158,13 @@ class LoopEquations:
         return group, np.array(of_name, dtype=np.intp)[self.loop_of_row]
 
     def subset(self, names: Collection[str]) -> "LoopEquations":
-        """The equations of some loops and couplings alone, in the same coordinates."""
+        """The equations of some loops and couplings only, in the same coordinates."""
         found = LoopEquations(
             self.model,
             [loop for loop in self.loops if loop.name in names],
             [coupling for coupling in self.couplings if coupling.name in names],
         )
-        found._thread_local.data = self.data  # which takes longer to make than all else
+        found._thread_local.data = self.data  # creating data is expensive
         return found
 
     @cached_property
@@ -173,8 +173,17 @@ class LoopEquations:
         return motion_scales(self.model)
 
     @property
+    def cache_key(self) -> tuple[Any, ...]:
+        """Everything that the equations depend on, see `crane.codegen.cached_result`."""
+        loops = tuple(
+            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis)) for x in self.loops
+        )
+        couplings = tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings)
+        return self.model.saveToString(), loops, couplings
+
+    @property
     def data(self) -> pin.Data:
-        """Pinocchio's memory of this thread."""
+        """Pinocchio's data of this thread."""
         try:
             return self._thread_local.data
         except AttributeError:
@@ -182,7 +191,7 @@ class LoopEquations:
             return self._thread_local.data
 
     def _frame_geometry(self) -> tuple[Array, Array, Array, Array]:
-        """Of every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
+        """For every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
         bodies = self.data.oMi
         placements = [bodies[joint] * local for joint, local in self.frames]
         rotations = np.array([placement.rotation for placement in placements])
@@ -190,7 +199,7 @@ class LoopEquations:
         return self._row_geometry(rotations, origins)
 
     def _row_geometry(self, rotations: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
-        """The same (..., m, 3) of frames with turns (..., 2 l, 3, 3), origins (..., 2 l, 3)."""
+        """The same (..., m, 3) from rotations (..., 2 l, 3, 3) and origins (..., 2 l, 3)."""
         axes, one = np.swapaxes(rotations, -1, -2), 2 * self._loop_index
         return (
             axes[..., one, self.axis_of_frame1, :],
@@ -200,14 +209,14 @@ class LoopEquations:
         )
 
     def constraint_wrenches(self, rotations: Array, origins: Array) -> Array:
-        """The loops' rows w as wrenches, by which frame 2 is held, at the world's origin.
+        """Rows w of the loops as wrenches on frame 2, at the world's origin.
 
         Args:
             rotations: (..., 2 l, 3, 3) of `frames`, in the world.
-            origins: (..., 2 l, 3) likewise [m].
+            origins: (..., 2 l, 3) of `frames` [m].
 
         Returns:
-            (..., m, 6) without the couplings' rows.
+            (..., m, 6) without the rows of couplings.
         """
         a, b, _, p2 = self._row_geometry(rotations, origins)
         return self._assemble_wrenches(a, b, p2)
@@ -243,21 +252,30 @@ class LoopEquations:
         )
 
     def evaluate_scaled(self, q: Array) -> tuple[Array, Array]:
-        """`evaluate` in shares of the machine's size: the same whatever its scale.
+        """Scaled residuals and Jacobian, which do not depend on the size of the machine.
 
         Args:
             q: (nq,) [m], [rad].
 
         Returns:
-            E^-1 phi (m,) and E^-1 dphi/dq D (m, nv), E = diag(row_units), D = diag(units).
+            E^-1 phi (m,) and E^-1 dphi/dq D (m, nv), E = diag(residual_units),
+            D = diag(coordinate_units).
         """
         phi, jacobian = self.evaluate(q)
         return phi / self.residual_units, jacobian / self.residual_units[
             :, None
         ] * self.coordinate_units
 
+    def name_of_row(self, row: int) -> str:
+        """Name of the loop or coupling that an equation belongs to."""
+        return self.names[self.loop_of_row[row]]
+
+    def unit_of_row(self, row: int) -> str:
+        """Unit of the residual of an equation."""
+        return "m" if self.is_translation[row] else "rad"
+
     def find_opposed_loop(self, q: Array) -> str | None:
-        """Name of a loop whose axes are antiparallel, which also solves its equations."""
+        """Name of a loop with antiparallel axes, which also solve its equations, or None."""
         if not self.loops:
             return None
         pin.forwardKinematics(self.model, self.data, self.coordinates.configuration(q))
@@ -277,7 +295,7 @@ class LoopEquations:
         """Second derivative of phi at zero joint acceleration, (d/dt dphi/dq) v.
 
         Args:
-            q: (nq,) [m], [rad], the posture this thread last called `evaluate` with.
+            q: (nq,) [m], [rad], the configuration of this thread's last call of `evaluate`.
             v: (nv,) [m/s], [rad/s].
 
         Returns:

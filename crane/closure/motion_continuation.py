@@ -1,4 +1,8 @@
-"""Postures along a recorded motion, through dead centres of the coordinates that were recorded."""
+"""Continuation along recorded motions and over stacks of samples.
+
+A recorded motion may pass dead centres of the recorded coordinates; samples of a stack need not
+be a path.
+"""
 
 import numpy as np
 
@@ -8,18 +12,36 @@ from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
 
-_SINGULAR_TOLERANCE = 1e-9  # singular values that are zero
-_WEAK_SINGULAR_VALUE = (
-    0.05  # least singular value of what moves q_A, below which it does not tell the posture
-)
-_EXTRAPOLATION_WEIGHT = (
-    3e-3  # weight of the continued motion there, per weight of what was recorded
-)
+_SINGULAR_TOLERANCE = 1e-9  # relative singular value that counts as zero
+# least singular value of A below which q_A does not determine q
+_WEAK_SINGULAR_VALUE = 0.05
+# weight w of the extrapolated motion
+_EXTRAPOLATION_WEIGHT = 3e-3
 _MAX_ITERATIONS, _STEP_TOLERANCE = 40, 1e-13
-_CLOSED_TOLERANCE = 1e-9  # of loops, in the equations' units
-_MAX_EXTRAPOLATION_ERROR = (
-    0.5  # from the continued motion [rad, ways of the joints]: another branch
-)
+_CLOSED_TOLERANCE = 1e-9  # residual of closed loops
+# scaled distance to the extrapolation that means another branch
+_MAX_EXTRAPOLATION_ERROR = 0.5
+
+# samples worth sorting: number, and mean distance of neighbours as a fraction of the range
+_MIN_SAMPLES_TO_SORT, _FAR_SAMPLE_DISTANCE = 100, 0.1
+
+
+def sort_samples(scaled: Array) -> Indices | None:
+    """An order of samples (N, n) with close neighbours; None if they need no sorting.
+
+    Samples are sorted into cells of all coordinates but the last, and by the last one within a
+    cell.
+
+    Args:
+        scaled: (N, n) coordinates as fractions of their ranges.
+    """
+    if len(scaled) <= _MIN_SAMPLES_TO_SORT or not scaled.size:
+        return None
+    if np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE:
+        return None
+    cells = np.floor(scaled * len(scaled) ** (1 / scaled.shape[1]))
+    order: Indices = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
+    return order
 
 
 def follow_motion(
@@ -29,27 +51,27 @@ def follow_motion(
     q_a: Array,
     first_configuration: Array,
 ) -> Array:
-    """Postures whose active coordinates were recorded, by the continuity of the motion.
+    """Configurations of recorded active coordinates, by continuity of the motion.
 
-    Where active coordinates turn because they come to a dead centre, two postures have them. The
-    one nearest to the motion continued is taken: with N the motions that the loops allow, A its
-    rows of the active joints, and y what is left to the recorded coordinates r and to the
-    continued motion p,
+    Where an active coordinate turns back at a dead centre, two configurations have the same q_A.
+    The one nearest to the extrapolated motion is taken: with N the motions that the loops allow, A
+    its rows of the active joints, r the remaining step of the recorded coordinates and p that of
+    the extrapolated motion,
 
         min |A y - r|^2 + w^2 |y - p|^2,
 
-    w small, and zero where A is regular. There the recorded coordinates are met exactly; at a dead
-    centre they say nothing of the posture to first order.
+    with a small w near a dead centre, and w = 0 where A is regular, so that the recorded
+    coordinates are met exactly.
 
     Args:
-        equations: Of the loops.
+        equations: The loop equations.
         active_columns: (n,) columns of the active joints.
-        motion_scales: (nq,) ways of the joints that compare.
-        q_a: (N, n) from sample to sample as dense as the motion is smooth.
-        first_configuration: (nq,) the closed posture of the first.
+        motion_scales: (nq,) comparable displacements of the joints.
+        q_a: (N, n), sampled densely enough to extrapolate.
+        first_configuration: (nq,) closed configuration of the first sample.
 
     Raises:
-        ClosureError: The motion does not go on.
+        ClosureError: The motion does not continue to a sample.
     """
     out = np.empty((len(q_a), len(first_configuration)))
     for k, target in enumerate(q_a):

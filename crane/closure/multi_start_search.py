@@ -1,12 +1,12 @@
-"""Closing the loops from anywhere: for machines whose files say little of their home posture.
+"""Multi-start search: closing the loops without a good initial guess.
 
-The residual of a loop is what it locks of log(M_1^-1 M_2), M_i the placements of its frames:
-rotations [rad], and translations in shares of the machine's size; where it locks no rotation, the
-distance of the origins. Unlike the loop equations it is zero only where axes point the same way,
-and grows all the way to half a turn. Damped least squares go downhill from any start (Levenberg
-1944; a damping that falls with the square of the residual keeps the convergence quadratic,
-Yamashita and Fukushima 2001), with a line search along the path that limits bend. Starts lie
-around the guess, farther and farther off.
+The residual of a loop is the locked part of log(M_1^-1 M_2), with M_i the placements of its
+frames: rotations [rad], and scaled translations; for loops that lock no rotation, the distance of
+the origins. Unlike the loop equations it only vanishes where axes point in the same direction, and
+it grows up to half a revolution. Damped least squares decrease it from any starting point
+(Levenberg 1944; damping proportional to the squared residual keeps quadratic convergence,
+Yamashita and Fukushima 2001), with a line search along the path that limits bend. Starting points
+lie around the guess at increasing distances.
 """
 
 import itertools
@@ -21,9 +21,9 @@ from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
 from crane.description import LOOP_TYPES
 
-_RESIDUAL_TOLERANCE = 1e-11  # in shares
+_RESIDUAL_TOLERANCE = 1e-11  # scaled
 _MAX_ITERATIONS = 80
-_MAX_STEP = 1.0  # [rad], or share of the machine's size: of an iteration at most
+_MAX_STEP = 1.0  # largest scaled step of an iteration
 _MAX_HALVINGS = 12
 _DAMPING = 1e-3
 _SLOW_PROGRESS_RATIO, _MAX_SLOW_ITERATIONS = (
@@ -38,12 +38,41 @@ _MAX_STARTS_TIMES_JOINTS, _EXTRA_STARTS_TIMES_JOINTS = (
     2000,
     120,
 )  # starts times joints at most: in all, and after one closes
-_START_RADII = (0.3, 1.0, 2.0, np.pi)  # of the starts [rad], or shares of the machine's size
-_SAME_CONFIGURATION_TOLERANCE = 1e-3  # difference of postures that is none, likewise
+_START_RADII = (0.3, 1.0, 2.0, np.pi)  # scaled radii of the starting points
+_SAME_CONFIGURATION_TOLERANCE = 1e-3  # scaled distance of equal configurations
+
+
+def damped_step(
+    jacobian: Array,
+    residual: Array,
+    base_damping: float = 1e-14,
+    max_step: float = _MAX_STEP,
+    max_cost: float = 1.0,
+) -> Array:
+    """Levenberg-Marquardt step towards residual = 0, at most `max_step` in any joint; scaled.
+
+    The damping falls with the squared residual, which keeps quadratic convergence.
+    """
+    gram = jacobian.T @ jacobian
+    rounding = base_damping + 1e-15 * float(gram.diagonal().max(initial=0.0))
+    damping = _DAMPING * min(max_cost, float(residual @ residual)) + rounding
+    step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ residual)
+    return np.asarray(step * min(1.0, max_step / max(np.abs(step).max(initial=0.0), 1e-300)))
+
+
+def low_discrepancy_steps(count: int) -> Array:
+    """Steps (count,) of a low-discrepancy sequence of points: multiples of them modulo 1.
+
+    The powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018).
+    """
+    phi = 2.0
+    for _ in range(40):
+        phi = (1 + phi) ** (1 / (count + 1))
+    return np.asarray(phi ** -np.arange(1.0, count + 1))
 
 
 class ClosureResidual:
-    """How far loops and couplings are from closed.
+    """Residuals of loops and couplings that grow with the distance from closed.
 
     Args:
         equations: The loops.
@@ -59,7 +88,7 @@ class ClosureResidual:
         self._coupling_units = equations.residual_units[is_coupling]
 
     def evaluate(self, q: Array) -> tuple[Array, Array]:
-        """Residuals (m,) and their slopes (m, nv)."""
+        """Residuals (m,) and their Jacobian (m, nv)."""
         equations = self._equations
         model, data = equations.model, equations.data
         configuration = equations.coordinates.configuration(q)
@@ -75,7 +104,7 @@ class ClosureResidual:
             relative_placement = one.actInv(two)
             relative_jacobian = two.toActionMatrixInverse() @ (
                 equations.sign[index] * joint_jacobians
-            )  # as 2 sees them
+            )  # in frame 2
             if locked.max() < 3:
                 residual, jacobian = (
                     relative_placement.translation,
@@ -92,7 +121,7 @@ class ClosureResidual:
 
 
 def periodic_coordinates(equations: LoopEquations) -> NDArray[np.bool_]:
-    """(nv,) joints that a whole turn leaves where they are: no slides, couplings and flyers."""
+    """(nv,) joints that a full revolution leaves unchanged: revolute, in no coupling or base."""
     coordinates = equations.coordinates
     periodic = ~coordinates.is_translation & ~(equations.coupling_factors != 0).any(axis=0)
     for column in coordinates.floating_base_columns:
@@ -103,18 +132,18 @@ def periodic_coordinates(equations: LoopEquations) -> NDArray[np.bool_]:
 def remove_revolutions(
     q: Array, nearby: Array, periodic: NDArray[np.bool_], lower: Array, upper: Array
 ) -> Array:
-    """The same posture with whole turns so that joints are in limits, and near another one.
+    """The same configuration, with full revolutions removed so that joints are within limits.
 
     Args:
         q: (nq,).
-        nearby: (nq,) the other one.
-        periodic: (nq,) joints that may wind, see `periodic_coordinates`.
+        nearby: (nq,) configuration to stay near.
+        periodic: (nq,) see `periodic_coordinates`.
         lower: (nq,) limits.
-        upper: (nq,) likewise.
+        upper: (nq,) limits.
 
     Returns:
-        (nq,), joints within half a turn of the other posture; where limits do not allow that, by
-        whole turns nearer to them, and where they allow none as it was.
+        (nq,), joints within half a revolution of `nearby`, or within their limits where these need
+        more revolutions; unchanged where no number of revolutions satisfies the limits.
     """
     turn = 2 * np.pi
     turned = np.where(periodic, nearby + np.remainder(q - nearby + np.pi, turn) - np.pi, q)
@@ -130,14 +159,14 @@ def remove_revolutions(
 
 
 class MultiStartSearch:
-    """Closed postures of a machine, from anywhere.
+    """Search for closed configurations of a machine from many starting points.
 
     Args:
         equations: The loops.
-        initial_guess: (nq,) what is said of the posture.
-        specified: Columns for which it is the file that says so.
-        extra_starts: Starts from the first closed posture on; if not given, more for smaller
-            machines.
+        initial_guess: (nq,) initial guess.
+        specified: Columns whose value in the guess comes from the file.
+        extra_starts: Starting points after the first closed configuration; more for smaller
+            machines if not given.
     """
 
     def __init__(
@@ -176,10 +205,10 @@ class MultiStartSearch:
     def find_configurations(
         self, movable: Indices, unlimited: Indices, tolerance: float
     ) -> list[Array]:
-        """Closed postures, the nearest to the guess first.
+        """Closed configurations, the nearest to the guess first.
 
-        Nearest where the farthest of the joints that are said is nearest [rad], [machine's size];
-        if that is equal, by their sum of squares, then by all joints.
+        Ordered by the largest scaled distance of the specified joints; where equal, by their sum
+        of squares, then by all joints.
 
         Args:
             movable: Columns of the joints that may move.
@@ -207,7 +236,7 @@ class MultiStartSearch:
     def _search_from(
         self, start: Array, movable: Indices, unlimited: Indices, tolerance: float
     ) -> Array | None:
-        """Along the limits from one start; else across them, where whole turns lead back."""
+        """Search within the limits from one starting point; else across them."""
         for without_limits in (unlimited, movable):
             q, residual = self.minimize_residual(start, movable, without_limits)
             limited = np.setdiff1d(movable, unlimited)
@@ -220,7 +249,7 @@ class MultiStartSearch:
         return None
 
     def distance_from_guess(self, q: Array) -> tuple[float, float, float]:
-        """How far a posture is from the guess: what is said, its sum of squares, all joints."""
+        """Distances from the guess: largest of specified joints, their norm, largest of all."""
         differences = self.coordinate_differences(q, self.initial_guess)
         specified = differences[self.said]
         return (
@@ -230,16 +259,15 @@ class MultiStartSearch:
         )
 
     def largest_specified_deviation(self, q: Array) -> tuple[int, float]:
-        """The joint whose link is farthest from where it is said to be on what carries it.
+        """The specified joint that is farthest from the guess, full revolutions ignored.
 
-        Whole turns leave it there. Links that no loop goes through, rotors on gears for one, are
-        where couplings put them, and are no matter of how loops are assembled.
+        Joints in no loop, for example of rotors on gears, are ignored: couplings place them.
 
         Args:
             q: (nq,).
 
         Returns:
-            Its column, and by how much [rad], [machine's size].
+            Its column, and the scaled distance.
         """
         joints = self.said[self._in_loops[self.said]]
         if not len(joints):
@@ -250,14 +278,14 @@ class MultiStartSearch:
         return int(joints[differences.argmax()]), float(differences.max())
 
     def largest_deviation(self, q: Array) -> tuple[int, float]:
-        """The joint that is farthest from the guess, and by how much [m], [rad]."""
+        """Column of the joint that is farthest from the guess, and its distance [m], [rad]."""
         differences = self.coordinate_differences(q, self.initial_guess)
         return int(differences.argmax()), float(
             (differences * self._coordinate_units)[differences.argmax()]
         )
 
     def coordinate_differences(self, first: Array, second: Array) -> Array:
-        """(nq,) how far apart the joints of two postures are [rad], [machine's size]."""
+        """(nq,) scaled distances of two configurations by joint."""
         angle_differences = np.abs(np.remainder(first - second + np.pi, 2 * np.pi) - np.pi)
         return np.asarray(
             np.where(
@@ -268,15 +296,9 @@ class MultiStartSearch:
         )
 
     def _starting_points(self, movable: Indices) -> Iterator[Array]:
-        """The guess, and low-discrepancy points of boxes around it that grow.
-
-        Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018).
-        """
+        """The guess, and low-discrepancy points of growing boxes around it."""
         yield self.initial_guess.copy()
-        phi = 2.0
-        for _ in range(40):
-            phi = (1 + phi) ** (1 / (len(movable) + 1))
-        steps = phi ** -np.arange(1.0, len(movable) + 1)
+        steps = low_discrepancy_steps(len(movable))
         for count in itertools.count(1):
             share = 2 * np.remainder(0.5 + count * steps, 1.0) - 1
             start = self.initial_guess.copy()
@@ -288,15 +310,15 @@ class MultiStartSearch:
     def minimize_residual(
         self, q: Array, movable: Indices, unlimited: Indices
     ) -> tuple[Array, float]:
-        """Least squares from one start.
+        """Damped least squares from one starting point.
 
         Args:
-            q: (nq,) the start.
+            q: (nq,) starting point.
             movable: Columns of the joints that may move.
             unlimited: Columns of those that may leave their limits.
 
         Returns:
-            The posture, whole turns as `remove_revolutions` has them, and its largest residual.
+            The configuration, see `remove_revolutions`, and its largest residual.
         """
         lower, upper = self._lower_limits.copy(), self._upper_limits.copy()
         lower[unlimited], upper[unlimited] = -np.inf, np.inf
@@ -320,7 +342,7 @@ class MultiStartSearch:
                 break
             step = np.zeros(len(q))
             step[free_columns] = (
-                self._levenberg_marquardt_step(
+                damped_step(
                     jacobian[:, free_columns] * self._coordinate_units[free_columns], residual
                 )
                 * self._coordinate_units[free_columns]
@@ -338,18 +360,10 @@ class MultiStartSearch:
         )
         return q, float(np.abs(residual).max(initial=0.0))
 
-    @staticmethod
-    def _levenberg_marquardt_step(jacobian: Array, residual: Array) -> Array:
-        gram = jacobian.T @ jacobian
-        rounding = 1e-14 + 1e-15 * float(gram.diagonal().max(initial=0.0))
-        damping = _DAMPING * min(1.0, float(residual @ residual)) + rounding
-        step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ residual)
-        return np.asarray(step * min(1.0, _MAX_STEP / max(np.abs(step).max(initial=0.0), 1e-300)))
-
     def _line_search(
         self, q: Array, step: Array, cost: float, clip_to_limits: Callable[[Array], Array]
     ) -> tuple[Array, Array, Array] | None:
-        """The longest of halved steps that gets downhill, None where none does."""
+        """The longest of successively halved steps that decreases the cost, or None."""
         for halvings in range(_MAX_HALVINGS):
             trial = clip_to_limits(q + step / 2**halvings)
             residual, jacobian = self._residual.evaluate(trial)

@@ -1,4 +1,4 @@
-"""One assembly branch: closing the loops from a near posture, and following the branch."""
+"""Newton's method and continuation along one branch."""
 
 from dataclasses import dataclass
 
@@ -14,23 +14,21 @@ from crane.common.errors import (
 )
 from crane.common.samples import Array, solve_linear
 
-# All in rad and shares of the machine's size, so that a branch is the same at any scale.
-_CLOSED_TOLERANCE = 1e-12  # of a closed loop
-_SINGULAR_TOLERANCE = (
-    1e-6  # relative least singular value of a block where the passive joints get undetermined
-)
-_MIN_STEP = 2.0**-24  # step of the continuation at which it gives up
+# Scaled values (rad, characteristic length): the same for machines of any size.
+_CLOSED_TOLERANCE = 1e-12  # residual of a closed loop
+# relative least singular value of a singular block
+_SINGULAR_TOLERANCE = 1e-6
+_MIN_STEP = 2.0**-24  # smallest step of the continuation, as a fraction of the line
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedConfiguration:
-    """A closed posture with what the next step from it needs.
+    """A closed configuration with what the next continuation step needs.
 
     Attributes:
         q: (nq,).
         q_a: (n,) its active coordinates.
-        jacobian: (m, nv) of the independent loop equations, as `LoopEquations.evaluate_scaled` has
-            it.
+        jacobian: (m, nv) of the independent equations, see `LoopEquations.evaluate_scaled`.
         passive_gamma: (m, n) passive rows of gamma.
     """
 
@@ -41,31 +39,28 @@ class ClosedConfiguration:
 
 
 class NewtonContinuation:
-    """The postures that can be reached from home without passing a singular one.
+    """The configurations that are reached from home without passing a singular one.
 
     Args:
         equations: All loop equations.
-        structure: Which of them count.
-        names: Names of all joints.
+        structure: Independent equations.
         active: Columns of the active joints.
-        passive: Columns of the others.
+        passive: Columns of the other joints.
         ranges: (n,) ranges of the active coordinates, to compare distances [m], [rad].
 
     Raises:
-        MechanismError: The home posture does not close.
+        MechanismError: The home configuration does not close.
     """
 
     def __init__(
         self,
         equations: LoopEquations,
         structure: ConstraintStructure,
-        names: tuple[str, ...],
         active: Indices,
         passive: Indices,
         ranges: Array,
     ):
         self._equations, self._structure = equations, structure
-        self._active_names = [names[i] for i in active]
         self._active_columns, self._passive_columns, self._active_ranges = active, passive, ranges
         self._blocks = structure.blocks_by_size()
         self._coordinate_units, self._is_translation = (
@@ -77,12 +72,12 @@ class NewtonContinuation:
         self._largest_dimension = max(float(np.abs(place.translation).max()) for place in places)
         home = self.solve_newton(structure.home, structure.home[active], 30)
         if home is None:
-            raise MechanismError("the home posture does not close, change 'home'", "home")
+            raise MechanismError("the home configuration does not close, change 'home'", "home")
         self.home = home
         self._home_signs = self._determinant_signs(home)
 
     def rounding_scale(self, q: Array) -> float:
-        """The longest part of a posture (nq,) whose rounding is that of its loops, at least 1."""
+        """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
         largest_stroke = float(
             np.abs(q[self._is_translation]).max(initial=self._largest_dimension)
         )
@@ -91,7 +86,7 @@ class NewtonContinuation:
     def solve_newton(
         self, q: Array, q_a: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """Close the loops at q_A from a near posture; None where that does not work."""
+        """Close the loops at q_A by Newton's method from a nearby q; None if it diverges."""
         q = q.copy()
         q[self._active_columns] = q_a
         rounding_scale, previous_residual = self.rounding_scale(q), np.inf
@@ -127,7 +122,7 @@ class NewtonContinuation:
         return None
 
     def take_newton_step(self, q: Array, target: Array) -> ClosedConfiguration | None:
-        """The posture at a target right beside a posture q (nq,); None where in doubt."""
+        """The configuration at a target very close to q (nq,), None if the branch is uncertain."""
         if not (np.abs(target - q[self._active_columns]) < 0.01 * self._active_ranges).all():
             return None
         solution = self.solve_newton(q, target, 5)
@@ -141,16 +136,16 @@ class NewtonContinuation:
     def continue_to(
         self, target: Array, known: ClosedConfiguration, sample: str = ""
     ) -> ClosedConfiguration:
-        """The closed posture at a target, tracked from a known one or from home.
+        """The closed configuration at a target, followed from a known one or from home.
 
         Args:
             target: (n,) active coordinates.
-            known: Where to start; home if that is nearer or if it fails.
-            sample: What to call the target in errors.
+            known: Start; home if that is nearer or if this start fails.
+            sample: Name of the target in errors.
 
         Raises:
-            OutOfReachError: No posture closes the loops.
-            BranchEdgeError: The passive joints are not determined there.
+            OutOfReachError: No configuration closes the loops.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         starts = [known] if known is self.home else [known, self.home]
         starts.sort(
@@ -165,36 +160,80 @@ class NewtonContinuation:
         raise self._out_of_reach_error(target, last_reached, sample)
 
     def nearest_closed_configuration(self, q: Array) -> ClosedConfiguration:
-        """The closed posture nearest to a guess (nq,), home where the guess leads nowhere.
+        """The closed configuration nearest to a guess (nq,), home if Newton's method diverges.
 
         Raises:
             WrongBranchError: It lies on another branch.
         """
-        posture = self.solve_newton(q, q[self._active_columns], 10)
-        if posture is None:
+        solution = self.solve_newton(q, q[self._active_columns], 10)
+        if solution is None:
             return self.home
-        changed_signs = np.flatnonzero(self._determinant_signs(posture) * self._home_signs < 0)
+        changed_signs = np.flatnonzero(self._determinant_signs(solution) * self._home_signs < 0)
         if len(changed_signs):
             rows = [block for group, _ in self._blocks for block in group][int(changed_signs[0])]
-            raise self._wrong_branch_error(self._format_loop_names(np.ravel(rows)), posture)
-        opposed_loop = self._equations.find_opposed_loop(posture.q)
+            raise self._wrong_branch_error(self._format_loop_names(np.ravel(rows)), solution)
+        opposed_loop = self._equations.find_opposed_loop(solution.q)
         if opposed_loop is not None:
-            raise self._wrong_branch_error(f"loop '{opposed_loop}'", posture)
-        return posture
+            raise self._wrong_branch_error(f"loop '{opposed_loop}'", solution)
+        return solution
+
+    def gamma(self, q: Array) -> Array:
+        """Derivative (nv, n) of f at a closed configuration (nq,); see `Closure.gamma`."""
+        return self._insert_passive_gamma(self._scaled_jacobian(q), q)
+
+    def drift(self, q: Array, v: Array) -> Array:
+        """Accelerations (nv,) at a_A = 0; see `Closure.drift`."""
+        return self._drift(self._scaled_jacobian(q), q, v)
+
+    def gamma_velocity_drift(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
+        """gamma, v = gamma v_A and drift; see `Closure.gamma_velocity_drift`."""
+        jacobian = self._scaled_jacobian(q)
+        gamma = self._insert_passive_gamma(jacobian, q)
+        v = gamma @ v_a
+        return gamma, v, self._drift(jacobian, q, v)
+
+    def _scaled_jacobian(self, q: Array) -> Array:
+        return self._equations.evaluate_scaled(q)[1][self._structure.independent_rows]
+
+    def _insert_passive_gamma(self, jacobian: Array, q: Array) -> Array:
+        active, passive = self._active_columns, self._passive_columns
+        rows = self._solve_passive(jacobian, jacobian[:, active], q)
+        gamma = np.zeros((len(q), len(active)))
+        gamma[active] = np.eye(len(active))
+        units = self._coordinate_units
+        gamma[passive] = rows * units[passive, None] / units[active]
+        return gamma
+
+    def _drift(self, jacobian: Array, q: Array, v: Array) -> Array:
+        bias = self._equations.acceleration_bias(q, v) / self._equations.residual_units
+        passive = self._solve_passive(jacobian, bias[self._structure.independent_rows], q)
+        drift = np.zeros(len(q))
+        drift[self._passive_columns] = passive * self._coordinate_units[self._passive_columns]
+        return drift
+
+    def _solve_passive(self, jacobian: Array, right_side: Array, q: Array) -> Array:
+        """-J_P^-1 right_side, all scaled."""
+        q_a = q[self._active_columns]
+        try:
+            solution = solve_linear(jacobian[:, self._passive_columns], -right_side)
+        except np.linalg.LinAlgError:
+            raise self.singularity_error(jacobian, q_a) from None
+        self.check_singularity(jacobian, solution, q_a)
+        return solution
 
     def check_singularity(
         self, jacobian: Array, solution: Array, q_a: Array, sample: str = ""
     ) -> None:
-        """Raise where J_P is singular, which shows in what was solved with it.
+        """Raise if J_P is singular, judged by a solution of a system with it.
 
         Args:
             jacobian: (m, nv) see `LoopEquations.evaluate_scaled`.
-            solution: What was solved with its passive columns.
-            q_a: (n,) where.
+            solution: Solution of a linear system with its passive columns.
+            q_a: (n,) active coordinates, for the error.
             sample: See `continue_to`.
 
         Raises:
-            BranchEdgeError: It is.
+            SingularConfigurationError: J_P is singular.
         """
         if (
             np.abs(solution).max(initial=0.0) > 1e-3 / _SINGULAR_TOLERANCE
@@ -205,19 +244,17 @@ class NewtonContinuation:
     def singularity_error(
         self, jacobian: Array, q_a: Array, sample: str = ""
     ) -> SingularConfigurationError:
-        """The error for a posture with a singular J_P."""
+        """The error for a configuration with a singular J_P."""
+        loops = self._format_loop_names(self._most_singular_block(jacobian)[1])
         return SingularConfigurationError(
-            f"{self._format_loop_names(self._most_singular_block(jacobian)[1])} is at the edge "
-            f"of its assembly branch "
-            f"at {self._format_active_coordinates(q_a)}{sample}, where the passive joints are "
-            f"undetermined: stay away "
-            "from it"
+            f"{loops} is at the edge of its branch at {self._format_values(q_a)}{sample}, where "
+            "the passive joints are undetermined: stay away from it"
         )
 
     def _most_singular_block(self, jacobian: Array) -> tuple[float, Indices]:
-        """Least singular value of a block, relative to its rows, at the most singular block.
+        """Relative least singular value and rows of the most singular block.
 
-        Rows are taken whole: a single equation for a single joint is singular where that joint
+        Whole rows set the scale: a single equation for a single joint is singular where that joint
         loses its lever while others keep theirs.
         """
         least_ratio, rows = 1.0, np.zeros(0, dtype=np.intp)
@@ -233,7 +270,7 @@ class NewtonContinuation:
         return least_ratio, rows
 
     def _determinant_signs(self, solution: ClosedConfiguration) -> Array:
-        """Sign of every block's determinant: constant on an assembly branch."""
+        """Sign of every block's determinant: constant on a branch."""
         signs = [
             np.linalg.slogdet(solution.jacobian[rows, self._passive_columns[columns]])[0]
             for rows, columns in self._blocks
@@ -243,10 +280,10 @@ class NewtonContinuation:
     def _follow_line(
         self, start: ClosedConfiguration, target: Array
     ) -> tuple[ClosedConfiguration | None, ClosedConfiguration]:
-        """Follow the branch along the straight line from a posture to a target.
+        """Follow the branch along the straight line of q_A to a target.
 
         Returns:
-            The posture at the target, or None, and the last posture on the way.
+            The configuration at the target, or None, and the last configuration that was reached.
         """
         current, progress, step = start, 0.0, 1.0
         while progress < 1.0 and step >= _MIN_STEP:
@@ -271,7 +308,7 @@ class NewtonContinuation:
     def _predict_and_correct(
         self, current: ClosedConfiguration, q_a: Array, passive_step: Array, max_iterations: int
     ) -> ClosedConfiguration | None:
-        """The posture at q_A from one beside it, None where it is not on the same branch."""
+        """The configuration at q_A next to the current one, None if the branch changes."""
         if (
             not np.abs(passive_step / self._coordinate_units[self._passive_columns]).max(
                 initial=0.0
@@ -289,7 +326,7 @@ class NewtonContinuation:
     def _is_continuation(
         self, predicted: Array, solution: ClosedConfiguration, passive_step: Array
     ) -> bool:
-        """Whether a posture continues the branch it was predicted on."""
+        """Whether a configuration continues the branch on which it was predicted."""
         if (self._determinant_signs(solution) * self._home_signs < 0).any():
             return False
         units = self._coordinate_units[self._passive_columns]
@@ -313,13 +350,11 @@ class NewtonContinuation:
             redundant_residuals = np.abs(phi[self._structure.redundant_rows])
             if redundant_residuals.max() > self._structure.redundancy.tolerance:
                 row = int(self._structure.redundant_rows[redundant_residuals.argmax()])
-                loop = self._equations.names[self._equations.loop_of_row[row]]
                 raise OutOfReachError(
-                    f"loop '{loop}' stays {self._format_gap(row, redundant_residuals.max())} "
-                    f"open at "
-                    f"{self._format_active_coordinates(solution.q_a)}{sample}, its surplus "
-                    f"equations hold only near home: "
-                    "the mechanism is overconstrained, use a looser loop type"
+                    f"loop '{self._equations.name_of_row(row)}' stays "
+                    f"{self._format_gap(row, redundant_residuals.max())} open at "
+                    f"{self._format_values(solution.q_a)}{sample}, its redundant equations hold "
+                    "only near home: the mechanism is overconstrained, use a looser loop type"
                 )
 
     def _out_of_reach_error(
@@ -338,43 +373,35 @@ class NewtonContinuation:
         def residual(passive: Array) -> Array:
             return evaluate(passive)[0]
 
-        def passive_jacobian(passive: Array) -> Array:
+        def jacobian(passive: Array) -> Array:
             return evaluate(passive)[1]
 
-        nearest = least_squares(
-            residual, q[self._passive_columns] / units, passive_jacobian, xtol=1e-12
-        )
-        phi = residual(nearest.x)
+        start = q[self._passive_columns] / units
+        nearest = least_squares(residual, start, jacobian, xtol=1e-12)
+        phi = evaluate(nearest.x)[0]
         worst = int(np.abs(phi).argmax())
+        place, last = self._format_values(target), self._format_values(last_reached.q_a)
         if np.abs(phi[worst]) < 10 * _CLOSED_TOLERANCE * self.rounding_scale(q):
+            loops = self._format_loop_names(self._most_singular_block(last_reached.jacobian)[1])
             return OutOfReachError(
-                f"{self._format_loop_names(self._most_singular_block(last_reached.jacobian)[1])} "
-                "can be closed at "
-                f"{self._format_active_coordinates(target)}{sample}, but the branch does not "
-                f"lead straight there from "
-                f"{self._format_active_coordinates(last_reached.q_a)}: go around in between, or "
-                f"give a nearer guess"
+                f"{loops} can be closed at {place}{sample}, but the branch does not lead straight "
+                f"there from {last}: go around in between, or give a nearer guess"
             )
-        loop = self._equations.names[self._equations.loop_of_row[worst]]
         return OutOfReachError(
-            f"loop '{loop}' cannot be closed at "
-            f"{self._format_active_coordinates(target)}{sample}: it stays "
-            f"{self._format_gap(worst, np.abs(phi[worst]))} open; the last posture on the way "
-            f"that "
-            f"closes is at {self._format_active_coordinates(last_reached.q_a)}"
+            f"loop '{self._equations.name_of_row(worst)}' cannot be closed at {place}{sample}: it "
+            f"stays {self._format_gap(worst, np.abs(phi[worst]))} open; the last configuration on "
+            f"the way that closes is at {last}"
         )
 
     def _wrong_branch_error(self, subject: str, solution: ClosedConfiguration) -> WrongBranchError:
         return WrongBranchError(
-            f"{subject} is assembled the other way at "
-            f"{self._format_active_coordinates(solution.q_a)}: start from the home "
-            "posture's branch"
+            f"{subject} is assembled the other way at {self._format_values(solution.q_a)}: start "
+            "from the branch of the home configuration"
         )
 
     def _format_gap(self, row: int, scaled_residual: float) -> str:
-        """How far an equation is open, in words."""
-        unit = "m" if self._equations.is_translation[row] else "rad"
-        return f"{scaled_residual * self._equations.residual_units[row]:.3g} {unit}"
+        gap = scaled_residual * self._equations.residual_units[row]
+        return f"{gap:.3g} {self._equations.unit_of_row(row)}"
 
     def _format_loop_names(self, rows: Indices) -> str:
         loops = sorted(
@@ -383,6 +410,5 @@ class NewtonContinuation:
         names = " and ".join(f"'{self._equations.names[i]}'" for i in loops)
         return ("loop " if len(loops) == 1 else "the group of loops ") + names
 
-    def _format_active_coordinates(self, q_a: Array) -> str:
-        pairs = zip(self._active_names, q_a, strict=True)
-        return ", ".join(f"{name} = {value:.6g}" for name, value in pairs)
+    def _format_values(self, q_a: Array) -> str:
+        return self._equations.coordinates.format_values(self._active_columns, q_a)

@@ -1,11 +1,16 @@
-"""Machine code from traced arithmetic."""
+"""Symbolic formulas, routines that call them, and their translation to machine code."""
 
-from crane.codegen.fallback_driver import run_with_fallback
-from crane.codegen.intermediate_representation import ArrayPointer, Routine, RoutineValue, select
-from crane.codegen.layout import Layout, LayoutView
+from crane.codegen.intermediate_representation import (
+    ArrayPointer,
+    Layout,
+    LayoutView,
+    Routine,
+    RoutineValue,
+    select,
+)
 from crane.codegen.program import BoundFunction, FormulaTooLongError, Program
-from crane.codegen.python_callback import PythonCallback
-from crane.codegen.result_cache import cached_result
+from crane.codegen.program_cache import cached_result
+from crane.codegen.python_interface import PythonCallback, run_with_fallback
 from crane.codegen.symbolic import Scalar, SymbolicExpression, Tape, max_abs, maximum
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Traced formulas as CasADi's expressions: the same operations, one by one."""
+"""Conversion of symbolic formulas to CasADi expressions, operation by operation."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,11 +19,11 @@ _FUNCTION_NAMES = {
 
 
 def casadi_expressions(outputs: Sequence[Scalar], arguments: Sequence[Any]) -> list[Any]:
-    """CasADi's scalars of traced formulas.
+    """Convert symbolic formulas to CasADi scalars.
 
     Args:
         outputs: (m,) formulas on one tape.
-        arguments: What stands for each argument of the tape: numbers, or CasADi's symbols.
+        arguments: Values of each argument of the tape: numbers or CasADi symbols.
 
     Raises:
         InputError: CasADi is not installed.
@@ -52,7 +52,7 @@ def _casadi_operation(ca: Any, kind: str) -> Callable[..., Any]:
         return _BINARY_OPERATIONS[kind]
     if kind == "negate":
         return lambda x: -x
-    if kind == "copysign":  # CasADi's own had wrong derivatives up to 3.8.0
+    if kind == "copysign":  # ca.copysign has wrong derivatives up to 3.8.0
         return lambda size, sign: ca.fabs(size) * ca.copysign(1.0, sign)
     if kind == "positive":
         return lambda x, yes, no: ca.if_else(x > 0, yes, no)

@@ -1,4 +1,4 @@
-"""Derivatives of traced formulas, as formulas."""
+"""Derivatives of symbolic formulas, as symbolic formulas: forward and reverse mode."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,7 +12,7 @@ from crane.codegen.symbolic import (
     where_positive,
 )  # fmt: skip
 
-# Of functions of one number: f'(x) by x and y = f(x).
+# Unary functions: f'(x) from x and y = f(x).
 _UNARY_DERIVATIVES: dict[str, Callable[[SymbolicExpression, SymbolicExpression], Scalar]] = {
     "sin": lambda x, y: apply_function("cos", x),
     "cos": lambda x, y: -apply_function("sin", x),
@@ -27,13 +27,13 @@ _UNARY_DERIVATIVES: dict[str, Callable[[SymbolicExpression, SymbolicExpression],
 def differentiate(
     outputs: Sequence[Scalar], variables: Sequence[SymbolicExpression]
 ) -> list[list[Scalar]]:
-    """Jacobian of formulas, the derivative that is not there being the number 0.
+    """Jacobian of formulas; entries that vanish are the number 0.
 
     At a kink it is that of one of the two sides.
 
     Args:
         outputs: (m,) formulas on one tape.
-        variables: (n,) what was loaded, or any expressions on the tape that count as independent.
+        variables: (n,) loaded values, or any expressions on the tape that are independent.
 
     Returns:
         (m, n) formulas on the same tape.
@@ -45,11 +45,11 @@ def differentiate(
 
 
 def directional_derivative(outputs: Sequence[Scalar], seeds: Mapping[int, Scalar]) -> list[Scalar]:
-    """Derivatives of formulas along a direction; see `differentiate`.
+    """Derivatives of formulas along a direction (forward mode); see `differentiate`.
 
     Args:
         outputs: (m,) formulas on one tape.
-        seeds: How expressions on it change that count as independent, by their index.
+        seeds: Derivatives of independent expressions on it, by their index.
 
     Returns:
         (m,) formulas on the same tape.
@@ -76,18 +76,18 @@ def directional_derivative(outputs: Sequence[Scalar], seeds: Mapping[int, Scalar
 def weighted_gradient(
     outputs: Sequence[Scalar], weights: Sequence[Scalar], variables: Sequence[SymbolicExpression]
 ) -> list[Scalar]:
-    """Gradient of a weighted sum of formulas, in one pass against their order.
+    """Gradient of a weighted sum of formulas (reverse mode).
 
-    It takes a small multiple of the formulas' own operations, however many variables there are
-    (Griewank and Walther, Evaluating Derivatives, 2008, section 3.2).
+    It takes a small multiple of the formulas' operations, for any number of variables (Griewank
+    and Walther, Evaluating Derivatives, 2008, section 3.2).
 
     Args:
         outputs: (m,) formulas on one tape.
-        weights: (m,) numbers or expressions on it, which count as constant.
-        variables: (n,) what was loaded, or any expressions on the tape that count as independent.
+        weights: (m,) numbers or expressions on it, which are treated as constant.
+        variables: (n,) loaded values, or any expressions on the tape that are independent.
 
     Returns:
-        (n,) formulas on the same tape, the sum over i of weights_i d outputs_i / d by.
+        (n,) formulas on the same tape, sum over i of weights_i d outputs_i / d variable.
     """
     gradient: dict[int, Scalar] = {}
 
@@ -113,7 +113,7 @@ def weighted_gradient(
 
 
 def _dependent_operations(tape: Tape, variable_indices: set[int], last: int) -> set[int]:
-    """Indices up to the last of what depends on independent ones, which are among them."""
+    """Indices up to `last` of operations that depend on the variables, which are included."""
     dependent = set(variable_indices)
     for index in range(min(variable_indices) + 1, last + 1):
         kind, *operands = tape.operations[index]
@@ -134,69 +134,66 @@ def _forward_rule(
         tangents.get(x, 0.0) if type(x) is int else 0.0 for x in operands
     ]
     a, da = value[0], operand_tangents[0]
-    if kind == "negate":
-        return -da
-    if kind in _UNARY_DERIVATIVES:
-        assert isinstance(a, SymbolicExpression)
-        return da * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index))
-    if kind == "dot":
-        half = len(value) // 2
-        return dot(operand_tangents[:half], value[half:]) + dot(
-            value[:half], operand_tangents[half:]
-        )
-    b, db = value[1], operand_tangents[1]
-    if kind == "add":
-        return da + db
-    if kind == "subtract":
-        return da - db
-    if kind == "multiply":
-        return da * b + a * db
-    if kind == "divide":
-        return (da - SymbolicExpression(tape, index) * db) / b
-    if kind == "maximum":
-        return where_positive(a - b, da, db)
-    if kind == "copysign":
-        # |a| with the sign of b: as a changes while both have one sign, else against it
-        assert isinstance(b, SymbolicExpression)
-        flipped = copysign(1.0, b)
-        if isinstance(a, SymbolicExpression):
-            flipped = flipped * copysign(1.0, a)
-        return da * flipped
-    assert kind == "positive"
-    return where_positive(a, db, operand_tangents[2])
+    b, db = (value[1], operand_tangents[1]) if len(value) > 1 else (0.0, 0.0)
+    half = len(value) // 2
+    match kind:
+        case "negate":
+            return -da
+        case "dot":
+            first = dot(operand_tangents[:half], value[half:])
+            return first + dot(value[:half], operand_tangents[half:])
+        case "add":
+            return da + db
+        case "subtract":
+            return da - db
+        case "multiply":
+            return da * b + a * db
+        case "divide":
+            return (da - SymbolicExpression(tape, index) * db) / b
+        case "maximum":
+            return where_positive(a - b, da, db)
+        case "copysign":
+            return da * _copysign_derivative(a, b)
+        case "positive":
+            return where_positive(a, db, operand_tangents[2])
+    assert isinstance(a, SymbolicExpression)
+    return da * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index))
+
+
+def _copysign_derivative(a: Scalar, b: Scalar) -> Scalar:
+    """Derivative of |a| with the sign of b: 1 if both have one sign, else -1."""
+    sign = copysign(1.0, b)
+    return sign * copysign(1.0, a) if isinstance(a, SymbolicExpression) else sign
 
 
 def _reverse_rule(
     tape: Tape, index: int, kind: str, operands: list, adjoint: Scalar
 ) -> tuple[Scalar, ...]:
-    """What a weight of an operation gives its operands: the transpose of `_forward_rule`."""
+    """Adjoints of the operands of an operation: the transpose of `_forward_rule`."""
     value: list[Scalar] = [SymbolicExpression(tape, x) if type(x) is int else x for x in operands]
-    a = value[0]
-    if kind == "negate":
-        return (-adjoint,)
-    if kind in _UNARY_DERIVATIVES:
-        assert isinstance(a, SymbolicExpression)
-        return (adjoint * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index)),)
-    if kind == "dot":
-        half = len(value) // 2
-        return tuple(adjoint * x for x in (*value[half:], *value[:half]))
-    b = value[1]
-    if kind == "add":
-        return adjoint, adjoint
-    if kind == "subtract":
-        return adjoint, -adjoint
-    if kind == "multiply":
-        return adjoint * b, adjoint * a
-    if kind == "divide":
-        share = adjoint / b
-        return share, -(SymbolicExpression(tape, index) * share)
-    if kind == "maximum":
-        return where_positive(a - b, adjoint, 0.0), where_positive(a - b, 0.0, adjoint)
-    if kind == "copysign":
-        assert isinstance(b, SymbolicExpression)
-        flipped = copysign(1.0, b)
-        if isinstance(a, SymbolicExpression):
-            flipped = flipped * copysign(1.0, a)
-        return adjoint * flipped, 0.0
-    assert kind == "positive"
-    return 0.0, where_positive(a, adjoint, 0.0), where_positive(a, 0.0, adjoint)
+    a, b, half = value[0], value[1] if len(value) > 1 else 0.0, len(value) // 2
+    match kind:
+        case "negate":
+            return (-adjoint,)
+        case "dot":
+            return tuple(adjoint * x for x in (*value[half:], *value[:half]))
+        case "add":
+            return adjoint, adjoint
+        case "subtract":
+            return adjoint, -adjoint
+        case "multiply":
+            return adjoint * b, adjoint * a
+        case "divide":
+            share = adjoint / b
+            return share, -(SymbolicExpression(tape, index) * share)
+        case "maximum":
+            difference = a - b
+            return where_positive(difference, adjoint, 0.0), where_positive(
+                difference, 0.0, adjoint
+            )
+        case "copysign":
+            return adjoint * _copysign_derivative(a, b), 0.0
+        case "positive":
+            return 0.0, where_positive(a, adjoint, 0.0), where_positive(a, 0.0, adjoint)
+    assert isinstance(a, SymbolicExpression)
+    return (adjoint * _UNARY_DERIVATIVES[kind](a, SymbolicExpression(tape, index)),)

@@ -1,15 +1,78 @@
-"""Formulas, which go straight on, and routines: loops, conditions that stop, own arrays.
+"""Intermediate representation of programs: layouts, straight-line formulas, routines with loops.
 
-Nothing here is written in a machine's language; an emitter translates.
+It does not depend on the target language; an emitter translates it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partialmethod
 from typing import Any, Literal
 
-from crane.codegen.layout import Layout
 from crane.codegen.symbolic import Scalar
+
+
+class Layout:
+    """Named consecutive parts of a vector.
+
+    Args:
+        parts: Lengths by name; a length may be 0.
+
+    Attributes:
+        parts: Lengths by name.
+        size: Length of the vector.
+    """
+
+    def __init__(self, **parts: int):
+        self.parts: Mapping[str, int] = parts
+        self._start_indices: dict[str, int] = {}
+        at = 0
+        for name, length in parts.items():
+            self._start_indices[name] = at
+            at += length
+        self.size = at
+
+    def __repr__(self) -> str:
+        return f"Layout({', '.join(f'{name}={length}' for name, length in self.parts.items())})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Layout) and [*self.parts.items()] == [*other.parts.items()]
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.parts.items()))
+
+    def __getitem__(self, name: str) -> slice:
+        """Where a part is."""
+        return slice(self._start_indices[name], self._start_indices[name] + self.parts[name])
+
+    def start_index(self, name: str) -> int:
+        """Index of a part's first element."""
+        return self._start_indices[name]
+
+    def view(self, array: Any) -> "LayoutView":
+        """The parts of an array (..., size) or of a sequence, by name."""
+        return LayoutView(self, array)
+
+
+class LayoutView:
+    """Parts of one array as attributes; see `Layout.view`."""
+
+    def __init__(self, layout: Layout, array: Any):
+        self.__dict__.update(
+            {
+                name: array[layout[name]] if isinstance(array, list) else array[..., layout[name]]
+                for name in layout.parts
+            }
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"no part '{name}', there are {', '.join(vars(self))}")
+
+
+def layout_of(parts: Mapping[str, Sequence]) -> Layout:
+    """The layout of concatenated sequences."""
+    return Layout(**{name: len(values) for name, values in parts.items()})
+
 
 ValueKind = Literal["real", "integer", "truth"]
 ArgumentKind = Literal["count", "function", "array"]
@@ -17,12 +80,12 @@ ArgumentKind = Literal["count", "function", "array"]
 
 @dataclass(frozen=True, eq=False)
 class RoutineValue:
-    """A number or a truth that a routine computes, evaluated where a statement uses it.
+    """A value that a routine computes where a statement uses it.
 
-    Comparisons are false where a number is NaN; `~` turns them round.
+    Comparisons with NaN are false; `~` inverts them.
 
     Attributes:
-        kind: What it is.
+        kind: Type of the value.
         operation: "constant", "variable", "argument", "element", "select", or an operator.
         operands: Values, an `ArrayPointer` and an index, a number or a name.
     """
@@ -34,39 +97,6 @@ class RoutineValue:
     @property
     def _is_zero(self) -> bool:
         return self.kind == "integer" and self.operation == "constant" and not self.operands[0]
-
-    def __add__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("+", other)
-
-    def __sub__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("-", other)
-
-    def __mul__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("*", other)
-
-    def __truediv__(self, other: "Operand") -> "RoutineValue":
-        return self._arithmetic_operation("/", other)
-
-    def __lt__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation("<", other)
-
-    def __le__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation("<=", other)
-
-    def __gt__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation(">", other)
-
-    def __ge__(self, other: "Operand") -> "RoutineValue":
-        return self._comparison_operation(">=", other)
-
-    def __and__(self, other: "RoutineValue") -> "RoutineValue":
-        return RoutineValue("truth", "and", (self, other))
-
-    def __or__(self, other: "RoutineValue") -> "RoutineValue":
-        return RoutineValue("truth", "or", (self, other))
-
-    def __invert__(self) -> "RoutineValue":
-        return RoutineValue("truth", "not", (self,))
 
     def _arithmetic_operation(self, operator: str, other: "Operand") -> "RoutineValue":
         second = as_value(other, self.kind)
@@ -80,12 +110,30 @@ class RoutineValue:
     def _comparison_operation(self, operator: str, other: "Operand") -> "RoutineValue":
         return RoutineValue("truth", operator, (self, as_value(other, self.kind)))
 
+    __add__ = partialmethod(_arithmetic_operation, "+")
+    __sub__ = partialmethod(_arithmetic_operation, "-")
+    __mul__ = partialmethod(_arithmetic_operation, "*")
+    __truediv__ = partialmethod(_arithmetic_operation, "/")
+    __lt__ = partialmethod(_comparison_operation, "<")
+    __le__ = partialmethod(_comparison_operation, "<=")
+    __gt__ = partialmethod(_comparison_operation, ">")
+    __ge__ = partialmethod(_comparison_operation, ">=")
+
+    def __and__(self, other: "RoutineValue") -> "RoutineValue":
+        return RoutineValue("truth", "and", (self, other))
+
+    def __or__(self, other: "RoutineValue") -> "RoutineValue":
+        return RoutineValue("truth", "or", (self, other))
+
+    def __invert__(self) -> "RoutineValue":
+        return RoutineValue("truth", "not", (self,))
+
 
 Operand = RoutineValue | float | int
 
 
 def as_value(value: Operand, kind: ValueKind) -> RoutineValue:
-    """A number of this kind."""
+    """A value of this kind."""
     if isinstance(value, RoutineValue):
         if value.kind != kind:
             raise TypeError(f"{value.kind} where {kind} is needed")
@@ -94,7 +142,7 @@ def as_value(value: Operand, kind: ValueKind) -> RoutineValue:
 
 
 def select(condition: RoutineValue, if_true: Operand, if_false: Operand) -> RoutineValue:
-    """One of two numbers."""
+    """`if_true` where a condition holds, else `if_false`."""
     return RoutineValue(
         "real", "select", (condition, as_value(if_true, "real"), as_value(if_false, "real"))
     )
@@ -102,12 +150,12 @@ def select(condition: RoutineValue, if_true: Operand, if_false: Operand) -> Rout
 
 @dataclass(frozen=True, eq=False)
 class ArrayPointer:
-    """Numbers in memory, from some element of an argument or of a routine's own array on.
+    """Position in an argument or local array of a routine.
 
     Attributes:
-        name: Of the argument or the own array.
-        offset: Elements before the first one.
-        layout: Its parts, where they have names.
+        name: Name of the argument or local array.
+        offset: Index of the first element.
+        layout: Names of its parts, if any.
     """
 
     name: str
@@ -121,13 +169,13 @@ class ArrayPointer:
     def element_pointer(
         self, index: "int | RoutineValue | str", layout: Layout | None = None
     ) -> "ArrayPointer":
-        """What begins at an element or a part."""
+        """Pointer to an element or a part."""
         return ArrayPointer(self.name, self.offset + self._element_index(index), layout)
 
     def row_pointer(
         self, index: "int | RoutineValue", width: int, layout: Layout | None = None
     ) -> "ArrayPointer":
-        """One of many rows."""
+        """Pointer to a row."""
         return self.element_pointer(as_value(index, "integer") * width, layout)
 
     def _element_index(self, index: "int | RoutineValue | str") -> RoutineValue:
@@ -162,7 +210,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Copy:
-    """Some elements from one array to another; they do not overlap."""
+    """Copy elements between arrays that do not overlap."""
 
     target: ArrayPointer
     source: ArrayPointer
@@ -171,7 +219,7 @@ class Copy:
 
 @dataclass(frozen=True)
 class Call:
-    """A formula, a routine, or a function that is an argument; `variable` takes its answer."""
+    """Call of a formula, routine or function argument; `variable` receives the result."""
 
     function: str
     arguments: tuple["RoutineValue | ArrayPointer | FunctionArgument", ...]
@@ -180,7 +228,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Loop:
-    """Without end, or `variable` from 0 to below `count`."""
+    """Infinite loop, or loop with `variable` from 0 to `count` - 1."""
 
     body: list["Statement"]
     variable: RoutineValue | None = None
@@ -189,7 +237,7 @@ class Loop:
 
 @dataclass(frozen=True)
 class If:
-    """One of two sequences."""
+    """Conditional statements."""
 
     condition: RoutineValue
     then_body: list["Statement"]
@@ -198,7 +246,7 @@ class If:
 
 @dataclass(frozen=True)
 class Break:
-    """Go on behind the innermost loop."""
+    """Leave the innermost loop."""
 
 
 @dataclass(frozen=True)
@@ -213,13 +261,13 @@ Statement = Assign | Store | Copy | Call | Loop | If | Break | Return
 
 @dataclass(frozen=True, eq=False)
 class Formula:
-    """f(in_0, in_1, ..., out), straight on.
+    """f(in_0, in_1, ..., out), straight-line code.
 
     Attributes:
         name: Its name.
-        input_count: Number of arguments that are read.
-        outputs: What it writes, (m,).
-        layout: The outputs' parts.
+        input_count: Number of input arguments.
+        outputs: Output expressions, (m,).
+        layout: Layout of the outputs.
     """
 
     name: str
@@ -229,24 +277,24 @@ class Formula:
 
     @property
     def argument_kinds(self) -> tuple[ArgumentKind, ...]:
-        """Of the arguments."""
+        """Kinds of the arguments."""
         return tuple("array" for _ in range(self.input_count + 1))
 
 
 class Routine:
-    """f(counts, functions, arrays) -> integer, built by its methods; see the module's text.
+    """f(counts, functions, arrays) -> integer, built by the methods below.
 
-    The arguments are attributes. Arrays of its own (`local_array`) hold nothing at first and are
-    gone when it returns, so any number of threads may be in it.
+    The arguments are attributes. Local arrays (`local_array`) are uninitialized and live until it
+    returns, so that any number of threads may execute it.
 
     Attributes:
         name: Its name.
-        counts: Names of arguments that are integers.
-        functions: Names of arguments that are functions.
-        arrays: Names of arguments that are arrays.
-        local_arrays: Length of each array of its own.
+        counts: Names of the integer arguments.
+        functions: Names of the function arguments.
+        arrays: Names of the array arguments.
+        local_arrays: Length of each local array.
         body: Statements.
-        variables: Values whose operation is "variable".
+        variables: Values with the operation "variable".
     """
 
     def __init__(
@@ -277,14 +325,14 @@ class Routine:
 
     @property
     def argument_kinds(self) -> tuple[ArgumentKind, ...]:
-        """Of the arguments, in their order."""
+        """Kinds of the arguments, in their order."""
         kinds: list[ArgumentKind] = ["count" for _ in self.counts]
         kinds += ["function" for _ in self.functions]
         kinds += ["array" for _ in self.arrays]
         return tuple(kinds)
 
     def local_array(self, name: str, layout: Layout | int) -> ArrayPointer:
-        """An array of its own."""
+        """Add a local array."""
         size = layout if isinstance(layout, int) else layout.size
         if name in self.local_arrays or name in self._arguments:
             raise ValueError(f"'{self.name}' has two arrays '{name}'")
@@ -292,7 +340,7 @@ class Routine:
         return ArrayPointer(name, layout=layout if isinstance(layout, Layout) else None)
 
     def new_variable(self, value: Operand) -> RoutineValue:
-        """A variable with the value that something has now, an integer if it is an int."""
+        """Add a variable with an initial value; an integer variable if the value is an int."""
         kind: ValueKind = "integer" if isinstance(value, int) else "real"
         value = as_value(value, value.kind if isinstance(value, RoutineValue) else kind)
         variable = self._add_variable(value.kind)
@@ -300,7 +348,7 @@ class Routine:
         return variable
 
     def assign(self, variable: RoutineValue, value: Operand) -> None:
-        """Give a variable another value."""
+        """Assign a value to a variable."""
         self._append_statement(Assign(variable, as_value(value, variable.kind)))
 
     def store(self, array: ArrayPointer, index: int | RoutineValue | str, value: Operand) -> None:
@@ -314,7 +362,7 @@ class Routine:
     def call(
         self, function: str, *arguments: "RoutineValue | ArrayPointer | FunctionArgument | int"
     ) -> RoutineValue:
-        """Call a formula, an earlier routine, or a function argument; the integer it returns."""
+        """Call a formula, an earlier routine, or a function argument; returns its integer."""
         ready = tuple(as_value(x, "integer") if isinstance(x, int) else x for x in arguments)
         callee = self._callees.get(function)
         if callee is None and function not in self.functions:
@@ -330,7 +378,7 @@ class Routine:
 
     @contextmanager
     def loop(self, count: RoutineValue) -> Iterator[RoutineValue]:
-        """The statements inside for an index from 0 to below a count."""
+        """Context of a loop with an index from 0 to count - 1."""
         variable = self._add_variable("integer")
         loop = Loop([], variable, count)
         self._append_statement(loop)
@@ -339,7 +387,7 @@ class Routine:
 
     @contextmanager
     def loop_forever(self) -> Iterator[None]:
-        """The statements inside until one of them leaves."""
+        """Context of an infinite loop."""
         loop = Loop([])
         self._append_statement(loop)
         with self._inside_block(loop.body):
@@ -347,7 +395,7 @@ class Routine:
 
     @contextmanager
     def if_then(self, condition: RoutineValue) -> Iterator[None]:
-        """The statements inside where something is true."""
+        """Context of the statements for a true condition."""
         when = If(condition, [], [])
         self._append_statement(when)
         with self._inside_block(when.then_body):
@@ -355,18 +403,18 @@ class Routine:
 
     @contextmanager
     def if_else(self) -> Iterator[None]:
-        """The statements inside where the test of the `if_then` before them is not true."""
+        """Context of the statements for a false condition of the preceding `if_then`."""
         when = self._open_blocks[-1][-1]
         assert isinstance(when, If)
         with self._inside_block(when.else_body):
             yield
 
     def break_loop(self) -> None:
-        """Go on behind the innermost loop."""
+        """Leave the innermost loop."""
         self._append_statement(Break())
 
     def return_value(self, value: Operand) -> None:
-        """Return."""
+        """Return an integer."""
         self._append_statement(Return(as_value(value, "integer")))
 
     def _add_variable(self, kind: ValueKind) -> RoutineValue:

@@ -1,4 +1,4 @@
-"""Sparse elimination as formulas: what is zero while tracing never becomes an operation."""
+"""Matrix factorizations as symbolic formulas; structural zeros cause no operations."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,13 +9,13 @@ Matrix = list[list[Scalar]]
 
 
 class LdltFactorization:
-    """A symmetric positive definite matrix as L D L^T, L with ones on its diagonal.
+    """Factorization L D L^T of a symmetric positive definite matrix, with unit diagonal of L.
 
     Args:
         matrix: (k, k), of which the lower half is read.
 
     Attributes:
-        inverse_diagonal: (k,) one over the diagonal of D.
+        inverse_diagonal: (k,) inverse of D.
     """
 
     def __init__(self, matrix: Sequence[Sequence[Scalar]]):
@@ -66,10 +66,10 @@ class LdltFactorization:
 
 
 def lu_factorize(matrix: Sequence[Sequence[Scalar]]) -> Matrix:
-    """L and U of a matrix in one, by elimination without pivoting.
+    """LU factorization without pivoting, L and U in one matrix.
 
-    The diagonal holds one over that of U; L has ones there. The order of the rows is the user's
-    business: pivots must stay away from zero.
+    The diagonal holds the inverse of U's; L has a unit diagonal. The caller must order the rows so
+    that pivots stay away from zero.
 
     Args:
         matrix: (k, k).
@@ -89,7 +89,7 @@ def lu_factorize(matrix: Sequence[Sequence[Scalar]]) -> Matrix:
 
 
 def lu_solve(factors: Sequence[Sequence[Scalar]], right: Sequence[Scalar]) -> list[Scalar]:
-    """Solution x of A x = b, given `lu_factorize` of A."""
+    """Solution x of A x = b, from `lu_factorize` of A."""
     x = list(right)
     size = len(x)
     for i in range(size):
@@ -103,12 +103,12 @@ def lu_solve(factors: Sequence[Sequence[Scalar]], right: Sequence[Scalar]) -> li
 
 
 def symbolic_entries(matrix: Sequence[Sequence[Scalar]]) -> list[Scalar]:
-    """The entries that are no constants, row by row."""
+    """The entries that are not constant, row by row."""
     return [entry for row in matrix for entry in row if isinstance(entry, SymbolicExpression)]
 
 
 def load_matrix(matrix: Sequence[Sequence[Scalar]], tape: Tape, array: int, start: int) -> Matrix:
-    """The same matrix, whose `symbolic_entries` are read from a function's argument."""
+    """The same matrix, with `symbolic_entries` loaded from an argument of a function."""
     indices = itertools.count(start)
 
     def read(entry: Scalar) -> Scalar:

@@ -1,14 +1,13 @@
 """Programs: straight-line formulas, and routines that call them in loops.
 
 A formula reads arrays and writes one, without branches; its operations come from a `Tape`. A
-routine has what formulas have not: sequences, loops over samples with strides, conditions that
-stop, and arrays of its own. Nothing here is written in a machine's language: an emitter
-(`crane.codegen.llvm`) translates.
+routine adds sequences, loops over samples, conditions and local arrays. Programs do not depend on
+the target language: an emitter (`crane.codegen.llvm`) translates them.
 
-    with program.routine("each", counts=("count",), arrays=("inputs", "out")) as r:
+    with program.add_routine("each", counts=("count",), arrays=("inputs", "out")) as r:
         with r.loop(r.count) as i:
             r.call("formula", r.inputs.row_pointer(i, 3), r.out.row_pointer(i, 2))
-        r.give(r.count)
+        r.return_value(r.count)
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen.intermediate_representation import Formula, Routine
-from crane.codegen.layout import Layout, layout_of
+from crane.codegen.intermediate_representation import Formula, Layout, Routine, layout_of
 from crane.codegen.llvm.machine_code import MachineCode
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
@@ -33,7 +31,7 @@ class FormulaTooLongError(Exception):
     """A formula has more than `MAX_OPERATIONS` operations.
 
     Args:
-        operation_count: How many, where it is known.
+        operations: Number of operations, if known.
     """
 
     def __init__(self, operations: int = 0):
@@ -42,11 +40,11 @@ class FormulaTooLongError(Exception):
 
 
 class Program:
-    """Formulas and routines, compiled together.
+    """Formulas and routines that are compiled together.
 
     Attributes:
-        functions: By name, in the order in which they were added; none of a program that was kept.
-        max_formula_length: Operations of the longest formula.
+        functions: By name, in the order in which they were added; empty if loaded from the cache.
+        max_formula_length: Number of operations of the longest formula.
     """
 
     def __init__(self) -> None:
@@ -57,15 +55,15 @@ class Program:
 
     @classmethod
     def from_cache(cls, dependencies: Any, build: Callable[["Program"], None]) -> "Program":
-        """A compiled program, which is built only where none is kept between runs.
+        """A compiled program from the cache, or else built and compiled.
 
         Args:
-            dependencies: All that it depends on besides the package's own files, see
-                `cache_entry_name`; None where it depends on more.
+            dependencies: Everything that it depends on besides the package's files, see
+                `cache_entry_name`; None if that cannot be given.
             build: Adds its formulas and routines.
 
         Raises:
-            TooLongError: A formula has too many operations.
+            FormulaTooLongError: A formula has too many operations.
         """
         entry_name = cache_entry_name(dependencies)
         record = ProgramRecord.from_cache(entry_name)
@@ -103,14 +101,14 @@ class Program:
 
         Args:
             name: Its name.
-            input_count: Number of arguments that are read; one more takes the outputs.
+            input_count: Number of input arguments; one more receives the outputs.
             outputs: (m,), or parts of them by name.
 
         Returns:
-            The outputs' parts; one `all` where they have no names.
+            Layout of the outputs; one part `all` where they have no names.
 
         Raises:
-            TooLongError: It has too many operations.
+            FormulaTooLongError: It has too many operations.
         """
         parts = outputs if isinstance(outputs, Mapping) else {"all": outputs}
         flat = [value for part in parts.values() for value in part]
@@ -131,7 +129,7 @@ class Program:
         functions: Sequence[str] = (),
         arrays: Sequence[str] | Mapping[str, Layout | None],
     ) -> Iterator[Routine]:
-        """Add a routine, which is built inside."""
+        """Add a routine, which is built in the context."""
         named = arrays if isinstance(arrays, Mapping) else dict.fromkeys(arrays)
         routine = Routine(name, self.functions, counts, functions, named)
         yield routine
@@ -139,34 +137,34 @@ class Program:
         self._signatures[name] = FunctionSignature(routine.argument_kinds, None)
 
     def formula_outputs(self, name: str) -> Layout:
-        """Parts of what a formula writes."""
+        """Layout of the outputs of a formula."""
         layout = self._signatures[name].outputs
         assert layout is not None
         return layout
 
     def compile(self) -> None:
-        """Translate everything that was added."""
+        """Compile everything that was added."""
         self._machine_code = MachineCode.compile_functions(self.functions.values())
 
     def function_address(self, name: str) -> int:
-        """Where a compiled function is, for as long as the program lives."""
+        """Address of a compiled function, valid for the lifetime of the program."""
         return int(self._machine_code.function_address(name))
 
     def call(self, name: str, *arguments: "int | np.ndarray") -> int:
-        """Call a compiled formula or routine once, other threads running meanwhile.
+        """Call a compiled formula or routine once, without the global interpreter lock.
 
         Args:
-            name: Which.
+            name: Name of the function.
             arguments: Counts, addresses of functions, and arrays, which must be contiguous.
 
         Returns:
-            What a routine returns, 0 of a formula.
+            The integer that a routine returns, 0 for a formula.
         """
         result: int = self._entry_point(name, arguments)(_pack_addresses(arguments))
         return result
 
     def bind(self, name: str, *arguments: "int | np.ndarray") -> "BoundFunction":
-        """A function with its arguments, for many calls that must cost little."""
+        """A function with its arguments bound, for many fast calls."""
         return BoundFunction(self, self._entry_point(name, arguments), arguments)
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
@@ -177,13 +175,13 @@ class Program:
 
 
 class BoundFunction(partial[int]):
-    """A compiled function together with its arguments, which it keeps alive; see `Program.call`.
+    """A compiled function with bound arguments, which it keeps alive; see `Program.call`.
 
-    One pointer costs a call from Python far less than a dozen.
+    Passing one pointer from Python is much faster than passing a dozen.
 
     Args:
-        program: Where the function is, kept alive.
-        entry_point: Takes the address of the arguments' addresses.
+        program: Program of the function, kept alive.
+        entry: Function that takes the address of the arguments' addresses.
         arguments: See `Program.call`.
     """
 
@@ -192,7 +190,7 @@ class BoundFunction(partial[int]):
     def __new__(
         cls, program: Program, entry: Any, arguments: Sequence["int | np.ndarray"]
     ) -> "BoundFunction":
-        """Keep all of it."""
+        """Bind the arguments."""
         addresses = np.frombuffer(_pack_addresses(arguments), dtype=np.int64)
         self = super().__new__(cls, entry, addresses.ctypes.data)
         self._references = program, addresses, arguments
@@ -206,7 +204,7 @@ def _pack_addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:
 def _argument_address(argument: "int | np.ndarray") -> int:
     if isinstance(argument, int):
         return argument
-    try:  # takes a tenth of the time of numpy's own way
+    try:  # ten times faster than array.ctypes.data
         return addressof(c_char.from_buffer(argument.data))
     except (TypeError, ValueError):  # not writable, or empty
         if not argument.flags.c_contiguous:

@@ -1,8 +1,8 @@
-"""Numbers that remember how they were computed.
+"""Symbolic expressions: numbers that record how they were computed.
 
-Python code that computes with `SymbolicExpression`s instead of floats leaves a tape of operations.
-What is known while tracing is folded: 0 and 1 disappear, equal operations are done once. So the
-general algorithms, traced for one machine, become that machine's own formulas.
+Python code that computes with `SymbolicExpression`s instead of floats records a tape of
+operations. Values that are known while tracing are folded: 0 and 1 disappear, equal operations are
+recorded once. General algorithms, traced for one machine, become the formulas of that machine.
 """
 
 import math
@@ -25,8 +25,8 @@ class Tape:
         self._known_operations: dict[tuple[object, ...], int] = {}
 
     def record(self, *operation: object) -> "SymbolicExpression":
-        """The expression of an operation, the old one if it is there already."""
-        # the constant 2.0 and operation number 2 are equal to Python
+        """The expression of an operation, which is only recorded once."""
+        # in Python the constant 2.0 equals the operation index 2
         key = (*operation, *(type(operand) is float for operand in operation))
         index = self._known_operations.get(key)
         if index is None:
@@ -44,7 +44,7 @@ class Tape:
 
 
 class SymbolicExpression:
-    """One value on a tape."""
+    """A value on a tape."""
 
     __slots__ = ("index", "tape")
 
@@ -126,7 +126,7 @@ def apply_function(function: str, x: Scalar) -> Scalar:
 
 
 def maximum(a: Scalar, b: Scalar) -> Scalar:
-    """The larger of two; NaN wins, so that it cannot hide."""
+    """The larger of two; NaN if one is NaN."""
     if isinstance(a, SymbolicExpression):
         return a.tape.record(
             "maximum", a.index, b.index if isinstance(b, SymbolicExpression) else float(b)
@@ -137,12 +137,12 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
 
 
 def minimum(a: Scalar, b: Scalar) -> Scalar:
-    """The smaller of two; NaN wins."""
+    """The smaller of two; NaN if one is NaN."""
     return -maximum(-a, -b)
 
 
 def where_positive(x: Scalar, if_positive: Scalar, otherwise: Scalar) -> Scalar:
-    """One number where x > 0, another elsewhere."""
+    """`if_positive` where x > 0, else `otherwise`."""
     if not isinstance(x, SymbolicExpression):
         return if_positive if x > 0 else otherwise
     words = (
@@ -153,7 +153,7 @@ def where_positive(x: Scalar, if_positive: Scalar, otherwise: Scalar) -> Scalar:
 
 
 def max_abs(values: Iterable[Scalar]) -> Scalar:
-    """The largest absolute value, 0 of none."""
+    """The largest absolute value, 0 of an empty sequence."""
     out: Scalar = 0.0
     for value in values:
         out = maximum(out, apply_function("abs", value))
@@ -161,7 +161,7 @@ def max_abs(values: Iterable[Scalar]) -> Scalar:
 
 
 def copysign(magnitude: Scalar, sign: Scalar) -> Scalar:
-    """|magnitude| with another's sign."""
+    """|magnitude| with the sign of `sign`."""
     if not isinstance(sign, SymbolicExpression):
         return math.copysign(1.0, sign) * apply_function("abs", magnitude)
     first = magnitude.index if isinstance(magnitude, SymbolicExpression) else float(magnitude)
@@ -209,7 +209,7 @@ def matvec(matrix: Sequence[Sequence[Scalar]], vector: Sequence[Scalar]) -> list
 
 
 def transpose(matrix: Sequence[Sequence[Scalar]]) -> list[list[Scalar]]:
-    """Rows as columns."""
+    """Transpose of a matrix."""
     return [list(column) for column in zip(*matrix, strict=True)]
 
 
@@ -220,9 +220,9 @@ def matmul(a: Sequence[Sequence[Scalar]], b: Sequence[Sequence[Scalar]]) -> list
 
 
 def dot_products(vector: Sequence[Scalar], others: Sequence[Sequence[Scalar]]) -> list[Scalar]:
-    """Dot products of one vector with several, which machine code takes at once.
+    """Dot products of one vector with several, which machine code computes together.
 
-    Each is one operation, ("dot", *vector, *other). What is not a formula is not worth one.
+    Each symbolic one is a single operation, ("dot", *vector, *other).
     """
     nonzero = [i for i, x in enumerate(vector) if isinstance(x, SymbolicExpression) or x != 0]
     first = [vector[i] for i in nonzero]
@@ -273,7 +273,7 @@ def solve_linear_system(
         below = dot(column[1:], column[1:])
         if (
             not isinstance(below, SymbolicExpression) and below == 0
-        ):  # nothing below: no reflection
+        ):  # only zeros below: no reflection needed
             diagonal.append(column[0])
             determinant = determinant * column[0]
             continue
@@ -290,7 +290,9 @@ def solve_linear_system(
             for i in range(k, size):
                 rows[i][j] = rows[i][j] - part * normal[i - k]
         diagonal.append(-length)
-        determinant = determinant * length  # -length on the diagonal, and -1 of the reflection
+        determinant = (
+            determinant * length
+        )  # -length from the diagonal, times -1 from the reflection
     width = len(right[0])
     out: list[list[Scalar]] = [[0.0] * width for _ in range(size)]
     for k in range(size - 1, -1, -1):

@@ -1,4 +1,7 @@
-"""Files and folders are written whole or not at all; folders that are not there are made."""
+"""Atomic output: files and folders are written completely or not at all.
+
+Missing folders are created.
+"""
 
 import os
 import re
@@ -9,20 +12,18 @@ from pathlib import Path
 
 from crane.common import temporary_files
 from crane.common.errors import OutputError
-from crane.common.folder_exchange import exchange_folders, move_to_free_path
+from crane.common.temporary_files import exchange_folders, move_to_free_path
 
 
 @contextmanager
 def replace_file(path: str | Path) -> Iterator[Path]:
-    """A temporary path to write to, which takes the place of `path` at the end.
+    """Context of a temporary path that replaces `path` at the end.
 
-    The temporary file stands in the same folder, or where there is none in the nearest folder
-    above it, and is removed when the block raises; whatever was at `path` before then stays as it
-    was.
+    The temporary file is in the same folder, or in the nearest existing folder above. It is
+    removed when the block raises, and `path` is then unchanged.
 
     Raises:
-        OutputError: Nothing can be written there, or something other than a plain file is in the
-            way.
+        OutputError: Nothing can be written there, or `path` is not a plain file.
     """
     path = Path(path)
     check_file_is_writable(path)
@@ -41,26 +42,25 @@ def replace_file(path: str | Path) -> Iterator[Path]:
 def replace_folder(
     folder: str | Path, overwrite: bool = True, stale: Iterable[str] = ()
 ) -> Iterator[Path]:
-    """A temporary folder to write to, which takes the place of `folder` at the end.
+    """Context of a temporary folder that replaces `folder` at the end.
 
-    It stands beside `folder`, or where that does not exist in the nearest folder above it that
-    does, and is removed when the block raises. Whatever else is in `folder` stays there: of its
-    files there are links in the new folder. Whoever looks, at any instant, and whoever finds it
-    after a kill, sees what was there or what was written, and never some of both.
+    It is beside `folder`, or in the nearest existing folder above, and is removed when the block
+    raises. Other files in `folder` are kept: the new folder has links to them. At any instant,
+    also after a kill, `folder` has either its old or its new content.
 
-    There is no place beside the current folder and those above it, where a disk is mounted, or in
-    a folder that may not be written to, and some file systems have no links: such a folder is
-    filled file by file, as by `fill_folder`.
+    Some folders cannot be replaced: the current folder and those above it, mount points, folders
+    without write permission, and those on file systems without links. They are filled file by
+    file, as by `fill_folder`.
 
     Args:
-        folder: Created where there is none.
-        overwrite: Whether files of the same names are replaced; if not, `folder` has to be new or
-            empty, at the end, too.
-        stale: Patterns of paths in `folder`, of files that do not stay.
+        folder: Created if it does not exist.
+        overwrite: Whether files of the same names are replaced; if not, `folder` must be new or
+            empty, also at the end.
+        stale: Patterns of paths in `folder`, of files to remove.
 
     Raises:
-        OutputError: Nothing can be written there, a folder is where a file is to go, or a file
-            where a folder is to go, or `folder` was filled meanwhile.
+        OutputError: Nothing can be written there, a file would replace a folder or a folder a
+            file, or `folder` was filled meanwhile.
     """
     target = Path(os.path.realpath(folder))
     _check_writable(target)
@@ -85,24 +85,24 @@ def replace_folder(
         try:
             _link_other_files(target, output_folder, _match_patterns(target, stale))
             exchange_folders(output_folder, target)
-        except OSError:  # no links here, or another user's folder
+        except OSError:  # no links on this file system, or another user's folder
             _move_files(output_folder, target, stale)
 
 
 @contextmanager
 def fill_folder(folder: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
-    """A temporary folder to write to, whose files go one by one into `folder` at the end.
+    """Context of a temporary folder whose files are moved one by one into `folder` at the end.
 
-    For a folder that is the user's place rather than a result. The temporary folder stands in it,
-    or where there is none in the nearest folder above it, and is removed when the block raises.
+    For folders of the user rather than results. The temporary folder is in `folder`, or in the
+    nearest existing folder above, and is removed when the block raises.
 
     Args:
-        folder: Created where there is none; files of the same names are replaced, others stay.
-        stale: Patterns of paths in `folder`, of files that do not stay.
+        folder: Created if it does not exist; files of the same names are replaced, others kept.
+        stale: Patterns of paths in `folder`, of files to remove.
 
     Raises:
-        OutputError: Nothing can be written there, or a folder is where a file is to go, or a file
-            where a folder is to go.
+        OutputError: Nothing can be written there, or a file would replace a folder or a folder a
+            file.
     """
     target = Path(os.path.realpath(folder))
     _check_writable(target)
@@ -118,11 +118,11 @@ def fill_folder(folder: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]
 def _temporary_output_folder(
     folder: str | Path, target: Path, parent: Path | None = None, subfolder: Path = Path()
 ) -> Iterator[tuple[Path, Path]]:
-    """A temporary folder for a place, and the one in it that is written to.
+    """A temporary folder, and the subfolder in it that is written to.
 
     Raises:
-        OutputError: One that is raised in the block, told of the folder that the user knows, or
-            nothing can be written.
+        OutputError: Raised in the block, with the path that the user knows; or nothing can be
+            written.
     """
     try:
         temporary_files.remove_leftovers(target, parent)
@@ -139,7 +139,7 @@ def _temporary_output_folder(
 
 
 def check_file_is_writable(path: Path, overwrite: bool = True) -> None:
-    """See that a file can be written, before it is computed.
+    """Check that a file can be written, before it is computed.
 
     Raises:
         OutputError: Its folder can be neither written to nor made, something other than a plain
@@ -150,7 +150,7 @@ def check_file_is_writable(path: Path, overwrite: bool = True) -> None:
             raise OutputError(f"{path}: is a folder, give the name of a file")
         if path.exists() and not path.is_file():
             raise OutputError(f"{path}: is no plain file, give another name")
-    except OSError as error:  # a name longer than any file's, a folder that may not be entered
+    except OSError as error:  # a name that is too long, or a folder without permission
         raise _cannot_be_written_error(path, error) from None
     _check_writable(path.parent)
     if path.exists() and not overwrite:
@@ -158,9 +158,9 @@ def check_file_is_writable(path: Path, overwrite: bool = True) -> None:
 
 
 def check_folder_is_writable(folder: Path, overwrite: bool = True) -> None:
-    """See that a folder can be made or filled, before its files are computed.
+    """Check that a folder can be made or filled, before its files are computed.
 
-    What killed processes left over of it is removed.
+    Removes what killed processes left there.
 
     Raises:
         OutputError: A file is in the way, the nearest folder may not be written to, or the folder
@@ -182,7 +182,7 @@ def check_folder_is_writable(folder: Path, overwrite: bool = True) -> None:
 
 
 def portable_file_name(text: str) -> str:
-    """A name for a file that every system takes, as near to a text as possible."""
+    """A file name that is valid on every system, as similar to a text as possible."""
     return re.sub(r"[^\w.-]+", "_", text).strip("._")[:60] or "unnamed"
 
 
@@ -216,18 +216,18 @@ def _first_missing(path: Path) -> Path:
 
 
 def _can_be_moved(target: Path) -> bool:
-    """Whether a folder can be put in the place of this one."""
+    """Whether a folder can be replaced by renaming."""
     if not os.access(_first_missing(target).parent, os.W_OK | os.X_OK):
         return False
     try:
         current = Path(os.path.realpath(os.getcwd()))
-    except OSError:  # it is gone
+    except OSError:  # the current folder was removed
         return not os.path.ismount(target)
     return not (current.is_relative_to(target) or os.path.ismount(target))
 
 
 def _check_free(target: Path, folder: str | Path) -> None:
-    """Raise if a folder holds something besides what is being written to it."""
+    """Raise if a folder contains other files than temporary ones."""
     if any(not temporary_files.is_temporary(name, target) for name in os.listdir(target)):
         raise OutputError(
             f"{folder}: is there now, another program has filled it meanwhile, choose another "
@@ -236,12 +236,12 @@ def _check_free(target: Path, folder: str | Path) -> None:
 
 
 def _match_patterns(target: Path, patterns: Iterable[str]) -> set[Path]:
-    """Files that patterns name."""
+    """Files in a folder that match patterns."""
     return {x for pattern in patterns for x in target.glob(pattern) if not x.is_dir()}
 
 
 def _link_other_files(old: Path, new: Path, stale: set[Path]) -> None:
-    """Link into a new folder what of an old one is not in it, and not stale."""
+    """Link files of an old folder into a new one, except stale and existing ones."""
     for entry in os.scandir(old):
         here, there = old / entry.name, new / entry.name
         is_folder = entry.is_dir(follow_symlinks=False)
@@ -259,7 +259,7 @@ def _link_other_files(old: Path, new: Path, stale: set[Path]) -> None:
             _link_other_files(here, there, stale)
             if any(there.iterdir()) or not any(here.iterdir()):
                 shutil.copystat(here, there)
-            else:  # all of it was stale
+            else:  # all files in it were stale
                 there.rmdir()
         else:
             os.link(here, there, follow_symlinks=False)
@@ -267,14 +267,14 @@ def _link_other_files(old: Path, new: Path, stale: set[Path]) -> None:
 
 
 def _move_files(source: Path, target: Path, patterns: Iterable[str]) -> None:
-    """Move all files from one folder into another, the same names replaced, then remove others."""
+    """Move all files from one folder into another, then remove stale files."""
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(source, target)
         return
     files = [path.relative_to(source) for path in sorted(source.rglob("*")) if path.is_file()]
     stale = _match_patterns(target, patterns) - {target / file for file in files}
-    for file in files:  # what is in the way is found before anything is moved
+    for file in files:  # check everything before moving anything
         _check_writable((target / file).parent)
         if (target / file).is_dir():
             raise _folder_in_the_way_error(target / file)

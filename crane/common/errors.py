@@ -1,9 +1,13 @@
-"""Every exception and warning of the package.
+"""Exceptions and warnings of the package, and the grouping of similar messages.
 
 A message is one line that says what is wrong, where, and what to do about it.
 """
 
-from collections.abc import Iterable
+import re
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
 from typing import Any
 
@@ -14,10 +18,10 @@ _MAX_WORD_LENGTH, _MAX_LINE_LENGTH = (
 
 
 def format_one_line(text: str) -> str:
-    """Text as one line that can be read.
+    """Text as one printable line.
 
-    What cannot be printed (a name may hold it) becomes a space; of words and lines without end
-    the middle is left out.
+    Characters that cannot be printed become spaces; very long words and lines are shortened in the
+    middle.
     """
     text = "".join(c if c.isprintable() else " " for c in text)
     if len(text) > _MAX_WORD_LENGTH:
@@ -26,7 +30,7 @@ def format_one_line(text: str) -> str:
 
 
 def prefix_location(location: str, error: Exception) -> str:
-    """`place: message`, and the message alone where that begins with the place."""
+    """Message of an error with its location in front, unless it begins with it."""
     text = str(error)
     return text if text.startswith(location) else f"{location}: {text}"
 
@@ -40,7 +44,7 @@ def _shorten(text: str, max_length: int) -> str:
 
 
 class CraneError(Exception):
-    """Base class of everything this package raises on purpose.
+    """Base class of all exceptions that this package raises intentionally.
 
     Args:
         message: One line, see `format_one_line`.
@@ -51,16 +55,16 @@ class CraneError(Exception):
 
 
 class DescriptionError(CraneError):
-    """A machine file or a URDF says something that cannot be."""
+    """A machine file or URDF contains invalid or contradictory data."""
 
 
 class MechanismError(CraneError):
-    """The parts are well described, but do not make a machine that can be driven.
+    """The parts are valid, but do not form a machine that can be driven.
 
     Args:
         message: See `CraneError`.
-        subject: What of the description it is about: "active", "home", or "loop" and its name.
-        configuration: (nq,) where the loops close, if that was found.
+        subject: The part of the description concerned: "active", "home", or "loop" and its name.
+        configuration: (nq,) where the loops close, if it was found.
     """
 
     def __init__(self, message: str, subject: str = "", configuration: Any = None):
@@ -78,23 +82,23 @@ class LimitError(CraneError):
 
 
 class ClosureError(CraneError):
-    """The loops cannot be closed as asked."""
+    """The loops cannot be closed as requested."""
 
 
 class OutOfReachError(ClosureError):
-    """No posture closes the loops at these active coordinates."""
+    """No configuration closes the loops at these active coordinates."""
 
 
 class SingularConfigurationError(ClosureError):
-    """The loops close, but at a posture where the passive joints are not determined."""
+    """The loops close, but at a configuration where the passive joints are not determined."""
 
 
 class WrongBranchError(ClosureError):
-    """The loops close, but in another assembly branch than the home posture's."""
+    """The loops close, but on another branch than that of the home configuration."""
 
 
 class UnreachableTipError(CraneError):
-    """No active coordinates within their limits put the tip where it was asked to be."""
+    """No active coordinates within their limits put the tip at the requested position."""
 
 
 class RecordingError(CraneError):
@@ -102,26 +106,26 @@ class RecordingError(CraneError):
 
 
 class SimulationError(CraneError):
-    """A simulation could not go on.
+    """A simulation could not continue.
 
     Attributes:
-        recording: What there is of it, whose `stopped` says where and why it ended; None where it
-            did not begin, or where nothing was to be recorded.
+        recording: The recording up to the error, whose `stopped` gives place and reason; None if
+            the simulation did not start, or nothing was to be recorded.
     """
 
     recording: Any = None
 
 
 class OutputError(CraneError):
-    """A result cannot be written where it was asked to be."""
+    """A result cannot be written to the requested path."""
 
 
 class CraneWarning(UserWarning):
-    """Something is unusual enough to be told, and not wrong enough to refuse."""
+    """Something unusual that is not an error."""
 
 
-_MAX_SEARCHED_NAMES = 2000  # names to search for a similar one
-_HOLDS = 0.7  # likeness of names of which one holds the other
+_MAX_SEARCHED_NAMES = 2000  # largest number of names to search for a similar one
+_HOLDS = 0.7  # likeness of names of which one contains the other
 _MAX_LISTED_NAMES, _NEAREST = (
     20,
     8,
@@ -129,11 +133,11 @@ _MAX_LISTED_NAMES, _NEAREST = (
 
 
 def suggest_names(names: Iterable[str], unknown_name: str | None = None) -> str:
-    """Words an error ends with: the name that was meant, all there are, or of many the nearest.
+    """End of an error message: the most similar name, all names, or the nearest of many.
 
     Args:
-        names: Those that exist.
-        unknown_name: What was asked for, and is none of them.
+        names: Valid names.
+        unknown_name: The name that is not valid.
     """
     names = list(names)
     if not names:
@@ -154,7 +158,69 @@ def suggest_names(names: Iterable[str], unknown_name: str | None = None) -> str:
 
 
 def _likeness(name: str, wanted: str) -> float:
-    """How alike two names are, 0 to 1, whatever their case; more if one holds the other."""
+    """Similarity of two names, 0 to 1, ignoring case; at least 0.7 if one contains the other."""
     name, wanted = name.lower(), wanted.lower()
     alike = SequenceMatcher(None, name, wanted).ratio()
     return max(alike, _HOLDS) if wanted and (wanted in name or name in wanted) else alike
+
+
+MAX_WARNINGS = 5  # per file
+_LOCATION_PATTERN = re.compile(r"^.+?\.\w+:\d+: ")
+_QUOTED_PATTERN = re.compile(r"'[^']*'")
+_NUMBER_PATTERN = re.compile(r"(?<![\w.])-?\d+(\.\d*)?(e[-+]?\d+)?")
+
+
+def message_kind(message: str) -> str:
+    """A message without its location, with placeholders for names and numbers."""
+    return _NUMBER_PATTERN.sub("#", _QUOTED_PATTERN.sub("''", _LOCATION_PATTERN.sub("", message)))
+
+
+@dataclass
+class MessageGroup:
+    """Messages of one kind.
+
+    Attributes:
+        first_message: The first message.
+        count: Number of messages.
+    """
+
+    first_message: str
+    count: int = 1
+
+    def __str__(self) -> str:
+        return (
+            self.first_message if self.count == 1 else f"{self.first_message} ({self.count} such)"
+        )
+
+
+def group_messages(messages: Iterable[str]) -> list[MessageGroup]:
+    """Messages by kind, in the order of their first occurrence."""
+    found: dict[str, MessageGroup] = {}
+    for message in messages:
+        group = found.get(message_kind(message))
+        if group is None:
+            found[message_kind(message)] = MessageGroup(message)
+        else:
+            group.count += 1
+    return list(found.values())
+
+
+@contextmanager
+def summarize_warnings() -> Iterator[None]:
+    """Context that delays warnings to its end: one per kind, and at most `MAX_WARNINGS`."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CraneWarning)
+        yield
+    package_messages = [
+        str(one.message) for one in caught if issubclass(one.category, CraneWarning)
+    ]
+    for one in caught:
+        if not issubclass(one.category, CraneWarning):
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    groups = group_messages(dict.fromkeys(package_messages))
+    texts = [str(group) for group in groups]
+    if len(texts) > MAX_WARNINGS:
+        rest = sum(group.count for group in groups[MAX_WARNINGS - 1 :])
+        texts[MAX_WARNINGS - 1 :] = [f"{rest} more warnings: crane check lists them"]
+    for text in texts:
+        warnings.warn(text, CraneWarning, stacklevel=4)

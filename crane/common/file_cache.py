@@ -1,8 +1,8 @@
-"""What is kept between runs, machine code above all: found once, it is read from a folder.
+"""Cache of computed results, mainly machine code, as files in the user's cache folder.
 
-A file each, in the user's cache, named by a digest of all that its content depends on. It begins
-with a digest of its own name and the rest, so that one that is damaged or belongs elsewhere is
-made anew. Where the folder cannot be written or belongs to someone else, nothing is kept.
+The name of a file is a digest of everything that its content depends on. The file begins with a
+digest of its own name and content, so that damaged or renamed files are not used. Nothing is
+cached where the folder cannot be written or belongs to another user.
 """
 
 import hashlib
@@ -18,28 +18,28 @@ from platformdirs import user_cache_path
 from crane.common.atomic_output import replace_file
 from crane.common.errors import OutputError
 
-MAX_CACHE_SIZE = 256 << 20  # bytes in the folder; what was used least lately makes room
-_CLEANUPS_PER_CACHE_SIZE = 16  # of these, after each of which the folder is looked through again
+MAX_CACHE_SIZE = 256 << 20  # [bytes]; the least recently used entries are removed
+_CLEANUPS_PER_CACHE_SIZE = 16  # cleanups per `MAX_CACHE_SIZE` written bytes
 _DIGEST_SIZE = 32  # bytes
-_remaining_bytes: dict[Path, int] = {}  # bytes that this process may write before it looks again
+_remaining_bytes: dict[Path, int] = {}  # [bytes] that may be written before the next cleanup
 
 
 def cache_folder() -> Path:
-    """Where things are kept."""
+    """Path of the cache folder."""
     return user_cache_path("crane", appauthor=False) / "objects"
 
 
 def entry_name(dependencies: str, kind: str = "code") -> str:
-    """The name of a file whose content depends on this alone."""
+    """The name of a cache entry whose content depends on `dependencies` only."""
     return f"{hashlib.sha256(dependencies.encode()).hexdigest()}.{kind}"
 
 
 def cached_object_code(dependencies: str, compile_code: Callable[[], bytes]) -> bytes:
-    """Machine code from the folder, or else made and put there.
+    """Machine code from the cache, or else compiled and cached.
 
     Args:
-        dependencies: All that it depends on.
-        compile_code: Makes it.
+        dependencies: Everything that it depends on.
+        compile_code: Compiles it.
     """
     name = entry_name(dependencies)
     found = read_entry(name)
@@ -50,7 +50,10 @@ def cached_object_code(dependencies: str, compile_code: Callable[[], bytes]) -> 
 
 
 def package_build(package: str) -> tuple[int, int] | None:
-    """What differs between builds of a package, which need not be imported; None if not here."""
+    """Time and size of a package's file, which differ between builds; None if it is not installed.
+
+    The package is not imported.
+    """
     spec = find_spec(package)
     if spec is None or spec.origin is None:
         return None
@@ -59,7 +62,7 @@ def package_build(package: str) -> tuple[int, int] | None:
 
 
 def read_entry(name: str) -> bytes | None:
-    """What is kept under a name; None where nothing is that was written whole under this name."""
+    """Content of a cache entry; None if it does not exist or is damaged."""
     file = cache_folder() / name
     try:
         if not _is_private(file.parent):
@@ -67,14 +70,14 @@ def read_entry(name: str) -> bytes | None:
         data = file.read_bytes()
     except OSError:
         return None
-    with suppress(OSError):  # a folder that may only be read serves as well
+    with suppress(OSError):  # a read-only folder can be used
         os.utime(file)
     code = data[_DIGEST_SIZE:]
     return code if _content_digest(name, code) == data[:_DIGEST_SIZE] else None
 
 
 def write_entry(name: str, content: bytes) -> None:
-    """Keep something under a name, if possible."""
+    """Write a cache entry, if possible."""
     file = cache_folder() / name
     with suppress(OSError, OutputError):
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -91,7 +94,7 @@ def _content_digest(name: str, content: bytes) -> bytes:
 
 
 def _is_private(place: Path) -> bool:
-    """Whether nobody else can put code there, as far as the system tells."""
+    """Whether no other user can write to a folder, as far as the system reports."""
     if not hasattr(os, "getuid"):
         return True
     file_status = place.stat()
@@ -101,10 +104,10 @@ def _is_private(place: Path) -> bool:
 
 
 def _make_room(place: Path, size: int) -> None:
-    """Remove what was used least lately until there is room for so many bytes.
+    """Remove the least recently used entries until there is room for `size` bytes.
 
-    Looking at thousands of files takes longer than compiling a small program, so that room is made
-    for many programs at once. Other processes may fill the same room meanwhile.
+    Listing thousands of files takes longer than compiling a small program, so that room is made
+    for many entries at once. Other processes may fill the same room meanwhile.
     """
     remaining = _remaining_bytes.get(place, 0)
     if remaining < size:
@@ -120,7 +123,7 @@ def _make_room(place: Path, size: int) -> None:
 
 
 def _cache_files(place: Path) -> Iterator[tuple[float, int, Path]]:
-    """When used last, length, and path of what is there, also of what a killed process left."""
+    """Time of last use, size and path of all files in the cache folder."""
     for item in place.iterdir():
         with suppress(FileNotFoundError):  # another process made room
             file_status = item.stat()

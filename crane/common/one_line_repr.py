@@ -1,34 +1,32 @@
-"""How an object is shown: in one line at a prompt, as HTML in a notebook."""
+"""One-line `repr` of objects, and their HTML representation in notebooks."""
 
 from collections.abc import Callable, Sized
 from typing import Any
 
-MAX_LINE_LENGTH = 200  # letters of a line
+MAX_LINE_LENGTH = 200  # characters
 
 
 def _no_html(_: Any) -> str | None:
     return None
 
 
-# What makes HTML of an object, or None where it has none: `crane.view.notebook.to_html`. The
-# package
-# puts it here, because views stand above nothing (see CONTRIBUTING.md).
+# Converts an object to HTML, or returns None. `crane.view.notebook` sets it, because this room may
+# not import that one (see CONTRIBUTING.md).
 to_html: Callable[[Any], str | None] = _no_html
 
 
 class OneLineRepr:
-    """A `repr` of at most `MAX_LINE_LENGTH` letters: shapes of arrays, lengths of lists."""
+    """Base class with a one-line `repr` of at most `MAX_LINE_LENGTH` characters."""
 
     def __repr__(self) -> str:
-        """One line, cut where it is too long."""
+        """One line, shortened if necessary."""
         return shorten_to_line(self._one_line())
 
     def _repr_html_(self) -> str | None:
-        """What notebooks show."""
         return to_html(self)
 
     def _one_line(self) -> str:
-        """Class and fields."""
+        """Class name and public fields: values, shapes of arrays, lengths of sequences."""
         words = []
         for name, value in vars(self).items():
             if name.startswith("_"):
@@ -45,7 +43,7 @@ class OneLineRepr:
 
 
 def shorten_to_line(text: str) -> str:
-    """A text in one line of at most `MAX_LINE_LENGTH` letters."""
+    """A text as one line of at most `MAX_LINE_LENGTH` characters."""
     line = "".join(letter if letter.isprintable() else " " for letter in text)
     return line if len(line) <= MAX_LINE_LENGTH else f"{line[: MAX_LINE_LENGTH - 1]}\u2026"
 

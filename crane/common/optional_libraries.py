@@ -1,11 +1,11 @@
-"""What does not come with the package by itself."""
+"""Optional libraries, which extras of the package install."""
 
 from importlib import import_module
 from typing import Any
 
 from crane.common.errors import InputError
 
-# Module: what its library is called, and the extra of pyproject.toml that brings it.
+# Module: name of the library, and the extra of pyproject.toml that installs it.
 _LIBRARIES = {
     "casadi": ("CasADi", "casadi"),
     "control": ("python-control", "control"),
@@ -17,11 +17,11 @@ _LIBRARIES = {
 
 
 def import_optional_library(module: str, purpose: str) -> Any:
-    """A library of an extra, imported.
+    """Import the library of an extra.
 
     Args:
-        module: Its name in Python.
-        purpose: What needs it, for the error.
+        module: Its module name.
+        purpose: The feature that needs it, for the error.
 
     Raises:
         InputError: It is not installed.
@@ -36,7 +36,7 @@ def import_optional_library(module: str, purpose: str) -> Any:
 def installation_hint(extra: str) -> str:
     """How to install an extra of pyproject.toml, from the repository.
 
-    The package is on no index, and whoever registers its name there would be installed: the name
-    is not told.
+    The hint does not use the package's name: it is not registered on PyPI, and whoever registers
+    it would be installed.
     """
     return f"install it in the repository's folder: pip install '.[{extra}]'"

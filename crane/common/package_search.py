@@ -1,14 +1,16 @@
-"""Where files are that other files name: paths, and places in packages of ROS and Gazebo.
+"""Search for files that other files refer to, and reading of files of limited size.
 
-`package://PACKAGE/PATH`, `$(find PACKAGE)` and `model://MODEL/PATH` name a folder that only the
-writer's system knew. It is sought, in this order, in the folders that the user gives, in those
-above the file that names it and beside its own package, and where ROS and Gazebo look. A package
-is a folder whose package.xml (of a model: model.config) has its name, or, without such a file,
-that is called so.
+`package://PACKAGE/PATH`, `$(find PACKAGE)` and `model://MODEL/PATH` refer to a folder that only
+the author's system knows. It is searched for, in this order, in the folders that the user gives,
+in those above the referring file and beside its own package, and in the search paths of ROS and
+Gazebo. A package is a folder whose package.xml (for a model: model.config) has its name, or,
+without such a file, a folder of that name.
 """
 
+import errno
 import os
 import re
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -24,8 +26,8 @@ OWN_ARGUMENTS = (URDF_CONSTRAINT, NEAREST_ASSEMBLY)  # that no file need have
 
 _MANIFESTS = ("package.xml", "model.config")
 _NAME_PATTERN = re.compile(rb"<name[^>]*>\s*([^<]*?)\s*</name>")
-_MAX_DEPTH, _MAX_FOLDERS = 4, 2000  # levels below a given folder, and folders looked into
-# Variables with folders of packages, and what is between them and the packages.
+_MAX_DEPTH, _MAX_FOLDERS = 4, 2000  # levels below a given folder, and folders searched
+# Environment variables with folders, and the subfolder that contains the packages.
 _SEARCH_VARIABLES = {
     "ROS_PACKAGE_PATH": "", "AMENT_PREFIX_PATH": "share", "CMAKE_PREFIX_PATH": "share",
     "GZ_SIM_RESOURCE_PATH": "", "IGN_GAZEBO_RESOURCE_PATH": "", "GAZEBO_MODEL_PATH": "",
@@ -35,14 +37,14 @@ _SEARCH_VARIABLES = {
 
 @dataclass(frozen=True)
 class LoadOptions:
-    """What a user says beside the name of a file.
+    """Options of the user for loading a file.
 
     Attributes:
-        packages: Folders of packages, or in which there are some.
-        arguments: Values by name of the file's arguments.
-        floating_root: Whether the root is to float.
-        strict: Whether what only has an odd form is refused, as `crane.load` has it.
-        found_packages: Packages that were sought while it holds, by name and by who asked.
+        packages: Folders of packages, or folders that contain some.
+        arguments: Values of the file's arguments by name.
+        floating_root: Whether the root is a floating base.
+        strict: Whether elements that are only formally wrong are errors, see `crane.load`.
+        found_packages: Packages that were searched for, by name and referring folder.
     """
 
     packages: tuple[str, ...] = ()
@@ -56,7 +58,7 @@ _load_options: ContextVar[LoadOptions | None] = ContextVar("given", default=None
 
 
 def load_options() -> LoadOptions:
-    """What holds for the files that are read now."""
+    """The options for the files that are read now."""
     return _load_options.get() or LoadOptions()
 
 
@@ -67,13 +69,14 @@ def use_load_options(
     floating: bool = False,
     strict: bool = False,
 ) -> Iterator[LoadOptions]:
-    """Read files with packages in these folders and with values of arguments.
+    """Context in which files are read with some options.
 
     Args:
         packages: Folders.
-        arguments: Values by name; numbers and truth values are written as XML has them.
-        floating: Whether the root is to float.
-        strict: Whether what only has an odd form is refused, here and in all that is read within.
+        arguments: Values by name; numbers and booleans are written as in XML.
+        floating: Whether the root is a floating base.
+        strict: Whether elements that are only formally wrong are errors, here and in nested
+            contexts.
     """
     values = {str(name): _format_argument(value) for name, value in (arguments or {}).items()}
     options = LoadOptions(tuple(packages), values, floating, strict or load_options().strict)
@@ -101,10 +104,10 @@ def _format_argument(value: object) -> str:
 
 
 def check_package_folders(packages: object) -> list[str]:
-    """Folders of packages, as a caller gives them.
+    """Check the folders of packages of a caller.
 
     Raises:
-        InputError: They are no list, or not there.
+        InputError: Not a list, or a folder does not exist.
     """
     if isinstance(packages, str | Path) or not isinstance(packages, Sequence):
         raise InputError(f"packages is {packages!r}, give a list of folders such as ['src']")
@@ -116,10 +119,10 @@ def check_package_folders(packages: object) -> list[str]:
 
 
 def check_argument_values(arguments: object) -> Mapping[str, object]:
-    """Values of arguments, as a caller gives them.
+    """Check the argument values of a caller.
 
     Raises:
-        InputError: They are not given by name.
+        InputError: Not a mapping by name.
     """
     if not isinstance(arguments, Mapping | None):
         raise InputError(
@@ -129,16 +132,16 @@ def check_argument_values(arguments: object) -> Mapping[str, object]:
 
 
 def find_file(name: str, folder: Path) -> Path | None:
-    """The file or folder that a name stands for, None if there is none.
+    """The file or folder that a name refers to, None if there is none.
 
-    A name is a path from the folder of the file that has it, or from one above. `package://NAME/`
-    and `model://NAME/` begin in a package, see `find_package`; where that is not known, the rest
-    is a path, and so is that of other `SCHEME://PATH`. `package://FILE`, which names no package,
-    is FILE.
+    A name is a path relative to the folder of the referring file, or to one above.
+    `package://NAME/` and `model://NAME/` begin in a package, see `find_package`; if that is
+    unknown, the rest is a path, and so is that of other `SCHEME://PATH`. `package://FILE`, without
+    a package, is FILE.
 
     Args:
-        name: As a file has it.
-        folder: Of that file.
+        name: As written in the file.
+        folder: Folder of that file.
     """
     scheme, separated, rest = name.partition("://")
     parts = [part for part in Path(rest if separated else name).parts if part != "/"]
@@ -149,12 +152,12 @@ def find_file(name: str, folder: Path) -> Path | None:
             if inside.exists():
                 return inside
         return _search_upwards(Path(rest if separated else name), parts, folder, in_package)
-    except (OSError, ValueError):  # a name that cannot be a file's
+    except (OSError, ValueError):  # not a valid file name
         return None
 
 
 def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool) -> Path | None:
-    """A path from a folder or one above it; in a package perhaps without the package's name."""
+    """A path relative to a folder or one above it, in packages also without their name."""
     ends = [path]
     if in_package:
         ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
@@ -163,11 +166,11 @@ def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool
 
 
 def find_package(name: str, folder: Path) -> Path | None:
-    """The folder of a package, None where it is not found.
+    """The folder of a package, None if it is not found.
 
     Args:
-        name: Of the package.
-        folder: Of the file that names it.
+        name: Name of the package.
+        folder: Folder of the referring file.
     """
     key, options = (name, folder.absolute()), load_options()
     if key not in options.found_packages:
@@ -198,7 +201,7 @@ def _search_package(name: str, folder: Path, packages: Sequence[str]) -> Path | 
 
 
 def _is_package(folder: Path, name: str) -> bool:
-    """Whether a folder is the package of a name."""
+    """Whether a folder is the package with a name."""
     name_in_manifest = _package_name(folder)
     return name_in_manifest == name or (
         folder.name == name and folder.is_dir() and not name_in_manifest
@@ -206,7 +209,7 @@ def _is_package(folder: Path, name: str) -> bool:
 
 
 def _search_below(name: str, top: Path, depth: int = _MAX_DEPTH) -> Path | None:
-    """The package of a name in a folder, the nearest to it."""
+    """The package with a name in a folder, nearest first."""
     level = [top]
     seen = 0
     for _ in range(depth + 1):
@@ -252,3 +255,23 @@ def _name_in_manifest(file: str, _: int) -> str:
     except OSError:
         return ""
     return found[1].decode("utf-8", "replace") if found else ""
+
+
+def read_plain_file(path: Path, max_size: int) -> bytes:
+    """Content of a plain file.
+
+    Args:
+        path: The file.
+        max_size: Largest accepted size [bytes].
+
+    Raises:
+        OSError: It cannot be read, is a device or pipe, which need not end, or is too large.
+    """
+    if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+        raise OSError(errno.EINVAL, "it is no plain file, copy it into one", str(path))
+    with path.open("rb") as file:
+        data = file.read(max_size + 1)
+    if len(data) > max_size:
+        size = max(os.path.getsize(path), len(data)) / 1e6
+        raise OSError(errno.EFBIG, f"{size:.3g} MB, more than {max_size / 1e6:g}", str(path))
+    return data

@@ -1,26 +1,27 @@
-"""How large the numbers of a hydraulic circuit are, and the unit that was meant where one is not.
+"""Plausible ranges of the parameters of a hydraulic circuit, and suggestions of units.
 
-The table holds what machines have from a syringe's piston to a ship's crane. A number outside is
-tried in the units that data sheets use; what is then usual is proposed.
+The ranges cover machines from a syringe's piston to a ship's crane. A value outside is converted
+from the units of data sheets; units that make it plausible are suggested.
 """
 
 import math
 from typing import NamedTuple
 
-LONGEST = 50.0  # [m], a length that no part of a machine has
+LONGEST = 50.0  # [m], longer than any part of a machine
 
 UnitSizes = tuple[tuple[str, float], ...]
 
 
 class PlausibleRange(NamedTuple):
-    """What is usual of a quantity.
+    """Plausible range of a quantity.
 
     Attributes:
         unit: Its SI unit.
-        lower: Least usual value; what is zero by the description's leave is not looked at.
-        upper: Largest one.
-        typical: Of several units, that counts which comes nearest to this.
-        other_units: Other units and their size in the SI unit, those tried first, then rarer ones.
+        lower: Least plausible value; zero is not checked where the description allows it.
+        upper: Largest plausible value.
+        typical: Among several units the one that comes nearest to this value is suggested.
+        other_units: Other units with their size in the SI unit, in the order in which they are
+            tried.
     """
 
     unit: str
@@ -142,7 +143,7 @@ PLAUSIBLE_RANGES |= {
 _ROTARY_DISPLACEMENT = PlausibleRange(
     "m3/rad", 1e-9, 0.1, 1e-3, ((("cm3/rad", 1e-6), ("l/rad", 1e-3)),)
 )
-ROTARY_RANGES = {  # what differs where the joint turns
+ROTARY_RANGES = {  # ranges for revolute joints
     "area_a": _ROTARY_DISPLACEMENT,
     "area_b": _ROTARY_DISPLACEMENT,
     "cushion": PlausibleRange("rad", 0.0, 3.2, 0.2, ((("degrees", math.pi / 180),),)),
@@ -154,7 +155,7 @@ ROTARY_RANGES = {  # what differs where the joint turns
 _VESSEL_VOLUME = PlausibleRange(
     "m3", 1e-8, 0.3, 2e-3, _VOLUME_UNITS
 )  # half a litre is a usual one, half a m3 not
-RANGES_BY_COMPONENT = {  # what differs for a kind of part
+RANGES_BY_COMPONENT = {  # ranges for certain components
     ("element", "gain"): PlausibleRange("m3/(s Pa)", 0.0, 1e-6, 2e-9, _LEAKAGE_UNITS),
     ("element", "pressure"): PlausibleRange("Pa", 1e3, 7e7, 1e6, _PRESSURE_UNITS),
     ("accumulator", "line"): _HOSE_VOLUME,
@@ -162,15 +163,14 @@ RANGES_BY_COMPONENT = {  # what differs for a kind of part
     ("line", "volume"): _VESSEL_VOLUME,
     ("motor", "volume"): _HOSE_VOLUME,
 }
-_SECOND_UNIT_RATIO = (
-    20.0  # how much farther from the typical value a second unit may bring it to be named
-)
+# how much farther from the typical value a second unit may bring it to be named
+_SECOND_UNIT_RATIO = 20.0
 
 
 def plausible_range(
     name: str, is_rotary: bool = False, component: str = ""
 ) -> PlausibleRange | None:
-    """The usual range of a number, None if it has none; see `implausible_value_text`."""
+    """The plausible range of a parameter, None if it has none; see `implausible_value_text`."""
     own = RANGES_BY_COMPONENT.get((component, name)) or (
         ROTARY_RANGES.get(name) if is_rotary else None
     )
@@ -180,13 +180,13 @@ def plausible_range(
 def implausible_value_text(
     name: str, value: float, is_rotary: bool = False, component: str = ""
 ) -> str:
-    """What to say of a number that hardly is in its SI unit, else nothing.
+    """Text about a value that is probably not in its SI unit, empty if it is plausible.
 
     Args:
-        name: Of the number in a machine file.
-        value: The number, which may be; zero is never doubted.
-        is_rotary: Whether it belongs to a joint that turns.
-        component: Of the part that has it: "engine", "element", "accumulator" ...
+        name: Name of the parameter in a machine file.
+        value: The value, which is valid; zero is never reported.
+        is_rotary: Whether it belongs to a revolute joint.
+        component: Kind of its component: "engine", "element", "accumulator" ...
     """
     plausible = plausible_range(name, is_rotary, component)
     if plausible is None or value == 0 or plausible.lower <= value <= plausible.upper:
@@ -205,7 +205,7 @@ def implausible_value_text(
 
 
 def suggested_units_text(name: str, value: float) -> str:
-    """What a number that cannot be looks like, to be put behind an error; perhaps nothing."""
+    """Suggested unit of an invalid value, to append to an error; may be empty."""
     found = [
         f"{unit}, write {_format_in_si(value, size)}"
         for unit, size in _suggest_units(value, PLAUSIBLE_RANGES[name])
@@ -214,7 +214,7 @@ def suggested_units_text(name: str, value: float) -> str:
 
 
 def _suggest_units(value: float, plausible: PlausibleRange) -> list[tuple[str, float]]:
-    """Units in which a number is usual, and their size; at most two."""
+    """At most two units in which a value is plausible, with their sizes."""
     for units in plausible.other_units:
         able = [
             (x, size)
@@ -236,7 +236,7 @@ def _suggest_units(value: float, plausible: PlausibleRange) -> list[tuple[str, f
 
 
 def _format_in_si(value: float, size: float) -> str:
-    """A number in another unit, as it is written in the SI unit."""
+    """A value in another unit, written in the SI unit."""
     power = math.log10(size)
     shown = f"{value:g}"
     if abs(power - round(power)) < 1e-9 and "e" not in shown and float(shown) == value:

@@ -1,9 +1,9 @@
-"""What goes on while somebody waits, and how far it is.
+"""Progress of calls that take long.
 
-The library computes without a word. What it is at is read off the main thread's stack: the room of
-the package (see CONTRIBUTING.md) that is nearest to what runs now. How far it is only calls know
-that take a `progress`: `progress_reporter` gives them one where a bar can be shown, and nobody
-gave another.
+The library itself prints nothing. The current activity is found on the stack of the main thread:
+the room of the package (see CONTRIBUTING.md) of the innermost call. The finished share is known
+for calls with a `progress` argument only: `progress_reporter` sets it where a progress bar can be
+shown and the caller gave none.
 """
 
 import sys
@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-REPORT_DELAY = 2.0  # [s] from which on something takes long
-REPORT_INTERVAL = 0.5  # [s] between two looks
+REPORT_DELAY = 2.0  # [s] before the first report
+REPORT_INTERVAL = 0.5  # [s] between two reports
 _ACTIVITIES = {
     "formats": "reading",
     "closure": "closing the loops",
@@ -29,11 +29,11 @@ _ACTIVITIES = {
 
 
 class MainThreadMonitor(threading.Thread):
-    """Tells what the main thread is at, from `REPORT_DELAY` on.
+    """Reports the activity of the main thread, beginning after `REPORT_DELAY`.
 
     Args:
-        report: Called every half second with the main thread's innermost call and the seconds
-            since the watch has begun.
+        report: Called every half second with the main thread's innermost frame and the seconds
+            since the start.
     """
 
     def __init__(self, report: Callable[[FrameType | None, float], None]):
@@ -42,7 +42,7 @@ class MainThreadMonitor(threading.Thread):
         self._main_thread = threading.main_thread().ident
 
     def run(self) -> None:
-        """Wait, then look every half second."""
+        """Wait, then report every half second."""
         start_time = time.monotonic()
         wait = REPORT_DELAY
         while not self._stopped.wait(wait):
@@ -51,13 +51,13 @@ class MainThreadMonitor(threading.Thread):
             self._report(frame, time.monotonic() - start_time)
 
     def stop(self) -> None:
-        """Say no more."""
+        """Stop reporting."""
         self._stopped.set()
         self.join()
 
 
 def current_activity(frame: FrameType | None) -> str:
-    """What a stack of calls is about, by the innermost room of the package that has a word."""
+    """The activity of a call stack: that of the innermost room that has one."""
     while frame is not None:
         package, _, rest = str(frame.f_globals.get("__name__", "")).partition(".")
         if package == "crane" and (activity := _ACTIVITIES.get(rest.partition(".")[0])):
@@ -67,15 +67,15 @@ def current_activity(frame: FrameType | None) -> str:
 
 
 class ProgressTracker:
-    """The finished share of the outermost call that tells one."""
+    """The finished share of the outermost call that reports one."""
 
     def __init__(self) -> None:
-        self.is_enabled = False  # whether somebody shows it
+        self.is_enabled = False  # whether a progress bar is shown
         self._reporting_call: FrameType | None = None
         self._finished_share = 0.0
 
     def finished_share(self, frame: FrameType | None) -> float | None:
-        """That of a stack of calls; None where no call of it has told."""
+        """The share for a call stack; None if no call on it reports one."""
         return (
             self._finished_share
             if self._reporting_call is not None and _is_on_stack(self._reporting_call, frame)
@@ -83,11 +83,11 @@ class ProgressTracker:
         )
 
     def reset(self) -> None:
-        """No call tells any more."""
+        """Forget the reporting call."""
         self._reporting_call = None
 
     def start_reporting(self, call: FrameType) -> Callable[[float], None] | None:
-        """What a call tells its share to; None within another that tells, or in a thread."""
+        """The function by which a call reports its share; None in nested calls and threads."""
         if not self.is_enabled or threading.current_thread() is not threading.main_thread():
             return None
         if self._reporting_call is not None and _is_on_stack(self._reporting_call, call):
@@ -103,12 +103,11 @@ PROGRESS = ProgressTracker()
 
 
 def progress_reporter(progress: Callable[[float], None] | None) -> Callable[[float], None] | None:
-    """What the calling function tells its finished share to: who was given, or who listens."""
+    """The function by which the caller reports its finished share: given, or the tracker's."""
     return PROGRESS.start_reporting(sys._getframe(1)) if progress is None else progress
 
 
 def _is_on_stack(call: FrameType, frame: FrameType | None) -> bool:
-    """Whether a call is on a stack."""
     while frame is not None and frame is not call:
         frame = frame.f_back
     return frame is call

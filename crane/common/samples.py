@@ -1,4 +1,4 @@
-"""One sample (n,) or a stack of them (N, n): every public function takes both."""
+"""Validation of arguments: one sample (n,) or a stack (N, n), which public functions accept."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -14,7 +14,7 @@ def as_samples(value: ArrayLike, size: int, label: str, names: Sequence[str] = (
     """A finite float64 array (size,) or (N, size).
 
     Args:
-        value: What the user gave.
+        value: The argument.
         size: Length of one sample.
         label: Its name, for errors.
         names: Names of the columns, for errors.
@@ -38,10 +38,10 @@ def as_samples(value: ArrayLike, size: int, label: str, names: Sequence[str] = (
 
 
 def as_sample(value: ArrayLike, size: int, label: str, names: Sequence[str] = ()) -> Array:
-    """`as_samples` of exactly one sample (size,).
+    """`as_samples` for exactly one sample (size,).
 
     Raises:
-        InputError: Also for a stack.
+        InputError: As `as_samples`, and for a stack.
     """
     shape = _as_real_array(value, label, f"give {size}").shape
     if shape != (size,):
@@ -50,9 +50,9 @@ def as_sample(value: ArrayLike, size: int, label: str, names: Sequence[str] = ()
     return as_samples(value, size, label, names)
 
 
-# Between these lies every quantity of a machine in SI units but zero, and its square is a number.
+# Bounds of nonzero quantities in SI units, whose squares neither overflow nor underflow.
 MIN_QUANTITY, MAX_QUANTITY = 1e-30, 1e30
-MAX_COORDINATE = 1e6  # coordinate [m], [rad] whose sine still has ten digits
+MAX_COORDINATE = 1e6  # [m], [rad], sines still have ten digits
 MAX_SEED = 2**64 - 1
 
 
@@ -63,18 +63,17 @@ def as_number(
     greater_than: float = -np.inf,
     max_magnitude: float = MAX_QUANTITY,
 ) -> float:
-    """A number that a quantity of a machine can have.
+    """A number within the range of quantities of a machine.
 
     Args:
-        value: What the user gave.
+        value: The argument.
         label: Its name, for errors.
         unit: Its unit, for errors.
-        greater_than: What it has to be above; of what has to be above zero, `MIN_QUANTITY` is the
-            least.
-        max_magnitude: What it may be at most, to both sides of zero.
+        greater_than: Exclusive lower bound; for 0 the least value is `MIN_QUANTITY`.
+        max_magnitude: Largest absolute value.
 
     Raises:
-        InputError: It is not.
+        InputError: Not a number within these bounds.
     """
     array = _as_real_array(value, label, "give a number")
     shown = " ".join(f"{label} is {value} {unit}".split())
@@ -105,10 +104,10 @@ def as_count(value: object, label: str, minimum: int = 1, maximum: int = 10**9) 
 
 
 def as_seed(value: object) -> int:
-    """A seed of random numbers.
+    """A seed of a random generator.
 
     Raises:
-        InputError: It is negative, or no whole number.
+        InputError: It is negative, or not a whole number.
     """
     return as_count(value, "the seed", 0, MAX_SEED)
 
@@ -124,7 +123,7 @@ def _as_real_array(value: object, label: str, hint: str) -> Array:
 
 
 def solve_linear(matrix: Array, right_side: Array) -> Array:
-    """Solution x of matrix x = right, float64 for the type checker too."""
+    """Solution x of matrix x = right_side as float64."""
     return np.asarray(np.linalg.solve(matrix, right_side), dtype=np.float64)
 
 
@@ -136,20 +135,36 @@ def _call_with_sample_number(sample: int, function: Callable[..., Array], *array
         raise type(error)(f"{error} (sample {sample})") from None
 
 
-def apply_per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
-    """Apply a function of single samples to single samples or row by row to stacks.
+def read_only_copy(array: Array) -> Array:
+    """A read-only copy of an array."""
+    out = array.copy()
+    out.flags.writeable = False
+    return out
 
-    Single samples among stacks hold for every row.
+
+def stack_length(arrays: Iterable[Array]) -> int | None:
+    """Common length N of the stacks (N, n) among samples (n,) and stacks; None without stacks.
 
     Raises:
         InputError: The stacks differ in length.
     """
     lengths = {len(array) for array in arrays if array.ndim == 2}
-    if not lengths:
-        return function(*arrays)
     if len(lengths) > 1:
         raise InputError(f"stacks of {sorted(lengths)} samples do not go together, give equal N")
-    (count,) = lengths
+    return lengths.pop() if lengths else None
+
+
+def apply_per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
+    """Apply a function of single samples, row by row to stacks.
+
+    Single samples among stacks apply to every row.
+
+    Raises:
+        InputError: The stacks differ in length.
+    """
+    count = stack_length(arrays)
+    if count is None:
+        return function(*arrays)
     rows: Iterable[Array] = (
         _call_with_sample_number(
             i, function, *(array[i] if array.ndim == 2 else array for array in arrays)

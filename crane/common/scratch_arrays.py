@@ -1,8 +1,8 @@
 """Large arrays in scratch files, so that long time series do not fill the memory.
 
-An array of `empty_array` is like any other. The system writes its pages to the file and reads them
-again as they are asked for; `release_pages` takes those out of memory that are in it, and is
-called by whoever goes through a whole series, in between. Nothing is lost by it.
+An array of `empty_array` is a normal array whose pages the system writes to a file and reads on
+access; `release_pages` removes its pages from memory, and is called repeatedly by code that goes
+through a whole series. No data are lost.
 """
 
 import contextlib
@@ -17,16 +17,16 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_MIN_FILE_ELEMENTS = 1 << 20  # numbers, 8 MiB
-BLOCK_SIZE = 1 << 16  # samples that are worked on between two releases
+_MIN_FILE_ELEMENTS = 1 << 20  # elements, 8 MiB
+BLOCK_SIZE = 1 << 16  # samples between two releases
 _memory_maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
 
 def empty_array(count: int, columns: int) -> Array:
     """An array (count, columns) whose columns are contiguous.
 
-    A large one is in a scratch file without a name in the system's folder for such files (TMPDIR),
-    which is gone with the array. Where there is no room it is in memory.
+    A large one is in an unnamed scratch file in the system's folder for temporary files (TMPDIR),
+    which is removed with the array; in memory if the disk is full.
     """
     shape = count, columns
     if math.prod(shape) >= _MIN_FILE_ELEMENTS:
@@ -38,9 +38,9 @@ def empty_array(count: int, columns: int) -> Array:
 
 
 def _map_temporary_file(size: int) -> mmap.mmap:
-    """So many bytes of a file, all of which have a place on the disk."""
+    """Memory map of a new file of `size` bytes with allocated disk space."""
     with tempfile.TemporaryFile(prefix="crane-") as file:
-        if hasattr(os, "posix_fallocate"):  # what has no place later ends the program
+        if hasattr(os, "posix_fallocate"):  # a full disk would later kill the process
             os.posix_fallocate(file.fileno(), 0, size)
         else:
             file.truncate(size)
@@ -48,17 +48,20 @@ def _map_temporary_file(size: int) -> mmap.mmap:
 
 
 def release_pages() -> None:
-    """Take the pages of all such arrays out of memory; their numbers stay."""
+    """Remove the pages of all such arrays from memory; their values stay."""
     for scratch in list(_memory_maps):
         scratch.madvise(mmap.MADV_DONTNEED)
 
 
 def compute_in_blocks(compute: Callable[[slice], Array], count: int) -> Array:
-    """What a function computes (m, columns) of m consecutive samples, of all (count, columns).
+    """Evaluate a function of blocks of samples for a whole series.
 
     Args:
-        compute: Called with the slices of up to `BLOCK_SIZE` samples, in their order.
+        compute: Returns (m, columns) for a slice of m <= `BLOCK_SIZE` samples; called in order.
         count: Number of samples, at least one.
+
+    Returns:
+        (count, columns).
     """
     found: Array | None = None
     for start in range(0, count, BLOCK_SIZE):

@@ -1,11 +1,11 @@
-"""Values as bytes and back: numbers, texts, arrays, and objects of classes that the reader names.
+"""Serialization of numbers, texts, arrays, and objects of classes that the reader names.
 
-The bytes hold data alone: unlike a pickle they cannot name code to run, and arrays that are read
-have numpy's own types, of which there is one each. They are
+The bytes contain data only: unlike a pickle they cannot name code to run, and arrays have numpy's
+own types. The format is
 
-    8 bytes: length of the head | head: JSON | elements of all arrays, one after the other
+    8 bytes: length of the head | head: JSON | elements of all arrays, concatenated
 
-In the head an array stands as its type, shape and place, a tuple and an object as what they hold.
+The head contains type, shape and position of an array, and the items of tuples and objects.
 """
 
 import json
@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 
 _HEAD_LENGTH_SIZE = 8  # bytes
-_ARRAY_KINDS = "biufSU"  # of arrays; no objects
+_ARRAY_KINDS = "biufSU"  # no object arrays
 
 
 def serialize(value: Any, classes: Sequence[type] = ()) -> bytes:
-    """The bytes of a value: equal for equal values, to the last bit of every number.
+    """Serialize a value: equal bytes for equal values, to the last bit of every number.
 
     Args:
         value: None, a bool, int, float, str, bytes, array, dataclass, or a tuple of these.
-        classes: Others whose objects may occur; their attributes are what they hold.
+        classes: Other classes that may occur; their attributes are serialized.
 
     Raises:
-        TypeError: Something else, which may mean another thing to another process.
+        TypeError: Another type, which may not be the same in another process.
     """
     blob = bytearray()
 
@@ -56,11 +56,11 @@ def serialize(value: Any, classes: Sequence[type] = ()) -> bytes:
 
 
 def deserialize(data: bytes, classes: Sequence[type]) -> Any:
-    """The value whose bytes these are.
+    """The value of `serialize`d bytes.
 
     Args:
         data: From `serialize`.
-        classes: Those whose objects may occur, dataclasses included.
+        classes: Classes that may occur, dataclasses included.
 
     Raises:
         ValueError: Not such bytes.

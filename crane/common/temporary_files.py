@@ -1,11 +1,12 @@
-"""Temporary files and folders beside a place, and those that killed processes left there.
+"""Temporary files and folders beside a path, their removal, and the exchange of folders.
 
-A process holds a lock on each of its own for as long as it lives. One without a lock is left over:
-the next that writes to the same place removes it. What stood at a place and was moved aside, to
-make room, goes back if nothing has taken the place.
+A process holds a lock on each of its temporary files for its lifetime. One without a lock is left
+over: the next process that writes to the same path removes it. A folder that was moved aside for
+an exchange is moved back if nothing is at its path.
 """
 
 import contextlib
+import errno
 import os
 import re
 import shutil
@@ -15,7 +16,7 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # no Unix: nothing is known to be left over
+except ImportError:  # not Unix: leftovers cannot be recognized
     fcntl = None  # type: ignore[assignment]
 
 PARTIAL_SUFFIX, REPLACED_SUFFIX = "part", "old"
@@ -24,7 +25,7 @@ _TEMPORARY_PATTERN = re.compile(rf"\.[0-9a-f]{{8}}\.({PARTIAL_SUFFIX}|{REPLACED_
 
 
 def temporary_name(target: Path, suffix: str) -> Path:
-    """A new name for a temporary file or folder next to a place."""
+    """A new name for a temporary file or folder next to a path."""
     return target.with_name(f".{target.name}.{os.urandom(4).hex()}.{suffix}")
 
 
@@ -32,12 +33,12 @@ def temporary_name(target: Path, suffix: str) -> Path:
 def temporary_path(
     target: Path, is_folder: bool = False, parent: Path | None = None
 ) -> Iterator[Path]:
-    """A new file or folder next to a place, locked, which is gone at the end if it is still there.
+    """Context of a new locked file or folder next to a path, which is removed at the end.
 
     Args:
-        target: What it is written for.
-        is_folder: Whether it is one.
-        parent: The folder that it stands in, the place's own if not given.
+        target: The path that it is written for.
+        is_folder: Whether to create a folder.
+        parent: Folder to create it in, that of the path if not given.
     """
     part, lock = _create_temporary(target if parent is None else parent / target.name, is_folder)
     try:
@@ -49,11 +50,11 @@ def temporary_path(
 
 
 def remove_leftovers(target: Path, parent: Path | None = None) -> None:
-    """Remove what is left over of a place, or put it back there."""
+    """Remove temporary files that killed processes left beside a path, or move them back to it."""
     folder = target.parent if parent is None else parent
     try:
         found = [name for name in os.listdir(folder) if is_temporary(name, target)]
-    except OSError:  # told by whoever writes there
+    except OSError:  # reported when writing
         return
     for leftover in (folder / x for x in found):
         lock = _acquire_lock(leftover)
@@ -64,21 +65,21 @@ def remove_leftovers(target: Path, parent: Path | None = None) -> None:
                 os.rename(leftover, target)
             else:
                 _remove(leftover)
-        except OSError:  # another was here first
+        except OSError:  # another process was faster
             pass
         finally:
             os.close(lock)
 
 
 def is_temporary(name: str, target: Path) -> bool:
-    """Whether a file or folder of this name is a temporary one of a place."""
-    if not name.startswith(f".{target.name}."):  # nearly all
+    """Whether a name is that of a temporary file or folder of a path."""
+    if not name.startswith(f".{target.name}."):  # fast path
         return False
     return bool(_TEMPORARY_PATTERN.fullmatch(name[len(target.name) + 1 :]))
 
 
 def wait_for_lock(path: Path) -> int | None:
-    """Wait for the lock of a folder or file that is there; None where systems have none."""
+    """Wait for the lock of an existing folder or file; None on systems without locks."""
     return _acquire_lock(path, wait=True)
 
 
@@ -93,7 +94,7 @@ def _create_temporary(target: Path, is_folder: bool) -> tuple[Path, int | None]:
             return part, None
         try:
             lock = os.open(part, os.O_RDONLY)
-        except FileNotFoundError:  # taken for left over before it was locked
+        except FileNotFoundError:  # another process removed it before it was locked
             continue
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -109,7 +110,7 @@ def _create_temporary(target: Path, is_folder: bool) -> tuple[Path, int | None]:
 
 
 def _acquire_lock(path: Path, wait: bool = False) -> int | None:
-    """The lock of a file or folder; None if another process holds it, or there are none."""
+    """The lock of a file or folder; None if another process holds it, or without locks."""
     if fcntl is None:
         return None
     try:
@@ -130,3 +131,68 @@ def _remove(path: Path) -> None:
     else:
         with contextlib.suppress(FileNotFoundError):
             path.unlink()
+
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
+_NOT_EMPTY_ERRORS = (errno.ENOTEMPTY, errno.EEXIST)
+_UNSUPPORTED_ERRORS = (
+    errno.ENOSYS,
+    errno.EINVAL,
+    errno.EOPNOTSUPP,
+)  # an old kernel, a plain file system
+
+
+def move_to_free_path(source: Path, target: Path) -> bool:
+    """Move a folder to a path that is free or an empty folder; returns whether it was."""
+    try:
+        os.rename(source, target)
+    except OSError as error:
+        if error.errno in _NOT_EMPTY_ERRORS or target.is_dir():
+            return False
+        raise
+    return True
+
+
+def exchange_folders(source: Path, target: Path) -> None:
+    """Replace `target` by `source`; the old folder is then at `source`, or removed.
+
+    Linux does this atomically. Elsewhere the old folder is moved aside first; if the process is
+    killed between the two renames, `remove_leftovers` moves it back.
+
+    Raises:
+        OSError: The exchange failed; everything is unchanged.
+    """
+    if _exchange_atomically(source, target):
+        return
+    lock, aside = wait_for_lock(target), temporary_name(target, REPLACED_SUFFIX)
+    try:
+        os.rename(target, aside)
+        try:
+            os.rename(source, target)
+        except OSError:
+            os.rename(aside, target)
+            raise
+        os.rename(aside, source)  # removed together with the temporary folder
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def _exchange_atomically(source: Path, target: Path) -> bool:
+    import ctypes
+
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if _is_linux() else None
+    if rename is None:
+        return False
+    if not rename(
+        _AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), _RENAME_EXCHANGE
+    ):
+        return True
+    number = ctypes.get_errno()
+    if number in _UNSUPPORTED_ERRORS:
+        return False
+    raise OSError(number, os.strerror(number), str(target))
+
+
+def _is_linux() -> bool:
+    return os.uname().sysname == "Linux" if hasattr(os, "uname") else False

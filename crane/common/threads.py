@@ -1,4 +1,4 @@
-"""What every thread has for itself, and how many threads compute."""
+"""Thread-local values, and the number of threads of linear algebra."""
 
 import functools
 import threading
@@ -6,35 +6,35 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Generic, ParamSpec, TypeVar
 
-_MIN_THREADED_ORDER = 33  # order of the matrices from which on libraries take several threads
+_MIN_THREADED_ORDER = 33  # order from which libraries use several threads
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class ThreadLocal(threading.local, Generic[T]):
-    """Memory of an object that several threads may use at once: each thread has its own.
+    """A value that every thread creates for itself.
 
     Args:
-        create: Makes it, here and wherever another thread first asks.
+        create: Creates the value, on first access in each thread.
 
     Attributes:
-        value: This thread's.
+        value: The value of this thread.
     """
 
-    def __init__(self, create: Callable[[], T]):  # runs once in every thread
+    def __init__(self, create: Callable[[], T]):  # called once in every thread
         self.value = create()
 
 
 @contextmanager
 def single_threaded_blas(matrix_order: int = _MIN_THREADED_ORDER) -> Iterator[None]:
-    """Within, the linear algebra of the libraries that are loaded computes on one thread.
+    """Context in which the loaded linear algebra libraries use one thread.
 
-    Of many small matrices: threads wait for each other longer than they compute, on a busy machine
-    a hundred times. What is found does not depend on how many there are, to the last digit.
+    For many small matrices threads wait for each other longer than they compute, a hundred times
+    longer on a busy machine. Results do not depend on the number of threads.
 
     Args:
-        matrix_order: Of the matrices; where libraries take one thread anyway, nothing is done.
+        matrix_order: Order of the matrices; small ones are computed on one thread anyway.
     """
     if matrix_order < _MIN_THREADED_ORDER:
         yield
@@ -50,7 +50,7 @@ def with_single_threaded_blas(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
-        import scipy.linalg  # noqa: F401 - brings its own library, which has to be there to be told
+        import scipy.linalg  # noqa: F401 - loads the BLAS library to limit
 
         with single_threaded_blas():
             return function(*args, **kwargs)

@@ -1,9 +1,9 @@
-"""Units that numbers are read in, and how numbers are written for reading."""
+"""Unit conversions of inputs, and formatting of quantities and tables."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-# Unit: other units to read it in, how many of them make one, from which value on (in SI).
+# SI unit: display units, their number per SI unit, and the value (in SI) from which they are used.
 DISPLAY_UNITS: Mapping[str, tuple[tuple[str, float, float], ...]] = {
     "rad": (("deg", 180 / math.pi, 0.0),),
     "rad/s": (("deg/s", 180 / math.pi, 0.0),),
@@ -35,11 +35,11 @@ SI_CONVERSIONS = {
     "l/min": ("m3/s", 1.0, 6e4),
     "mV": ("V", 1.0, 1e3),
 }
-_ZERO_TOLERANCE = 1e-6  # is rounding noise in any of these units
+_ZERO_TOLERANCE = 1e-6  # rounding noise in any of these units
 
 
 def display_unit(unit: str, peak: float) -> tuple[str, float]:
-    """Unit to read numbers up to a peak (in SI) in, and how many of it make one."""
+    """Display unit of values up to `peak` (in SI), and its number per SI unit."""
     for name, scale, start in DISPLAY_UNITS.get(unit, ()):
         if abs(peak) >= start:
             return name, scale
@@ -47,7 +47,7 @@ def display_unit(unit: str, peak: float) -> tuple[str, float]:
 
 
 def format_number(value: float, digits: int = 3) -> str:
-    """So many digits before zeros, without an exponent, and 0 for what is rounding noise."""
+    """A number with `digits` significant digits, without exponent; 0 for rounding noise."""
     if abs(value) < _ZERO_TOLERANCE:
         return "0"
     places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
@@ -56,11 +56,29 @@ def format_number(value: float, digits: int = 3) -> str:
 
 
 def format_quantity(value: float, unit: str, digits: int = 3) -> str:
-    """A number (in SI) in the unit to read it in: 13.36 t, 4.2 kN, 350 bar."""
+    """A value (in SI) with its display unit: 13.36 t, 4.2 kN, 350 bar."""
     name, scale = display_unit(unit, value)
     return f"{format_number(scale * value, digits)} {name}"
 
 
 def accepted_units(unit: str) -> list[str]:
-    """An SI unit and the units of a file that are converted to it."""
+    """An SI unit and the units that are converted to it."""
     return [unit, *(other for other, (si, _, _) in SI_CONVERSIONS.items() if si == unit)]
+
+
+def format_table(rows: Sequence[Sequence[str]], left_aligned: Sequence[int] = (0,)) -> list[str]:
+    """Lines of a table with columns as wide as their cells, separated by two spaces.
+
+    Args:
+        rows: Cells, the same number in each row.
+        left_aligned: Columns that are left-aligned; others are right-aligned.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if i in left_aligned else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines

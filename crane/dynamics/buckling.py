@@ -1,4 +1,4 @@
-"""Buckling of hydraulic cylinders: columns of rod and tube, pressed between two pins."""
+"""Buckling of hydraulic cylinders: columns of rod and tube under compression between two pins."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,26 +13,26 @@ from crane.hydraulics.components import Cylinder
 from crane.machine import Machine
 
 YOUNGS_MODULUS_STEEL = 2.1e11  # [Pa] Young's modulus
-_PIN_LOOP_TYPES = ("revolute", "spherical", "cylindrical")  # loops that hold an end as a pin does
-_SAME_PIN_TOLERANCE = 1e-6  # of the machine's size, that joints of one pin lie apart
+_PIN_LOOP_TYPES = ("revolute", "spherical", "cylindrical")  # loop types that act like a pin
+_SAME_PIN_TOLERANCE = 1e-6  # scaled distance of joints of one pin
 _BISECTION_STEPS = 60
-_MIN_ROD_RATIO = 1e-9  # of the whole length, that a rod sticks out at least
+_MIN_ROD_RATIO = 1e-9  # least visible length of a rod, as a fraction of the whole
 
 
 @dataclass(frozen=True)
 class CylinderColumn:
-    """A cylinder between two pins, or several side by side.
+    """A cylinder between two pins, or several in parallel.
 
     Attributes:
-        joint: Its joint.
-        count: How many there are side by side.
-        bore: Of one of them [m].
+        joint: Name of its joint.
+        count: Number of cylinders in parallel.
+        bore: Bore of one cylinder [m].
         rod: Diameter of its rod [m].
-        tube: Outer diameter of its tube [m]; 0 where it is not known.
-        pin_offset: From one pin to the other at q = 0, in the frame of what carries the joint [m].
-        slide_axis: Of the slide in that frame, a unit vector.
-        lower_limit: Least coordinate of the joint [m].
-        upper_limit: Largest.
+        tube: Outer diameter of its tube [m]; 0 if unknown.
+        pin_offset: From one pin to the other at q = 0, in the frame of the joint's carrier [m].
+        slide_axis: Axis of the joint in that frame, a unit vector.
+        lower_limit: Lower limit of the joint [m].
+        upper_limit: Upper limit of the joint [m].
     """
 
     joint: str
@@ -46,57 +46,57 @@ class CylinderColumn:
     upper_limit: float
 
     def pin_distance(self, x: ArrayLike) -> Array:
-        """Pin to pin [m] at coordinates x of the joint [m], any shape."""
+        """Distance of the pins [m] at coordinates x of the joint [m], any shape."""
         pin_vector = self.pin_offset + np.asarray(x, dtype=np.float64)[..., None] * self.slide_axis
         return np.asarray(np.linalg.norm(pin_vector, axis=-1))
 
     @property
     def compression_sign(self) -> float:
-        """1 where a force in the joint's direction presses the rod, -1 where it pulls it."""
+        """1 if a positive joint force compresses the rod, -1 if it pulls it."""
         first, last = self.pin_distance([self.lower_limit, self.upper_limit])
         return 1.0 if last > first else -1.0
 
     @property
     def tube_length(self) -> float:
-        """From the tube's pin to its gland [m].
+        """Length from the tube's pin to its gland [m].
 
-        With the rod in, all but what sticks out then: one bore, or a fourth of what the cylinder
-        has beside its stroke where that is less, as `crane.add_cylinder` builds them.
+        The retracted length without what sticks out: one bore, or a quarter of the dead length if
+        that is less, as `crane.add_cylinder` builds cylinders.
         """
         ends = self.pin_distance([self.lower_limit, self.upper_limit])
         least, stroke = float(ends.min()), self.upper_limit - self.lower_limit
         return least - min(self.bore, (least - stroke) / 4)
 
     def euler_load(self, x: ArrayLike) -> Array:
-        """Euler's load of a rod that reaches from pin to pin: pi^2 E I / L^2.
+        """Euler load of a rod between the pins: pi^2 E I / L^2.
 
-        On the safe side wherever the tube is the stiffer part.
+        A lower bound wherever the tube is the stiffer part.
 
         Args:
             x: Coordinates of the joint [m], any shape.
 
         Returns:
-            The same shape, of all side by side [N].
+            The same shape, of all cylinders in parallel [N].
         """
         return np.pi**2 * self.count * _bending_stiffness(self.rod) / self.pin_distance(x) ** 2
 
     def buckling_load(self, x: ArrayLike) -> Array:
-        """The load that buckles it: of rod and tube where the tube is known, else Euler's.
+        """Buckling load: of rod and tube where the tube is known, else the Euler load.
 
-        Both parts bend as y'' = -k_i^2 y, k_i = sqrt(P / (E I_i)), from pins that hold no moment.
-        At the gland y and y' are the same, so the least P > 0 with
+        Both parts bend as y'' = -k_i^2 y, k_i = sqrt(P / (E I_i)), between frictionless pins. At
+        the gland y and y' are continuous, which gives the least P > 0 with
 
             tan(k_1 L_1) / k_1 + tan(k_2 L_2) / k_2 = 0.
 
-        It is the only zero of k_1 cot(k_1 L_1) + k_2 cot(k_2 L_2), which falls from 1/L_1 + 1/L_2
-        without end, below the load of either part between pins of its own. Gland and piston are
-        stiff and without play, the column straight, its weight left out.
+        It is the only zero of k_1 cot(k_1 L_1) + k_2 cot(k_2 L_2), which decreases from 1/L_1 +
+        1/L_2 without bound, below the load of either part between its own pins. Gland and piston
+        are rigid and without play, the column is straight, its weight is neglected.
 
         Args:
             x: Coordinates of the joint [m], any shape.
 
         Returns:
-            The same shape, of all side by side [N].
+            The same shape, of all cylinders in parallel [N].
 
         Source: ISO/TS 13725:2021, after Hoblit, Critical buckling load for hydraulic actuating
         cylinders, Product Engineering, July 1950; the column: Timoshenko and Gere, Theory of
@@ -126,18 +126,17 @@ class CylinderColumn:
 
 
 class Buckling(OneLineRepr):
-    """Whether a machine's cylinders buckle.
+    """Buckling loads and margins of a machine's cylinders.
 
-    A cylinder counts that lies in a loop and has one pin at either end, so that what its ends are
-    pressed with goes along it. One within a telescope is no body of the machine: where its pins
-    are is not known.
+    Cylinders in a loop with one pin at either end are included: their end forces act along them.
+    Cylinders within a telescope are not bodies of the machine, so that their pins are unknown.
 
     Args:
-        machine: With a hydraulic circuit, whose bores, rods and tubes count.
+        machine: With a hydraulic circuit, which gives bores, rods and tubes.
 
     Attributes:
-        columns: Those that count, by joint.
-        unsupported: The others, and why, by joint.
+        columns: Included cylinders, by joint.
+        unsupported: Reason why a cylinder is not included, by joint.
 
     Raises:
         InputError: It has no circuit.
@@ -159,7 +158,7 @@ class Buckling(OneLineRepr):
                 self.columns[joint] = made
 
     def buckling_loads(self, q_a: ArrayLike) -> Array:
-        """The loads that buckle the cylinders, see `CylinderColumn.buckling_load`.
+        """Loads at which the cylinders buckle, see `CylinderColumn.buckling_load`.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -175,19 +174,19 @@ class Buckling(OneLineRepr):
         return out
 
     def buckling_margins(self, q_a: ArrayLike, tau_a: ArrayLike) -> Array:
-        """How many times the force that presses a cylinder buckles it.
+        """Buckling load divided by the compressive force of each cylinder.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
-            tau_a: The same shape, forces of the active joints, as of `Dynamics.inverse` or
+            tau_a: The same shape, forces of the active joints, from `Dynamics.inverse` or
                 `Reactions.drive_forces` [N], [N m].
 
         Returns:
-            (c,) or (N, c) in the order of `columns`: 1 at the load that buckles it, more below it,
-            infinite where it is pulled.
+            (c,) or (N, c) in the order of `columns`: 1 at the buckling load, more below it,
+            infinite under tension.
 
         Raises:
-            InputError: Shapes that do not go together.
+            InputError: Shapes that do not match.
         """
         active = self.machine.active
         loads = self.buckling_loads(q_a)
@@ -211,7 +210,7 @@ def _bending_stiffness(outer: float, inner: float = 0.0) -> float:
 
 
 def _cylinder_column(machine: Machine, cylinder: Cylinder) -> CylinderColumn | str:
-    """A cylinder as a column, or why it is none."""
+    """A cylinder as a column, or the reason why it is not included."""
     index = machine.column(cylinder.joint)
     if machine.unit(cylinder.joint) != "m":
         return "it turns its joint"
@@ -248,7 +247,7 @@ def _cylinder_column(machine: Machine, cylinder: Cylinder) -> CylinderColumn | s
 
 
 def _pins_of_body(machine: Machine, body: int, slide_joint: int) -> Iterator[tuple[Array, bool]]:
-    """Where the joints and loops of a body are but its slide, and whether they are pins."""
+    """Positions of a body's joints and loops except one slide, and whether they are pins."""
     model, equations = machine.model, machine.closure.equations
     for joint in range(1, model.njoints):
         turns = "JointModelR" in model.joints[joint].shortname()

@@ -1,4 +1,4 @@
-"""Equations of motion and their derivatives in machine code made for one machine."""
+"""Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,11 +14,8 @@ from crane.codegen.program import BoundFunction
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
 from crane.dynamics.dynamics_derivatives import DynamicsDerivatives
-from crane.dynamics.dynamics_formulas import (
-    DynamicsFormulas,
-    FormulaStructure,
-    StickSlipAccelerations,
-)
+from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
+from crane.dynamics.formula_structure import FormulaStructure
 from crane.dynamics.spatial_inertia import Matrix
 from crane.machine import Machine
 
@@ -51,7 +48,7 @@ STICK_SLIP_QUANTITIES = (
     "observation",
     "resting",
 )  # what depends on `set_modes`, `set_grip`
-# What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
+# Quantities of `DynamicsFormulas` with a second argument x (n,): a_A for inverse and regressor,
 # tau_A for the others.
 QUANTITIES: dict[str, Callable[[DynamicsFormulas, list[Scalar]], list[Scalar]]] = {
     "inverse": lambda sweep, x: sweep.inverse_dynamics(x, friction=False),
@@ -81,20 +78,19 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
     "inverse": lambda found, x: (*found.inverse_dynamics_derivatives(x), found.mass_matrix),
     "forward": lambda found, x: found.forward_dynamics_derivatives(x),
 }
-DERIVATIVES_OF = (
-    "slopes of "  # before a quantity: its derivatives by q_A, v_A and the second argument
-)
+# before a quantity: its derivatives by q_A, v_A and the second argument
+DERIVATIVES_OF = "derivatives of "
 _FLOAT = np.dtype(np.float64)
 
 
 class _QuantityWorkspace(NamedTuple):
-    """What evaluating a quantity writes.
+    """Buffers of one thread that evaluates a quantity.
 
     Attributes:
-        cursor: Where it has got to.
-        q: (nq,) the last posture.
-        sample_buffers: Of one sample second argument, v_A and q_A (n,) each, the result (size,),
-            and what evaluates it.
+        cursor: Continuation cursor.
+        q: (nq,) last configuration.
+        sample_buffers: For one sample: second argument, v_A and q_A (n,) each, result (size,), and
+            the bound function that evaluates it.
     """
 
     cursor: ContinuationCursor
@@ -106,17 +102,17 @@ class CompiledQuantity:
     """One quantity as machine code.
 
     Args:
-        quantity: A key of `QUANTITIES`, perhaps behind `DERIVATIVES_OF`.
+        quantity: A key of `QUANTITIES`, with or without the prefix `DERIVATIVES_OF`.
         machine: The machine.
-        formula_constants: See `dynamics_constants`; read when a quantity is asked for.
-        constant_pattern: What of them is part of the formulas.
-        formula_structure: What they depend on besides.
+        formula_constants: See `dynamics_constants`; read at every evaluation.
+        constant_pattern: Constants that are folded into the formulas.
+        formula_structure: What else the formulas depend on.
 
     Attributes:
-        result_size: Length of the result of one sample.
+        size: Length of the result of one sample.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: It would take too long to compile.
     """
 
     def __init__(
@@ -161,16 +157,16 @@ class CompiledQuantity:
 
     @property
     def cursor(self) -> ContinuationCursor:
-        """Where this thread has got to."""
+        """Continuation cursor of this thread."""
         return self._workspace.value.cursor
 
     def evaluate_sample(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
-        """The quantity of one sample without delay, or None where arguments need a closer look.
+        """The quantity of one sample, or None where arguments need to be checked first.
 
         Args:
             q_a: (n,).
-            v_a: (n,), or None where the quantity does not ask for it.
-            x: Likewise.
+            v_a: (n,), or None if the quantity does not depend on it.
+            x: (n,), or None if the quantity does not depend on it.
         """
         shape = self._shape
         second, first, target, out, once = self._workspace.value.sample_buffers
@@ -186,17 +182,17 @@ class CompiledQuantity:
         return out.copy() if once() == 1 else None
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
-        """The quantity at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        """The quantity at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
         out = np.empty(self.size)
         geometry = self._compiled_closure.geometry.constants
         self._program.call("formula", geometry, self._formula_constants, q, inputs, out)
         return out
 
     def evaluate_targets(self, targets: Array, inputs: Array, out: Array) -> int:
-        """The quantity at q_A (N, n) with inputs (N, 2 n), until one is too far from the last.
+        """The quantity at q_A (N, n) with inputs (N, 2 n) until a sample is too far from the last.
 
         Returns:
-            How many were done.
+            Number of evaluated samples.
         """
         fast, memory = self._compiled_closure, self._workspace.value
         arrays = (
@@ -211,9 +207,11 @@ class CompiledQuantity:
         )
 
     def evaluate_closed_stack(self, q: Array, inputs: Array, out: Array) -> None:
-        """The quantity at closed postures (N, nq) with inputs (N, 2 n) into out (N, size)."""
+        """The quantity at closed configurations (N, nq), inputs (N, 2 n), into out (N, size)."""
         geometry = self._compiled_closure.geometry.constants
-        self._program.call("along", len(q), geometry, self._formula_constants, q, inputs, out)
+        self._program.call(
+            "closed_each", len(q), geometry, self._formula_constants, q, inputs, out
+        )
 
 
 def _build_quantity(
@@ -258,7 +256,7 @@ def _build_quantity(
         if base_quantity != quantity:
             outputs = _state_derivatives(formulas, outputs, x)
     program.add_formula("formula", 4, outputs)
-    tape = Tape()  # what is not finite is left to the checks that name it
+    tape = Tape()  # arguments that are not finite are left to the checks that name them
     program.add_formula(
         "scan", 2, [max_abs([*tape.load_vector(0, 0, n), *tape.load_vector(1, 0, 2 * n)])]
     )
@@ -266,10 +264,9 @@ def _build_quantity(
 
 
 class CompiledParameterDerivatives:
-    """Derivatives of one quantity by numbers of the machine, as machine code.
+    """Derivatives of one quantity by parameters of the machine, as machine code.
 
-    With numbers p of the machine, and phi(q, p) = 0 of its loops, at given q_A, v_A and second
-    argument,
+    With parameters p and the loops phi(q, p) = 0, at given q_A, v_A and second argument,
 
         d y / d p = dy/dp + dy/dq dq/dp,    J_P dq_P/dp = -dphi/dp.
 
@@ -277,14 +274,13 @@ class CompiledParameterDerivatives:
         quantity: A key of `QUANTITIES`.
         machine: The machine.
         formula_constants: See `dynamics_constants`.
-        constant_pattern: What of them is part of the formulas.
-        formula_structure: What the formulas depend on besides.
-        geometry_derivatives: (k, .) how the geometry's numbers change with each number of the
-            machine.
-        constant_derivatives: (k, .) how `formula_constants` do.
+        constant_pattern: Constants that are folded into the formulas.
+        formula_structure: What else the formulas depend on.
+        geometry_derivatives: (k, .) derivatives of the geometry constants by each parameter.
+        constant_derivatives: (k, .) derivatives of `formula_constants` by each parameter.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: It would take too long to compile.
     """
 
     def __init__(
@@ -323,12 +319,12 @@ class CompiledParameterDerivatives:
 
         def build(program: Program) -> None:
             tape = Tape()
-            q, posture, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
+            q, kinematics, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
             constants, v_a = (
                 FormulaConstants(tape, 1, folded_constants[1]),
                 tape.load_vector(3, 0, n),
             )
-            sweep = DynamicsFormulas(posture, loops, constants, q, v_a, formula_structure)
+            sweep = DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure)
             values = QUANTITIES[quantity](sweep, tape.load_vector(3, n, n))
             seeds: dict[int, Scalar] = {}
             for i in np.flatnonzero(geometry_changes).tolist():
@@ -347,7 +343,7 @@ class CompiledParameterDerivatives:
         self.result_size = self._program.formula_outputs("formula").size
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
-        """(size, k) at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        """(size, k) at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
         out = np.empty((len(self._constant_derivatives), self.result_size))
         geometry = self._compiled_closure.geometry.constants
         for row, bent, moved in zip(
@@ -377,39 +373,37 @@ def _state_derivatives(
 
 
 def _tape_index(loaded: Scalar) -> int:
-    """Of a number that was loaded."""
     assert isinstance(loaded, SymbolicExpression)
     return loaded.index
 
 
 def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
-    """each: close the loops sample by sample and evaluate there; once: the same of one sample.
+    """Add the routines that evaluate a quantity.
 
-    along: evaluate at postures that are closed already.
-
-    Like `follow` of `CompiledClosure`, it stops at the first sample that is too far from the one
-    before it.
+    "each" closes the loops and evaluates sample by sample; "once" does so for one finite sample;
+    "closed_each" evaluates at closed configurations. Like `follow` of `CompiledClosure`, "each"
+    stops at the first sample that is too far from the previous one.
     """
-    arrays = ("geometry", "numbers", "targets", "inputs", "at", "q", "out", "bounds")
+    arrays = ("geometry", "constants", "targets", "inputs", "cursor", "q", "out", "tolerances")
     outputs = program.formula_outputs("formula").size
     with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
         with r.loop(r.count) as i:
             target = r.targets.row_pointer(i, n)
-            got = r.call("follow", 1, r.geometry, target, r.at, r.q, r.bounds)
+            got = r.call("follow", 1, r.geometry, target, r.cursor, r.q, r.tolerances)
             with r.if_then(got < 1):
                 r.return_value(i)
             out = r.out.row_pointer(i, outputs)
-            r.call("formula", r.geometry, r.numbers, r.q, r.inputs.row_pointer(i, 2 * n), out)
+            r.call("formula", r.geometry, r.constants, r.q, r.inputs.row_pointer(i, 2 * n), out)
         r.return_value(r.count)
-    closed = ("geometry", "numbers", "postures", "inputs", "out")
-    with program.add_routine("along", counts=("count",), arrays=closed) as r:
+    closed = ("geometry", "constants", "configurations", "inputs", "out")
+    with program.add_routine("closed_each", counts=("count",), arrays=closed) as r:
         with r.loop(r.count) as i:
             q, inputs, out = (
-                r.postures.row_pointer(i, nq),
+                r.configurations.row_pointer(i, nq),
                 r.inputs.row_pointer(i, 2 * n),
                 r.out.row_pointer(i, outputs),
             )
-            r.call("formula", r.geometry, r.numbers, q, inputs, out)
+            r.call("formula", r.geometry, r.constants, q, inputs, out)
         r.return_value(r.count)
     with program.add_routine("once", functions=("follow",), arrays=arrays) as r:
         scanned = r.local_array("scanned", program.formula_outputs("scan"))
@@ -418,7 +412,7 @@ def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
             r.return_value(0)
         r.return_value(
             r.call(
-                "each", 1, r.follow, r.geometry, r.numbers, r.targets, r.inputs, r.at, r.q, r.out,
-                r.bounds,
+                "each", 1, r.follow, r.geometry, r.constants, r.targets, r.inputs, r.cursor, r.q,
+                r.out, r.tolerances,
             )
         )  # fmt: skip

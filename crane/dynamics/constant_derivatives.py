@@ -1,4 +1,4 @@
-"""How the numbers of a machine's description change the constants of its formulas."""
+"""Derivatives of formula constants by the parameters of a machine description."""
 
 from collections.abc import Callable, Sequence
 
@@ -10,22 +10,22 @@ from crane.description.parameter_changes import unknown_parameter_text
 from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 
-UNIT_OF_ZERO_PARAMETER = 0.1  # what counts as large of a number that is 0
-_RELATIVE_STEP = 1e-3  # of a number
-_LINEARITY_TOLERANCE = 1e-11  # second difference of what is straight, as a share of the first
+UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
+_RELATIVE_STEP = 1e-3  # step as a fraction of the parameter
+_LINEARITY_TOLERANCE = 1e-11  # second over first difference of linear constants
 # f'(0) h from f(h) - f(0), ... f(5 h) - f(0), of order 5
 _FORWARD_DIFFERENCE_WEIGHTS = np.array([5.0, -5.0, 10 / 3, -5 / 4, 1 / 5], dtype=np.float64)
 
 
 class ConstantDerivatives:
-    """Derivatives of constants by named numbers, which most constants are linear in.
+    """Derivatives of constants by named parameters, in which most constants are linear.
 
-    Constants are elementary functions of one number: itself, its inverse, sine and cosine of an
-    angle. Where they are straight, their difference is the derivative to rounding; elsewhere it is
-    the one-sided difference of order 5, to about 1e-11.
+    Constants are elementary functions of a parameter: itself, its inverse, sine and cosine of an
+    angle. The derivative of a linear one is a finite difference, exact to rounding; of others the
+    one-sided difference of order 5, exact to about 1e-11.
 
     Args:
-        machine: The machine, as it was loaded.
+        machine: The machine, as loaded.
     """
 
     def __init__(self, machine: Machine):
@@ -34,24 +34,24 @@ class ConstantDerivatives:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Of all numbers."""
+        """Names of all parameters."""
         return tuple(self._values)
 
     def parameter_value(self, name: str) -> float:
-        """A number.
+        """Value of a parameter.
 
         Raises:
-            InputError: There is none of this name.
+            InputError: Unknown name.
         """
         if name not in self._values:
             raise InputError(unknown_parameter_text(self._variants.spec, self._values, name))
         return self._values[name]
 
     def jacobian(self, names: Sequence[str], constants: Callable[[Machine], Array]) -> Array:
-        """Derivatives (k, m) of constants (m,) of a machine by k of its numbers.
+        """Derivatives (k, m) of constants (m,) by k parameters.
 
         Raises:
-            InputError: An unknown name, or a number that no machine can be made with beside it.
+            InputError: Unknown name, or a parameter that no neighbouring machine can be built for.
         """
         nominal = self.nominal_constants(constants)
         return np.array([self.derivative(name, constants, nominal) for name in names])
@@ -63,7 +63,7 @@ class ConstantDerivatives:
     def derivative(
         self, name: str, constants: Callable[[Machine], Array], nominal: Array
     ) -> Array:
-        """Derivatives (m,) by one number, given `nominal`; see `jacobian`."""
+        """Derivatives (m,) by one parameter, given the nominal constants; see `jacobian`."""
         value = self.parameter_value(name)
         unit = value if value else UNIT_OF_ZERO_PARAMETER
 
@@ -96,7 +96,7 @@ class ConstantDerivatives:
             two_steps,
             *map(constants_at, range(3, len(_FORWARD_DIFFERENCE_WEIGHTS) + 1)),
         ]
-        slope: Array = (
+        derivative: Array = (
             _FORWARD_DIFFERENCE_WEIGHTS @ (np.array(rows) - nominal) / (_RELATIVE_STEP * unit)
         )
-        return slope
+        return derivative

@@ -1,38 +1,26 @@
-"""The equations of motion in the active coordinates."""
+"""Equations of motion in the active coordinates."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.closure.kinematics_formulas import tree_geometry
-from crane.codegen import FormulaTooLongError, run_with_fallback
-from crane.common.errors import InputError, MechanismError, suggest_names
-from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, apply_per_sample, as_number, as_samples, solve_linear
+from crane.common.errors import InputError, suggest_names
+from crane.common.samples import (
+    Array,
+    as_number,
+    as_samples,
+    solve_linear,
+    stack_length,
+)
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.compiled_dynamics import (
-    DERIVATIVES_OF,
     WITH_FRICTION,
-    CompiledParameterDerivatives,
-    CompiledQuantity,
-)
-from crane.dynamics.constant_derivatives import ConstantDerivatives
-from crane.dynamics.dynamics_formulas import (
-    FormulaStructure,
-    circuit_friction_indices,
-    dynamics_constants,
-    stick_slip_mode_indices,
 )
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.dynamics.joint_forces import JointForces
-from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
-from crane.machine import Machine
-from crane.machine.mass_checks import has_mass
+from crane.dynamics.quantity_evaluator import QuantityEvaluator
 
-BACKENDS = ("compiled", "pinocchio")
-QUANTITY_ARGUMENTS = {  # of the quantities that `derivatives` takes
+QUANTITY_ARGUMENTS = {  # arguments of the quantities of `derivatives`
     "inverse": ("q_a", "v_a", "a_a"),
     "forward": ("q_a", "v_a", "tau_a"),
     "mass_matrix": ("q_a",),
@@ -46,8 +34,8 @@ QUANTITY_ARGUMENTS = {  # of the quantities that `derivatives` takes
 }
 
 
-class Dynamics(OneLineRepr):
-    """Dynamics of a machine in its active coordinates, without multipliers.
+class Dynamics(QuantityEvaluator):
+    """Dynamics of a machine in its active coordinates, without Lagrange multipliers.
 
     The tree's dynamics projected by gamma (Park, Choi, Ploen 1999), equations (4) and (6) of the
     reduced-scale forwarder paper:
@@ -55,88 +43,52 @@ class Dynamics(OneLineRepr):
         tau_A = gamma^T (rnea(q, v, a) - f(q, v)) [+ gamma^T tau_F(v)]
               = M_A(q_A) a_A + bias(q_A, v_A) [+ friction(q_A, v_A)],
 
-    with f the passive forces and tau_F the friction of all joints. Friction is left out unless
-    asked for; passive forces belong to the machine and are always in. Every method takes single
-    samples (n,) or stacks (N, n) and returns the same kind. Not safe to share between threads.
+    with f the passive forces and tau_F the friction of all joints. Friction is only included on
+    request; passive forces belong to the machine and are always included. Every method takes
+    single samples (n,) or stacks (N, n) and returns the same kind. Not safe to share between
+    threads.
 
-    Two paths compute the same to rounding: "compiled" turns each quantity, when it is first asked
-    for, into machine code of straight-line formulas for this one machine; "pinocchio" projects the
-    results of Pinocchio's algorithms. Formulas of very large machines take too long to compile and
-    are left to the second.
+    Two backends compute the same to rounding: "compiled" turns each quantity, on first use, into
+    machine code of straight-line formulas of this machine; "pinocchio" projects the results of
+    Pinocchio's algorithms. Formulas of very large machines take too long to compile and are left
+    to the second.
 
     Args:
-        machine: The machine; its payload and parameters are those at this moment.
+        machine: The machine with its current payload and parameters.
         formulation: "exact", or "decoupled": every sub-chain on a base held still, as published.
-            It lacks the forces of a chain on the chain that carries it, so it does not keep
-            energy; `docs/validation/mini_forwarder.md` shows how much that is.
+            It lacks the forces of a chain on the chain that carries it, so that it does not
+            conserve energy; `docs/validation/mini_forwarder.md` shows by how much.
         backend: "compiled" or "pinocchio".
 
     Raises:
         InputError: Unknown formulation or backend.
-        MechanismError: Nothing that moves has a mass.
+        MechanismError: No moving body has a mass.
     """
 
-    def __init__(self, machine: Machine, formulation: str = "exact", backend: str = "compiled"):
-        if backend not in BACKENDS:
-            raise InputError(f"backend '{backend}' is unknown, {suggest_names(BACKENDS, backend)}")
-        if not isinstance(machine, Machine):
-            raise InputError(f"{machine!r} is not a machine, load it with crane.load")
-        if not has_mass(machine.model):
-            raise MechanismError(
-                f"no link of '{machine.name}' that moves has a mass, give each an <inertial>: "
-                "without masses there is kinematics, and no dynamics"
-            )
-        self.machine, self.formulation = machine, formulation
-        self.forces = JointForces(machine)
-        self.formula_structure = FormulaStructure.from_machine(machine, formulation, self.forces)
-        self.backend = backend if machine.closure.is_compiled else "pinocchio"
-        self.tree_dynamics = PinocchioDynamics(
-            machine, self.forces, self.formula_structure.carrier_bodies
-        )
-        self._compiled_quantities: dict[str, CompiledQuantity | None] = {}
-        self._parameter_derivatives: dict[
-            tuple[str, tuple[str, ...]], CompiledParameterDerivatives
-        ] = {}
-        self.numbers = np.zeros(0)
-        if self.backend == "compiled":
-            geometry = machine.closure.compiled_closure.geometry
-            self.numbers = np.ascontiguousarray(dynamics_constants(machine, geometry, self.forces))
-        # what becomes part of formulas; not what changes with the motion
-        self.constant_pattern = self.numbers.copy()
-        self._mode_indices = (
-            stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
-        )
-        self.constant_pattern[self._mode_indices] = np.nan
-        self._circuit_friction_indices = (
-            circuit_friction_indices(machine, self.forces) if self.backend == "compiled" else []
-        )
-        self.constant_pattern[self._circuit_friction_indices] = np.nan
-
     def _one_line(self) -> str:
-        """Of what, and how it is computed."""
         return f"Dynamics of '{self.machine.name}', {self.backend}"
 
     @property
     def parameters(self) -> Array:
         """(10 nb + nr,) inertial parameters of the bodies, in the order of the tree's joints.
 
-        Ten per body about its joint frame's origin: m, m c_x, m c_y, m c_z, I_xx, I_xy, I_yy,
-        I_xz, I_yz, I_zz [kg, kg m, kg m2]. After them the rotor inertias that are not zero, nr of
-        them, in the same order [kg m2], [kg].
+        Ten per body about the origin of its joint frame: m, m c_x, m c_y, m c_z, I_xx, I_xy, I_yy,
+        I_xz, I_yz, I_zz [kg, kg m, kg m2]. After them the nr rotor inertias that are not zero, in
+        the same order [kg m2], [kg].
         """
         return self.tree_dynamics.inertial_parameters
 
     def inverse(
         self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, friction: bool = False
     ) -> Array:
-        """Active forces of a motion: tau_A = gamma^T (rnea(q, v, a) - f) [+ friction].
+        """Inverse dynamics: tau_A = gamma^T (rnea(q, v, a) - f) [+ friction].
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             a_a: The same shape [m/s2], [rad/s2].
-            friction: Whether the drives also overcome friction. From rest, where it sticks, it is
-                against the acceleration of the joint, and its offset where there is none.
+            friction: Whether the drives overcome friction. At rest, under stiction, it opposes the
+                acceleration of the joint; without acceleration it is the friction offset.
 
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
@@ -147,14 +99,14 @@ class Dynamics(OneLineRepr):
     def forward(
         self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, friction: bool = False
     ) -> Array:
-        """Accelerations under active forces: M_A a_A = tau_A - bias [- friction].
+        """Forward dynamics: M_A a_A = tau_A - bias [- friction].
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             tau_a: The same shape [N], [N m].
-            friction: Whether friction brakes; at rest, where it sticks, by its offset: what holds
-                a joint is found by `simulate`.
+            friction: Whether friction brakes. At rest, under stiction, only its offset acts:
+                `simulate` determines which joints are held.
 
         Returns:
             a_A, (n,) or (N, n) [m/s2], [rad/s2].
@@ -167,15 +119,16 @@ class Dynamics(OneLineRepr):
     ) -> tuple[Array, Array]:
         """Inverse dynamics of the driven joints d, forward dynamics of the free ones f.
 
-        Free joints have no force. With c = inverse(q_A, v_A, (a_d, 0)),
+        No drive acts on free joints. With c = inverse(q_A, v_A, (a_d, 0)),
 
             a_f = -M_ff^-1 c_f,    tau_d = c_d + M_df a_f.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
-            a_d: Of the k driven joints in their order, (k,) or (N, k) [m/s2], [rad/s2].
-            friction: As of `inverse` for driven joints; of free ones as of `forward`.
+            a_d: Accelerations of the k driven joints in their order, (k,) or (N, k) [m/s2],
+                [rad/s2].
+            friction: As in `inverse` for driven joints, as in `forward` for free ones.
 
         Returns:
             tau_d, (k,) or (N, k) [N], [N m], and a_f, (n - k,) or (N, n - k) [m/s2], [rad/s2].
@@ -218,7 +171,7 @@ class Dynamics(OneLineRepr):
         return self._evaluate("bias", (), q_a, v_a)
 
     def gravity(self, q_a: ArrayLike) -> Array:
-        """Active forces that hold the weight alone: gamma^T g(q), without passive forces.
+        """Active forces that balance gravity: gamma^T g(q), without passive forces.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -229,7 +182,7 @@ class Dynamics(OneLineRepr):
         return self._evaluate("gravity", (), q_a)
 
     def friction(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
-        """Active forces that friction of all joints consumes: gamma^T tau_F(gamma v_A).
+        """Active forces that overcome friction of all joints: gamma^T tau_F(gamma v_A).
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -241,7 +194,7 @@ class Dynamics(OneLineRepr):
         return self._evaluate("friction", (), q_a, v_a)
 
     def passive(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
-        """What passive forces do at the active joints: gamma^T f(q, gamma v_A).
+        """Passive forces at the active joints: gamma^T f(q, gamma v_A).
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -253,11 +206,10 @@ class Dynamics(OneLineRepr):
         return self._evaluate("passive", (), q_a, v_a)
 
     def project_wrenches(self, q_a: ArrayLike, wrenches: Mapping[str, ArrayLike]) -> Array:
-        """What wrenches from outside do at the active joints: gamma^T sum J^T w.
+        """External wrenches at the active joints: gamma^T sum J^T w.
 
-        M_A a_A + bias = tau_A + applied: the active forces of a motion under them are `inverse`
-        less this, those that hold the machine `gravity` less this, and `forward` takes tau_A and
-        this added up. The quantities themselves know nothing of the machine's `external`.
+        M_A a_A + bias = tau_A + applied: subtract them from `inverse` or `gravity`, and add them
+        to tau_A for `forward`. These methods do not include the machine's `external_forces`.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -268,7 +220,7 @@ class Dynamics(OneLineRepr):
             (n,) or (N, n) [N], [N m].
 
         Raises:
-            InputError: Unknown link, or shapes that do not go together.
+            InputError: Unknown link, or shapes that do not match.
         """
         q_a = as_samples(q_a, self._mobility, "q_a", self.machine.active)
         given = {
@@ -277,12 +229,8 @@ class Dynamics(OneLineRepr):
         }
         for link in given:
             self.machine.frame(link)
-        lengths = {len(x) for x in (q_a, *given.values()) if x.ndim == 2}
-        if len(lengths) > 1:
-            raise InputError(
-                f"stacks of {sorted(lengths)} samples do not go together, give equal N"
-            )
-        stacked, count = bool(lengths), lengths.pop() if lengths else 1
+        length = stack_length((q_a, *given.values()))
+        count = 1 if length is None else length
         q = self.machine.closure.solve(np.broadcast_to(q_a, (count, self._mobility)))
         out = np.zeros((count, self._mobility))
         jacobians = FrameJacobians(self.machine)
@@ -291,7 +239,7 @@ class Dynamics(OneLineRepr):
             jacobians.set_configuration(q[i])
             for link, wrench in rows.items():
                 out[i] += gamma.T @ (jacobians.jacobian(link).T @ wrench[i])
-        return out if stacked else out[0]
+        return out[0] if length is None else out
 
     def energy(self, q_a: ArrayLike, v_a: ArrayLike) -> tuple[Array, Array]:
         """Kinetic and potential energy; the potential includes springs and constant forces.
@@ -307,7 +255,7 @@ class Dynamics(OneLineRepr):
         return both[..., 0], both[..., 1]
 
     def regressor(self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike) -> Array:
-        """Y_A = gamma^T Y(q, v, a): inverse = Y_A parameters - passive.
+        """Regressor Y_A = gamma^T Y(q, v, a): inverse = Y_A parameters - passive.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -333,13 +281,13 @@ class Dynamics(OneLineRepr):
     ) -> dict[str, Array]:
         """Exact derivatives of a quantity through the closed loops.
 
-        By the state and the second argument, along the motions of the active joints:
-        dq = gamma dq_A (of a floating base along its twist). By numbers of the machine at the same
-        q_A, v_A and second argument: J_P dq_P = -(dphi/dp) dp. Inverse and forward dynamics
-        without floating bases have formulas of their own (`crane.dynamics.dynamics_derivatives`),
-        which cost a few evaluations; everything else is differentiated operation by operation.
-        Friction that sticks has, at rest, the derivatives of its offset alone; an end stop those
-        of the side that it is on.
+        By the state and the second argument, along the motions of the active joints: dq = gamma
+        dq_A (for a floating base along its twist). By parameters of the machine at the same q_A,
+        v_A and second argument: J_P dq_P = -(dphi/dp) dp. Inverse and forward dynamics without
+        floating bases have analytic formulas (`crane.dynamics.dynamics_derivatives`), which cost a
+        few evaluations; other quantities are differentiated operation by operation. Under stiction
+        at rest the derivatives are those of the friction offset alone; at an end stop those of the
+        current side.
 
         Args:
             quantity: "inverse", "forward", "mass_matrix", "bias", "gravity", "friction",
@@ -349,14 +297,12 @@ class Dynamics(OneLineRepr):
             v_a: The same shape [m/s], [rad/s], where the quantity depends on it.
             x: The second argument of inverse and regressor (a_A) and of forward (tau_A), the same
                 shape.
-            friction: Whether friction is in, of inverse and forward.
-            by: Of "q_a", "v_a", "a_a", "tau_a", and names of
-                `crane.description.parameters` such as "boom.mass", "lift_eye.x",
-                "friction.lift.viscous". All the arguments there are if not given.
+            friction: Whether inverse and forward dynamics include friction.
+            by: Names among "q_a", "v_a", "a_a", "tau_a" and `crane.description.parameters` such as
+                "boom.mass", "lift_eye.x", "friction.lift.viscous". All arguments if not given.
 
         Returns:
-            By name, arrays of the quantity's shape and one more axis (n,) for the arguments; of
-            the quantity's shape for numbers.
+            By name, arrays of the quantity's shape, with one more axis (n,) for the arguments.
 
         Raises:
             InputError: An unknown quantity or name, a missing argument, or a machine whose
@@ -377,108 +323,40 @@ class Dynamics(OneLineRepr):
                 raise InputError(f"derivatives of '{quantity}' need {name}, give it")
             rows[name] = as_samples(given, n, name, self.machine.active)
         by = arguments if by is None else by
-        lengths = {len(array) for array in rows.values() if array.ndim == 2}
-        if len(lengths) > 1:
-            raise InputError(
-                f"stacks of {sorted(lengths)} samples do not go together, give equal N"
-            )
-        count = lengths.pop() if lengths else 1
-        stacked = any(array.ndim == 2 for array in rows.values())
+        parameters = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
+        for name in by:
+            if name not in (*arguments, *parameters):
+                hint = suggest_names(arguments, name)
+                raise InputError(f"'{quantity}' does not depend on '{name}', {hint}")
+        length = stack_length(rows.values())
+        count = 1 if length is None else length
         q = self.machine.closure.solve(np.broadcast_to(rows["q_a"], (count, n)))
         inputs = np.zeros((count, 2 * n))
         for i, name in enumerate(arguments[1:]):
             inputs[:, i * n : (i + 1) * n] = rows[name]
         key = quantity.replace("_", " ") + (WITH_FRICTION if friction else "")
-        shape = self.result_shape(quantity)
-        states = [name for name in by if name in arguments]
-        formula_constants = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
-        if unknown_names := [name for name in by if name not in (*states, *formula_constants)]:
-            hint = suggest_names(arguments, unknown_names[0])
-            raise InputError(f"'{quantity}' does not depend on '{unknown_names[0]}', {hint}")
-        found: dict[str, Array] = {}
-        if states:
-            formula = self._required_formula(DERIVATIVES_OF + key)
-            flat = np.empty((count, formula.size))
-            formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, flat)
-            parts = flat.reshape(count, 3, *shape, n)
-            found = {name: parts[:, arguments.index(name)].copy() for name in states}
-        if formula_constants:
-            code = self._parameter_derivative_code(key, formula_constants)
-            every = np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
-            every = every.reshape(count, *shape, len(formula_constants))
-            found |= {name: every[..., i].copy() for i, name in enumerate(formula_constants)}
-        return {name: found[name] if stacked else found[name][0] for name in by}
-
-    def result_shape(self, quantity: str) -> tuple[int, ...]:
-        """Of one sample of a quantity that `derivatives` takes."""
-        n, model = self._mobility, self.machine.model
-        shapes = {
-            "mass_matrix": (n, n),
-            "energy": (2,),
-            "statics": (4 + 4 * n + (0 if self.machine.tip is None else 3 + 3 * n),),
-            "regressor": (n, 10 * (model.njoints - 1) + np.count_nonzero(model.armature)),
-        }
-        return shapes.get(quantity, (n,))
-
-    def _required_formula(self, quantity: str) -> CompiledQuantity:
-        formula = self._compiled_quantity(quantity)
-        if formula is None:
-            raise InputError(
-                f"'{self.machine.name}' has no formulas to differentiate, "
-                + (
-                    "take the compiled backend"
-                    if self.machine.closure.is_compiled and self.backend != "compiled"
-                    else "it is too large: lock joints"
-                )
-            )
-        return formula
-
-    def _parameter_derivative_code(
-        self, quantity: str, names: Sequence[str]
-    ) -> CompiledParameterDerivatives:
-        """Machine code of derivatives by numbers of the machine."""
-        self._required_formula(quantity)
-        key = quantity, tuple(names)
-        if key not in self._parameter_derivatives:
-            closure = self.machine.closure
-            constants = ConstantDerivatives(self.machine).jacobian(names, self.constants_of)
-            geometry, numbers = np.split(
-                constants, [len(closure.compiled_closure.geometry.constants)], axis=1
-            )
-            geometry[:, -1] = 0.0  # the size that residuals are measured by
-            self._parameter_derivatives[key] = CompiledParameterDerivatives(
-                quantity,
-                self.machine,
-                self.numbers,
-                self.constant_pattern,
-                self.formula_structure,
-                geometry,
-                numbers,
-            )
-        return self._parameter_derivatives[key]
-
-    def constants_of(self, variant: Machine) -> Array:
-        """Those of its formulas: geometry, then `formula_constants`."""
-        variant = replace(variant, tip=self.machine.tip)
-        geometry = tree_geometry(variant.closure.equations)
-        if geometry.parents != self.machine.closure.compiled_closure.geometry.parents:
-            raise InputError("the tree is not the same")
-        return np.concatenate(
-            [geometry.constants, dynamics_constants(variant, geometry, JointForces(variant))]
-        )
+        shape, found = self.result_shape(quantity), dict[str, Array]()
+        if len(parameters) < len(by):
+            parts = self._argument_derivatives(key, q, inputs).reshape(count, 3, *shape, n)
+            found = {name: parts[:, i].copy() for i, name in enumerate(arguments) if name in by}
+        if parameters:
+            every = self._parameter_derivatives_at(key, parameters, q, inputs)
+            every = every.reshape(count, *shape, len(parameters))
+            found |= {name: every[..., i].copy() for i, name in enumerate(parameters)}
+        return {name: found[name][0] if length is None else found[name] for name in by}
 
     def drive_forces(
         self, q_a: ArrayLike, tau_a: ArrayLike, sharing: Mapping[str, float] | None = None
     ) -> Array:
-        """Forces of the drives that make active forces, also where drives are in surplus.
+        """Forces of the drives that produce active forces, also for redundant drives.
 
         With the drives' lengths L = S q + const and B = (S gamma)^T, tau_A = B u. Where there are
-        more drives than freedoms the forces share the load by weights W,
+        more drives than degrees of freedom the forces share the load by weights W,
 
             u = W B^T (B W B^T)^+ tau_A,
 
-        the least sum of u_i^2 / W_i. What no drive moves keeps no force: active forces of free
-        joints are left out, which `active_forces` tells.
+        the least sum of u_i^2 / W_i. Active forces of joints that no drive moves are dropped;
+        `active_forces` shows the result.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -505,7 +383,7 @@ class Dynamics(OneLineRepr):
         units = self.machine.closure.units[self.machine.closure.active]
         drive_jacobian = (
             drive_jacobian * units[:, None]
-        )  # virtual work per 1 rad and the machine's size: to compare
+        )  # comparable: virtual work per 1 rad or characteristic length
         weighted_jacobian = weights[:, None] * np.swapaxes(drive_jacobian, -1, -2)
         inverse = np.linalg.pinv(drive_jacobian @ weighted_jacobian, rcond=1e-12, hermitian=True)
         joint_forces: Array = np.einsum(
@@ -514,7 +392,7 @@ class Dynamics(OneLineRepr):
         return joint_forces
 
     def active_forces(self, q_a: ArrayLike, forces: ArrayLike) -> Array:
-        """Active forces of the drives': tau_A = (S gamma)^T u, see `drive_forces`.
+        """Active forces from forces of the drives: tau_A = (S gamma)^T u, see `drive_forces`.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -537,138 +415,3 @@ class Dynamics(OneLineRepr):
                 row[machine.column(joint)] += factor
         gamma = machine.closure.gamma(machine.closure.solve(q_a))
         return np.swapaxes(lengths @ gamma, -1, -2)
-
-    def backend_of(self, quantity: str = "forward") -> str:
-        """Which backend computes a quantity of `crane.dynamics.compiled_dynamics.QUANTITIES`."""
-        return "pinocchio" if self._compiled_quantity(quantity) is None else "compiled"
-
-    def evaluate_closed(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
-        """A quantity at postures that are closed already, which are not checked.
-
-        Args:
-            quantity: A key of `crane.dynamics.compiled_dynamics.QUANTITIES`.
-            q: (nq,) or (N, nq) closed postures.
-            v_a: (n,) or (N, n) [m/s], [rad/s].
-            x: The same shape, a_A or tau_A, whatever the quantity asks for.
-
-        Returns:
-            The results, each flattened.
-        """
-        formula = self._compiled_quantity(quantity)
-        if formula is None:
-            return apply_per_sample(
-                lambda *one: self.tree_dynamics.evaluate(quantity, *one), q, v_a, x
-            )
-        inputs = np.ascontiguousarray(np.concatenate([v_a, x], axis=-1))
-        if q.ndim == 1:
-            return formula.evaluate_closed(np.ascontiguousarray(q), inputs)
-        out = np.empty((len(q), formula.size))
-        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, out)
-        return out
-
-    def set_stick_slip_modes(
-        self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
-    ) -> None:
-        """Say what the joints do whose friction sticks; see `JointForces.set_stick_slip_modes`.
-
-        It counts for "rates" and "observation" alone, which only an integration asks for.
-        """
-        self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        if self._mode_indices:
-            self.numbers[self._mode_indices] = [
-                *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
-                is_moving,
-            ]
-
-    def set_circuit_friction(self, circuit_friction: Array) -> None:
-        """Say what a circuit adds to Coulomb friction; see `JointForces.set_circuit_friction`.
-
-        It counts where `set_stick_slip_modes` does.
-        """
-        self.forces.set_circuit_friction(circuit_friction)
-        if self.backend == "compiled":
-            self.numbers[self._circuit_friction_indices] = circuit_friction
-
-    @property
-    def _mobility(self) -> int:
-        return len(self.machine.active)
-
-    def _compiled_quantity(self, quantity: str) -> CompiledQuantity | None:
-        """Machine code of a quantity, or None on the Pinocchio backend."""
-        if quantity not in self._compiled_quantities:
-            made = None
-            try:
-                if self.backend == "compiled":
-                    made = CompiledQuantity(
-                        quantity,
-                        self.machine,
-                        self.numbers,
-                        self.constant_pattern,
-                        self.formula_structure,
-                    )
-            except FormulaTooLongError:
-                pass
-            # of two threads' that made it at once one counts, in which both follow the branch
-            self._compiled_quantities.setdefault(quantity, made)
-        return self._compiled_quantities[quantity]
-
-    def _evaluate(
-        self,
-        quantity: str,
-        shape: tuple[int, ...],
-        q_a: ArrayLike,
-        v_a: ArrayLike | None = None,
-        x: ArrayLike | None = None,
-        x_name: str = "",
-    ) -> Array:
-        """A quantity of samples or stacks, single samples among stacks held for every row.
-
-        `result_shape` is that of one result, () for a vector.
-        """
-        formula = self._compiled_quantities.get(quantity)
-        if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:
-            return out.reshape(shape) if shape else out
-        names, n = self.machine.active, self._mobility
-        q_a = as_samples(q_a, n, "q_a", names)
-        checked = [
-            as_samples(value, n, what, names)
-            for what, value in (("v_a", v_a), (x_name, x))
-            if value is not None
-        ]
-        lengths = {len(array) for array in (q_a, *checked) if array.ndim == 2}
-        if len(lengths) > 1:
-            raise InputError(
-                f"stacks of {sorted(lengths)} samples do not go together, give equal N"
-            )
-        count = lengths.pop() if lengths else 1
-        if count == 0:
-            raise InputError("the stack is empty, give at least one sample")
-        stacked = any(array.ndim == 2 for array in (q_a, *checked))
-        rows = np.zeros((count, 2 * n))
-        for i, array in enumerate(checked):
-            rows[:, i * n : (i + 1) * n] = array
-        targets = np.ascontiguousarray(np.broadcast_to(q_a, (count, n)))
-        out = self._evaluate_stack(quantity, targets, rows, q_a.ndim == 2)
-        if shape:
-            return out.reshape((count, *shape) if stacked else shape)
-        return out if stacked else out[0]
-
-    def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
-        closure, n = self.machine.closure, self._mobility
-        formula = self._compiled_quantity(quantity)
-        if formula is None:
-            return self.evaluate_closed(quantity, closure.solve(targets), rows[:, :n], rows[:, n:])
-        out = np.empty((len(targets), formula.size))
-
-        def reach(i: int) -> None:
-            sample = f" (sample {i})" if is_stack else ""
-            out[i] = formula.evaluate_closed(
-                closure.continue_from_home(formula.cursor, targets[i], sample), rows[i]
-            )
-
-        run_with_fallback(
-            len(targets),
-            lambda i, _: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
-            reach,
-        )
-        return out

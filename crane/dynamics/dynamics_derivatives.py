@@ -1,25 +1,24 @@
-"""Exact derivatives of inverse and forward dynamics through closed loops, as formulas.
+"""Analytic derivatives of inverse and forward dynamics through closed loops, as symbolic formulas.
 
-Coordinates q_j of the machine move every body b with a twist J_b,j = dV_b/dv_j. For any holonomic
-mechanism, d_j J_k - d_k J_j = J_j x J_k, so what a coordinate does to twists and accelerations are
-time derivatives of its own columns,
+Coordinate q_j of the machine moves every body b with a twist J_b,j = dV_b/dv_j. For any holonomic
+mechanism, d_j J_k - d_k J_j = J_j x J_k, so that derivatives of twists and accelerations are time
+derivatives of these columns,
 
     d_j V = J_j' + J_j x V,    d_j A = J_j'' + J_j' x V + J_j x A,
 
-and of the wrench f = I A + V x* I V = I A + B V of a body
+and those of the wrench f = I A + V x* I V = I A + B V of a body are
 
     d f / d v_j = 2 I J_j' + 2 B J_j,
     d f / d q_j = J_j x* f + I J_j'' + 2 B J_j',
     2 B [u, t] = [2 t x p, 2 (tr(K) t - K t)],    p = sum m r',    K = sum m r' r^T,
 
-with sums over the body's points r (Singh, Russell, Wensing 2022, equations (39) to (46), have the
-same for open trees, with other signs and names). Columns hold gamma's derivatives
+with sums over the points r of the body (Singh, Russell, Wensing 2022, equations (39) to (46), have
+the same for open trees, with other signs and names). The columns include the derivatives of gamma
 (`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.clusters`) move with its
-own coordinates alone: sums over bodies are taken cluster by cluster, with what hangs on each body
-as one inertia.
+own coordinates only: sums over bodies are taken by cluster, with all bodies beyond as one inertia.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -38,108 +37,27 @@ from crane.codegen.symbolic import (
     Scalar,
     SymbolicExpression,
     add_vectors,
-    cross,
     dot,
     dot_products,
-    matvec,
     scale_vector,
     subtract_vectors,
     transpose,
 )  # fmt: skip
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
-from crane.dynamics.spatial_inertia import Matrix
-
-_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-
-@dataclass(frozen=True)
-class MassMoments:
-    """What moves as one body: sums over its points at r, which move with r'.
-
-    Attributes:
-        mass: sum m.
-        first_moment: sum m r (3,).
-        inertia_tensor: sum m (r^2 - r r^T) (3, 3).
-        momentum: sum m r' (3,).
-        moment_rate: tr(K) - K (3, 3), K = sum m r' r^T.
-    """
-
-    mass: Scalar
-    first_moment: Vector
-    inertia_tensor: Matrix
-    momentum: Vector
-    moment_rate: Matrix
-
-    @classmethod
-    def rigid_body(
-        cls, mass: Scalar, centre: Vector, tensor: Matrix, motion: SpatialVector
-    ) -> "MassMoments":
-        """A rigid body.
-
-        Args:
-            mass: Its mass.
-            centre: Its centre of mass.
-            tensor: Inertia about it.
-            motion: Its twist.
-        """
-        first = scale_vector(mass, centre)
-        square = dot(first, centre)
-        inertia = _symmetric_matrix(
-            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0)
-        )
-        v, w = motion
-        momentum = scale_vector(mass, add_vectors(v, cross(w, centre)))
-        # second moments about the centre, tr(I) / 2 - I
-        half = 0.5 * (tensor[0][0] + tensor[1][1] + tensor[2][2])
-        spread = _symmetric_matrix(lambda r, c: (half if r == c else 0.0) - tensor[r][c])
-        spun = transpose([cross(w, column) for column in spread])
-        k = [
-            [p * x + more for x, more in zip(centre, row, strict=True)]
-            for p, row in zip(momentum, spun, strict=True)
-        ]
-        sums = [k[1][1] + k[2][2], k[0][0] + k[2][2], k[0][0] + k[1][1]]
-        mixed = [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)]
-        return cls(mass, first, inertia, momentum, mixed)
-
-    def __add__(self, other: "MassMoments") -> "MassMoments":
-        return MassMoments(
-            self.mass + other.mass,
-            add_vectors(self.first_moment, other.first_moment),
-            _symmetric_matrix(lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c]),
-            add_vectors(self.momentum, other.momentum),
-            [
-                add_vectors(one, two)
-                for one, two in zip(self.moment_rate, other.moment_rate, strict=True)
-            ],
-        )
-
-    def inertial_wrench(self, acceleration: SpatialVector) -> SpatialVector:
-        """I A."""
-        a, e = acceleration
-        force = add_vectors(scale_vector(self.mass, a), cross(e, self.first_moment))
-        return force, add_vectors(cross(self.first_moment, a), matvec(self.inertia_tensor, e))
-
-    def velocity_wrench(self, angular: Vector) -> SpatialVector:
-        """B of a motion, whose linear part does not matter."""
-        return cross(angular, self.momentum), matvec(self.moment_rate, angular)
-
-    def transposed_velocity_product(self, motion: SpatialVector) -> Vector:
-        """What B^T of a motion has for the angular part of another."""
-        v, w = motion
-        return add_vectors(cross(self.momentum, v), matvec(transpose(self.moment_rate), w))
+from crane.dynamics.spatial_inertia import MassMoments, Matrix
 
 
 @dataclass(frozen=True)
 class _CoordinateEffect:
-    """What a coordinate does to inverse dynamics within its cluster and on what carries that.
+    """Derivatives of inverse dynamics by one coordinate, within its cluster and on its carrier.
 
     Attributes:
-        joint_forces_by_q: Forces along the cluster's joints, by joint, per unit of the coordinate,
-            but for what turns with the joints.
-        joint_forces_by_v: Half of those per unit of its velocity.
-        wrench_shifts: By joint, wrenches that turn with it.
-        base_wrench_by_q: Wrench on the body that carries the cluster, per unit of the coordinate.
-        base_wrench_by_v: Half of that per unit of its velocity.
+        joint_forces_by_q: Derivative of the forces along the cluster's joints by the coordinate,
+            by joint, without the part in `wrench_shifts`.
+        joint_forces_by_v: Half of their derivative by the coordinate's velocity.
+        wrench_shifts: By joint, derivative of the wrench that rotates with it.
+        base_wrench_by_q: Derivative of the wrench on the carrier of the cluster by the coordinate.
+        base_wrench_by_v: Half of its derivative by the coordinate's velocity.
         transposed_product: B^T J_j of all bodies.
     """
 
@@ -152,14 +70,14 @@ class _CoordinateEffect:
 
 
 class DynamicsDerivatives:
-    """Derivatives of inverse and forward dynamics at a posture and velocity.
+    """Derivatives of inverse and forward dynamics at a configuration and velocity.
 
-    Of holonomic coordinates, without free-flyers, in the exact formulation.
+    For holonomic coordinates, without floating bases, in the exact formulation.
 
     Args:
-        formulas: The machine.
-        gamma_derivatives: Derivatives of its gamma.
-        friction: Whether friction brakes.
+        formulas: Dynamics formulas.
+        gamma_derivatives: Derivatives of gamma.
+        friction: Whether friction is included.
     """
 
     def __init__(
@@ -170,26 +88,24 @@ class DynamicsDerivatives:
             gamma_derivatives,
             friction,
         )
-        self._joint_axes = formulas.posture.joint_axes
-        self._parents, self._n = formulas.posture.geometry.parents, len(formulas.v_a)
+        self._joint_axes = formulas.kinematics.joint_axes
+        self._parents, self._n = formulas.kinematics.geometry.parents, len(formulas.v_a)
         self._cluster_of_joint = {
             i: c for c, x in enumerate(gamma_derivatives.clusters) for i in x.joints
         }
 
     @cached_property
     def _body_velocities(self) -> list[SpatialVector]:
-        """Of every body."""
         return self._formulas.body_motions([0.0] * len(self._parents))[0]
 
     @cached_property
     def _body_moments(self) -> dict[int, MassMoments]:
-        """Every body."""
         bodies = enumerate(self._formulas.body_inertias, start=1)
         return {i: MassMoments.rigid_body(*body, self._body_velocities[i]) for i, body in bodies}
 
     @cached_property
     def _lumped_moments(self) -> dict[int, MassMoments]:
-        """What every joint moves, but for what hangs on other joints of its cluster."""
+        """Mass moments of every body with all bodies beyond it in other clusters."""
         lumped, subtree = dict(self._body_moments), dict(self._body_moments)
         for i in range(len(lumped), 0, -1):
             if parent := self._parents[i]:
@@ -201,7 +117,7 @@ class DynamicsDerivatives:
     def _accumulate_wrenches(
         self, cluster_index: int, wrenches: dict[int, SpatialVector]
     ) -> dict[int, SpatialVector]:
-        """Wrenches on the bodies of a cluster and all beyond them in it, and on its base."""
+        """Sums of wrenches over each body of a cluster and those beyond it, and at its base."""
         out = dict(wrenches)
         for i in reversed(self._gamma_derivatives.clusters[cluster_index].joints):
             parent = self._parents[i]
@@ -210,7 +126,7 @@ class DynamicsDerivatives:
 
     @cached_property
     def _unit_acceleration_wrenches(self) -> dict[int, dict[int, SpatialVector]]:
-        """By coordinate, wrenches I J_j of its cluster's bodies and what is beyond."""
+        """By coordinate, accumulated wrenches I J_j of its cluster."""
         return {
             j: self._accumulate_wrenches(
                 c,
@@ -231,7 +147,7 @@ class DynamicsDerivatives:
         out: Matrix = [[0.0] * self._n for _ in range(self._n)]
         gamma, rotors, twists = (
             self._formulas.gamma,
-            self._formulas.rotors,
+            self._formulas.rotor_inertias,
             self._gamma_derivatives.twists,
         )
         for c, cluster in enumerate(self._gamma_derivatives.clusters):
@@ -251,7 +167,7 @@ class DynamicsDerivatives:
         return out
 
     def _carrying_coordinates(self, cluster_index: int) -> list[tuple[int, int]]:
-        """The coordinates that carry a cluster, with the body of theirs that it hangs on."""
+        """The coordinates that move the base of a cluster, with the body through which they do."""
         out, body = [], self._gamma_derivatives.clusters[cluster_index].base
         while body:
             carrying_cluster = self._cluster_of_joint[body]
@@ -267,13 +183,13 @@ class DynamicsDerivatives:
             len(self._parents),
         )
         rates = [0.0, *(dot(formulas.gamma[i], a_a) + formulas.drift[i] for i in range(1, size))]
-        second = gamma_derivatives.second_time_derivatives(formulas.rates, rates)
+        second = gamma_derivatives.second_time_derivatives(formulas.joint_velocities, rates)
         motions = tuple(dict(enumerate(x)) for x in formulas.body_motions(rates))
         subtree_wrenches, forces = (
             self._subtree_wrenches(rates),
             formulas.passive_and_friction_forces(self._friction),
         )
-        # what the drives of all joints would have to do
+        # forces of drives at all joints
         required_joint_forces = subtract_vectors(
             self._inertial_joint_forces(subtree_wrenches, rates), forces
         )
@@ -299,7 +215,7 @@ class DynamicsDerivatives:
         return by_q, by_v
 
     def _subtree_wrenches(self, joint_accelerations: Sequence[Scalar]) -> dict[int, SpatialVector]:
-        """By joint, the wrench that all that hangs on it takes to accelerate so."""
+        """By joint, the wrench that accelerates all bodies beyond it."""
         _, accelerations = self._formulas.body_motions(joint_accelerations)
         subtree: dict[int, SpatialVector] = {}
         for i in range(len(accelerations) - 1, 0, -1):
@@ -318,12 +234,12 @@ class DynamicsDerivatives:
     def _inertial_joint_forces(
         self, subtree_wrenches: Mapping[int, SpatialVector], joint_accelerations: Sequence[Scalar]
     ) -> Vector:
-        """Forces along the joints (nb + 1,) that bodies and rotors take to accelerate so."""
+        """Forces along the joints (nb + 1,) that accelerate bodies and rotors."""
         out: Vector = [0.0] * len(joint_accelerations)
         for i, wrench in subtree_wrenches.items():
             out[i] = (
                 spatial_dot(self._joint_axes[i], wrench)
-                + self._formulas.rotors[i] * joint_accelerations[i]
+                + self._formulas.rotor_inertias[i] * joint_accelerations[i]
             )
         return out
 
@@ -335,7 +251,7 @@ class DynamicsDerivatives:
         subtree_wrenches: Mapping[int, SpatialVector],
         second_time_derivative: Mapping[int, Scalar],
     ) -> "_CoordinateEffect":
-        """What one of a cluster's own coordinates does to the bodies of the cluster."""
+        """Effect of one of a cluster's coordinates on the bodies of the cluster."""
         formulas, cluster, (rate, twice) = (
             self._formulas,
             self._gamma_derivatives.clusters[cluster_index],
@@ -367,11 +283,12 @@ class DynamicsDerivatives:
         return _CoordinateEffect(
             {
                 i: spatial_dot(self._joint_axes[i], by_q[i])
-                + formulas.rotors[i] * second_time_derivative[i]
+                + formulas.rotor_inertias[i] * second_time_derivative[i]
                 for i in cluster.joints
             },
             {
-                i: spatial_dot(self._joint_axes[i], by_v[i]) + formulas.rotors[i] * first[i]
+                i: spatial_dot(self._joint_axes[i], by_v[i])
+                + formulas.rotor_inertias[i] * first[i]
                 for i in cluster.joints
             },
             wrench_shifts,
@@ -389,7 +306,7 @@ class DynamicsDerivatives:
         by_q: Matrix,
         by_v: Matrix,
     ) -> None:
-        """Rows of the coordinates of the same cluster, gamma's derivative among them."""
+        """Add the entries of coordinates of the same cluster, with the derivative of gamma."""
         gamma, gamma_derivatives = self._formulas.gamma, self._gamma_derivatives
         joints = gamma_derivatives.clusters[cluster_index].joints
         for k in gamma_derivatives.own[cluster_index]:
@@ -417,7 +334,7 @@ class DynamicsDerivatives:
         by_q: Matrix,
         by_v: Matrix,
     ) -> None:
-        """Rows and columns of the coordinates that carry the cluster."""
+        """Add the entries of coordinates that carry the cluster."""
         wrench = self._unit_acceleration_wrenches[j][
             self._gamma_derivatives.clusters[cluster_index].base
         ]
@@ -457,11 +374,13 @@ class DynamicsDerivatives:
     def _joint_force_derivatives(
         self, cluster_index: int, coordinate: int, forces: Vector
     ) -> tuple[Vector, Vector]:
-        """What forces along the joints change by with q_j and with v_j (nb + 1,)."""
+        """Derivatives of forces along the joints by q_j and by v_j, (nb + 1,) each."""
         formulas, joints = self._formulas, self._gamma_derivatives.clusters[cluster_index].joints
         at = {i: formulas.q[i - 1] for i in joints}
         rates = {
-            i: rate for i in joints if isinstance(rate := formulas.rates[i], SymbolicExpression)
+            i: rate
+            for i in joints
+            if isinstance(rate := formulas.joint_velocities[i], SymbolicExpression)
         }
         by_q = {
             x.index: formulas.gamma[i][coordinate]
@@ -473,10 +392,3 @@ class DynamicsDerivatives:
         }
         by_v = {rate.index: formulas.gamma[i][coordinate] for i, rate in rates.items()}
         return directional_derivative(forces, by_q), directional_derivative(forces, by_v)
-
-
-def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:
-    out: Matrix = [[0.0] * 3 for _ in range(3)]
-    for r, c in _UPPER_TRIANGLE:
-        out[r][c] = out[c][r] = entry(r, c)
-    return out

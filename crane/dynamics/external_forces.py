@@ -1,4 +1,4 @@
-"""Forces from outside along the joints: J^T w, by Pinocchio and as formulas."""
+"""External forces along the joints: J^T w, by Pinocchio and as symbolic formulas."""
 
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.kinematics_formulas import TreeGeometry
 from crane.closure.spatial_vectors import Vector
 from crane.codegen import PythonCallback, SymbolicExpression, Tape
 from crane.codegen.symbolic import (
@@ -26,20 +25,19 @@ from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine import Machine
 
-_CALLBACK_INPUT_SIZE = 19  # numbers that a function in Python is called with
+_CALLBACK_INPUT_SIZE = 19  # inputs of a Python function
 
 
 class ExternalForceFormulas(NamedTuple):
-    """What forces from outside do to a machine.
+    """Effects of the external forces of a machine.
 
     Attributes:
-        active_forces: gamma^T J^T w (n,) of all of them together.
-        powers: (k,) of each [W].
-        event_lengths: Lengths [m] at whose signs some of them bend.
-        outputs: (s,) of each its wrench in the world's axes and its channels.
-        state_rates: Of their states, one after the other.
-        callback_inputs: What those that are functions in Python are called with, see
-            `ExternalForceCallback`.
+        active_forces: gamma^T J^T w (n,) of all forces together.
+        powers: (k,) power of each [W].
+        event_lengths: Lengths [m] whose sign changes are events.
+        outputs: (s,) wrench in the world's axes and channels of each.
+        state_rates: Time derivatives of their states, concatenated.
+        callback_inputs: Inputs of the Python functions among them, see `ExternalForceCallback`.
     """
 
     active_forces: Vector
@@ -51,12 +49,11 @@ class ExternalForceFormulas(NamedTuple):
 
 
 class ExternalForceValues(NamedTuple):
-    """The same at a state, in numbers.
+    """The same at a state, as numbers.
 
     Attributes:
-        generalized_forces: J^T w (nv,) of all of them together; gamma^T J^T w (n,) where a chart
-            gives it.
-        powers: (k,) of each [W].
+        generalized_forces: J^T w (nv,) of all forces together; gamma^T J^T w (n,) in a chart.
+        powers: (k,) power of each [W].
         outputs: See `ExternalForceFormulas`.
         state_rates: See `ExternalForceFormulas`.
     """
@@ -68,7 +65,7 @@ class ExternalForceValues(NamedTuple):
 
 
 def reference_samples(forces: Sequence[ExternalForce], times: Array) -> Array:
-    """References (N, c) of all at times (N,) [s], with room for answers of functions in Python."""
+    """References (N, c) of all forces at times (N,) [s], and columns for results of callbacks."""
     parts: list[Array] = [np.zeros((len(times), 0))]
     for force in forces:
         parts.append(force.references(times))
@@ -78,12 +75,12 @@ def reference_samples(forces: Sequence[ExternalForce], times: Array) -> Array:
 
 
 def reference_counts(forces: Sequence[ExternalForce]) -> list[int]:
-    """(k,) how many references each has there."""
+    """(k,) number of columns of each force in `reference_samples`."""
     return [reference_samples([force], np.zeros(1)).shape[1] for force in forces]
 
 
 def formula_key(machine: Machine) -> Hashable:
-    """All that the formulas of a machine's external forces are, each traced by itself."""
+    """Cache key of the formulas of a machine's external forces, each traced separately."""
     out: list[Hashable] = []
     for force, count in zip(
         machine.external_forces, reference_counts(machine.external_forces), strict=True
@@ -113,7 +110,7 @@ def formula_key(machine: Machine) -> Hashable:
 
 
 def state_count(forces: Sequence[ExternalForce]) -> int:
-    """How many states they have together."""
+    """Number of states of all forces."""
     return sum(force.state_count for force in forces)
 
 
@@ -123,8 +120,8 @@ def trace_external_forces(
     references: Sequence[Scalar],
     states: Sequence[Scalar],
 ) -> ExternalForceFormulas:
-    """`ExternalForces` as formulas, with their references and states one after the other."""
-    kinematics, geometry = formulas.posture, formulas.posture.geometry
+    """`ExternalForces` as formulas, from the concatenated references and states."""
+    kinematics, geometry = formulas.kinematics, formulas.kinematics.geometry
     active_forces: Vector = [0.0] * len(machine.active)
     powers: Vector = []
     event_lengths: Vector = []
@@ -134,7 +131,7 @@ def trace_external_forces(
     world_rotation, first = (
         transpose(kinematics.rotation[0]),
         0,
-    )  # formulas are seen from the trunk
+    )  # formulas are in the frame of the reference body
     for force, count in zip(
         machine.external_forces, reference_counts(machine.external_forces), strict=True
     ):
@@ -144,15 +141,18 @@ def trace_external_forces(
         arm = matvec(kinematics.rotation[body], (turn @ pose.translation).tolist())
         at = add_vectors(kinematics.origin[body], arm)
         axes = matmul(kinematics.rotation[body], (turn @ pose.rotation).tolist())
-        carriers = _supporting_bodies(geometry, body)
+        carriers = geometry.supporting_bodies(body)
         velocity: Vector = [0.0] * 3
         spin: Vector = [0.0] * 3
         for i in carriers:
             linear, angular = kinematics.joint_axes[i]
             velocity = add_vectors(
-                velocity, scale_vector(formulas.rates[i], add_vectors(linear, cross(angular, at)))
+                velocity,
+                scale_vector(
+                    formulas.joint_velocities[i], add_vectors(linear, cross(angular, at))
+                ),
             )
-            spin = add_vectors(spin, scale_vector(formulas.rates[i], angular))
+            spin = add_vectors(spin, scale_vector(formulas.joint_velocities[i], angular))
         here = FrameMotion(
             matvec(world_rotation, subtract_vectors(at, kinematics.origin[0])),
             matmul(world_rotation, axes),
@@ -190,13 +190,13 @@ def trace_external_forces(
 
 
 class ExternalForceCallback(PythonCallback):
-    """Calls those of a machine's external forces that are functions in Python, for machine code.
+    """Calls the Python functions among the external forces from machine code.
 
-    It reads of each (19,): time, place, axes, velocity and spin, see `FrameMotion`, and fills its
-    answer into the references of all.
+    It reads 19 values per function: time, position, rotation, velocity and angular velocity, see
+    `FrameMotion`, and writes the wrench into the references of all forces.
 
     Args:
-        forces: All of a machine.
+        forces: All external forces of a machine.
     """
 
     def __init__(self, forces: Sequence[ExternalForce]):
@@ -223,11 +223,11 @@ class ExternalForceCallback(PythonCallback):
 
 
 class ExternalForces:
-    """What acts on a machine from outside, in numbers.
+    """External forces on a machine, evaluated with Pinocchio.
 
     Args:
         machine: The machine.
-        forces: Those of its `external` that act.
+        forces: Those of its `external_forces` that act.
     """
 
     def __init__(self, machine: Machine, forces: Sequence[ExternalForce]):
@@ -240,9 +240,9 @@ class ExternalForces:
 
         Args:
             time: [s].
-            q: (nq,) closed posture.
+            q: (nq,) closed configuration.
             v: (nv,) velocities of all joints.
-            states: Of all forces.
+            states: States of all forces, concatenated.
         """
         self._jacobians.set_configuration(q)
         joint_forces, powers = np.zeros(len(v)), np.empty(len(self._forces))
@@ -272,7 +272,7 @@ class ExternalForces:
 
 
 def static_active_forces(machine: Machine, q: Array) -> Array:
-    """gamma^T J^T w (n,) of a machine's external forces at time 0, at rest in a posture (nq,)."""
+    """gamma^T J^T w (n,) of the external forces at time 0, at rest at a configuration (nq,)."""
     if not machine.external_forces:
         return np.zeros(len(machine.active))
     still, none = np.zeros(machine.model.nv), np.zeros(state_count(machine.external_forces))
@@ -283,14 +283,6 @@ def static_active_forces(machine: Machine, q: Array) -> Array:
 
 
 def _frame_placement(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:
-    """Pinocchio's joint that moves a force's frame, and where the frame is in it."""
+    """Pinocchio's joint that moves a force's frame, and the placement of the frame in it."""
     frame = machine.model.frames[machine.frame(force.frame)]
     return int(frame.parentJoint), frame.placement
-
-
-def _supporting_bodies(geometry: TreeGeometry, body: int) -> list[int]:
-    found = []
-    while body:
-        found.append(body)
-        body = geometry.parents[body]
-    return found

@@ -1,4 +1,4 @@
-"""How frames of the tree move with its joints, by Pinocchio."""
+"""Poses, Jacobians and distances of frames of the tree, with Pinocchio."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from crane.machine import Machine
 
 
 class FrameJacobians:
-    """Jacobians of links, posture by posture.
+    """Poses and Jacobians of links at one configuration at a time.
 
     Args:
         machine: The machine.
@@ -26,12 +26,12 @@ class FrameJacobians:
         return self._workspace.value
 
     def set_configuration(self, q: Array) -> None:
-        """Take up a posture (nq,), in this thread."""
+        """Evaluate at a configuration (nq,), in this thread."""
         configuration = self._machine.coordinates.configuration(q)
         pin.computeJointJacobians(self._model, self._data, configuration)
 
     def frame_origins(self, q: Array, links: Sequence[str]) -> Array:
-        """(N, k, 3) of the origins of k links' frames in the world, at postures (N, nq) [m]."""
+        """Origins (N, k, 3) of k links' frames in the world, at configurations (N, nq) [m]."""
         placements = [self._frame_placement(link) for link in links]
         joints = [joint for joint, _ in placements]
         local_origins = np.array([placement.translation for _, placement in placements]).reshape(
@@ -42,20 +42,20 @@ class FrameJacobians:
             np.empty((len(q), len(placements), 3)),
         )
         configuration = self._machine.coordinates.configuration
-        for i, posture in enumerate(q):
-            pin.forwardKinematics(self._model, self._data, configuration(posture))
+        for i, one in enumerate(q):
+            pin.forwardKinematics(self._model, self._data, configuration(one))
             for k, joint in enumerate(joints):
                 placed = self._data.oMi[joint]
                 rotations[i, k], origins[i, k] = placed.rotation, placed.translation
         return np.asarray(origins + np.einsum("ikab,kb->ika", rotations, local_origins))
 
     def frame_pose(self, link: str) -> pin.SE3:
-        """Of a link's frame in the world, at the posture."""
+        """Pose of a link's frame in the world."""
         joint, placement = self._frame_placement(link)
         return self._data.oMi[joint] * placement
 
     def jacobian(self, link: str) -> Array:
-        """(6, nv) velocity of a frame's origin and angular velocity, in the world's axes."""
+        """(6, nv) Jacobian of a frame's origin and angular velocity, in the world's axes."""
         joint, placement = self._frame_placement(link)
         if not joint:
             return np.zeros((6, self._model.nv))
@@ -67,19 +67,89 @@ class FrameJacobians:
 
 
 def point_jacobian(model: pin.Model, data: pin.Data, joint: int, point: Array) -> Array:
-    """(6, nv) of a point of a body, which the joints' Jacobians of `data` are computed for.
+    """Jacobian (6, nv) of a point of a body, from the joint Jacobians in `data`.
 
     Args:
         model: The tree.
         data: Its data.
-        joint: Pinocchio's, that moves the body.
-        point: (3,) of the point in its frame [m].
+        joint: Pinocchio's joint that moves the body.
+        point: (3,) the point in the joint's frame [m].
 
     Returns:
-        Of the point's velocity and the body's angular velocity, in the world's axes.
+        Rows of the point's velocity and the body's angular velocity, in the world's axes.
     """
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    # of a single joint it is a vector
+    # a vector if the model has a single joint
     columns: Array = pin.getJointJacobian(model, data, joint, world).reshape(6, -1).copy()
     columns[:3] -= pin.skew(data.oMi[joint].rotation @ point) @ columns[3:]
     return columns
+
+
+FramePair = tuple[str, str]  # names of links
+MIN_LENGTH = 1e-150  # [m] below which a distance has no direction: the square must not underflow
+
+
+class FrameDistances:
+    """Distances l = |p_2 - p_1| of pairs of frames, and their derivatives.
+
+    l' = u . (p_2' - p_1') with u = (p_2 - p_1) / l, so that a force F along l acts on the joints
+    with F dl/dv. Where the frames coincide there is no direction: u is taken as zero.
+
+    `DynamicsFormulas` of `crane.dynamics.dynamics_formulas` has the same as formulas, with
+    wrenches; each checks the other.
+
+    Args:
+        machine: The machine.
+        pairs: Names of two links each.
+
+    Attributes:
+        pairs: Names of two links each.
+        end_points: For each pair Pinocchio's joints that move the frames, 0 for the world, and the
+            origins of the frames in the joints' frames (3,) [m].
+    """
+
+    def __init__(self, machine: Machine, pairs: Sequence[FramePair]):
+        self.pairs, self._coordinates = tuple(pairs), machine.coordinates
+        frames = machine.model.frames
+        self.end_points = [
+            [
+                (int(frames[i].parentJoint), frames[i].placement.translation.copy())
+                for i in map(machine.frame, pair)
+            ]
+            for pair in self.pairs
+        ]
+        if self.pairs:
+            self._model = pin.Model(machine.model)
+            self._workspace = ThreadLocal(self._model.createData)
+
+    def evaluate(self, q: Array) -> tuple[Array, Array]:
+        """Lengths and their derivatives.
+
+        Args:
+            q: (nv,) or (N, nv) [m], [rad].
+
+        Returns:
+            l (m,) or (N, m) [m], and dl/dv (m, nv) or (N, m, nv).
+        """
+        count = len(self.pairs)
+        lengths = np.empty((*q.shape[:-1], count))
+        jacobians = np.zeros((*q.shape[:-1], count, q.shape[-1]))
+        if not count:
+            return lengths, jacobians
+        for i in np.ndindex(q.shape[:-1]):
+            configuration = self._coordinates.configuration(q[i])
+            pin.computeJointJacobians(self._model, self._workspace.value, configuration)
+            for k, (one, two) in enumerate(self.end_points):
+                (p1, j1), (p2, j2) = self._point(*one), self._point(*two)
+                vector = p2 - p1
+                lengths[(*i, k)] = length = float(np.linalg.norm(vector))
+                jacobians[(*i, k)] = vector / max(length, MIN_LENGTH) @ (j2 - j1)
+        return lengths, jacobians
+
+    def _point(self, joint: int, local_point: Array) -> tuple[Array, Array]:
+        """A point of a body in the world (3,), and its Jacobian (3, nv)."""
+        if not joint:
+            return local_point, np.zeros((3, self._model.nv))
+        data = self._workspace.value
+        point: Array = data.oMi[joint].act(local_point)
+        return point, point_jacobian(self._model, data, joint, local_point)[:3]

@@ -1,4 +1,4 @@
-"""Driven joints whose accelerations are given, free ones that follow."""
+"""Hybrid dynamics: given accelerations of driven joints, unknown ones of free joints."""
 
 from collections.abc import Callable, Sequence
 
@@ -15,15 +15,15 @@ def hybrid_dynamics(
     a_d: Sequence[Scalar],
     friction: bool,
 ) -> tuple[Vector, Vector]:
-    """`Dynamics.hybrid_dynamics` of inverse dynamics at an instant, in numbers or formulas.
+    """`Dynamics.hybrid` from a function of inverse dynamics, for numbers or formulas.
 
     Columns of M_A are differences of inverse dynamics, which share all but the accelerations.
 
     Args:
         inverse: (a_A (n,), friction) -> tau_A (n,).
         driven: (n,) whether a joint is driven.
-        a_d: (k,) accelerations of those that are [m/s2], [rad/s2].
-        friction: Whether friction is in.
+        a_d: (k,) accelerations of the driven joints [m/s2], [rad/s2].
+        friction: Whether friction is included.
 
     Returns:
         Forces (k,) of the driven joints and accelerations (n - k,) of the others.

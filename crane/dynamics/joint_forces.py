@@ -1,4 +1,8 @@
-"""Forces along joints and distances: friction, springs, dampers, gas, end stops, ropes."""
+"""Forces along joints and distances: friction, springs, dampers, gas, end stops, ropes.
+
+Stick-slip friction has modes, see `JointForces.set_stick_slip_modes`; a simulation switches them
+at stick-slip transitions in `crane.simulation.integration.stick_slip_modes`.
+"""
 
 from collections import Counter
 
@@ -6,56 +10,54 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.description import ForceElement, Friction, GasSpring, Rope
-from crane.dynamics.frame_distances import FrameDistances, FramePair
+from crane.dynamics.frame_jacobians import FrameDistances, FramePair
 from crane.machine import Machine
 
 _LAW_FIELDS = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
-    "slip", "held", "pace",
-    "stiffness", "damping", "constant", "slack",
-    "stop", "stop_damping", "lower", "upper",
-    "gas", "gas_share", "gas_rest", "gas_exponent",
+    "slip_sign", "is_held", "inverse_velocity",
+    "stiffness", "damping", "constant", "energy_offset",
+    "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
+    "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
-_MODE_FIELDS = slice(_LAW_FIELDS.index("slip"), _LAW_FIELDS.index("pace") + 1)
-_SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("slack") + 1)
-_END_STOP_FIELDS = slice(_LAW_FIELDS.index("stop"), _LAW_FIELDS.index("upper") + 1)
-_GAS_FIELDS = slice(_LAW_FIELDS.index("gas"), len(_LAW_FIELDS))
-MIN_COULOMB_FRICTION = (
-    1e-6  # of a joint that sticks by what a circuit adds alone, for it never to be none
-)
-REST_VELOCITY = 5e-10  # velocity of a machine that is none
-REST_ACCELERATION = 1e-9  # acceleration of a joint that is none [rad/s^2], [m/s^2]
-_UNSMOOTHED_SHARPNESS = 1e300  # sharpness of a sign that is not smoothed
+_MODE_FIELDS = slice(_LAW_FIELDS.index("slip_sign"), _LAW_FIELDS.index("inverse_velocity") + 1)
+_SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("energy_offset") + 1)
+_END_STOP_FIELDS = slice(_LAW_FIELDS.index("stop_stiffness"), _LAW_FIELDS.index("upper_limit") + 1)
+_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), len(_LAW_FIELDS))
+# for joints with circuit friction only, so that friction is never zero
+MIN_COULOMB_FRICTION = 1e-6
+REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
+REST_ACCELERATION = 1e-9  # [rad/s^2], [m/s^2] acceleration that counts as rest
+_UNSMOOTHED_SHARPNESS = 1e300  # sharpness of a discontinuous sign
 
 
 class JointForces:
     """Friction and passive forces of a machine, as forces along the joints of its tree.
 
     A passive force acts along a coordinate: that of a joint, or the distance of two frames. The
-    law is the same; what acts along a distance l acts on the joints with F dl/dv.
+    law is the same; a force F along a distance l acts on the joints with F dl/dv.
 
-    The laws stand here in numpy and once more as formulas, `effects` of
-    `crane.dynamics.force_law_formulas`, on purpose: each is what checks the other.
+    `crane.dynamics.joint_force_formulas.evaluate_force_law` has the same laws as formulas, on
+    purpose: each checks the other.
 
     Args:
-        machine: The machine whose `friction_forces`, `forces`, `gas_springs`, `ropes` and
-            `end_stops` act.
+        machine: The machine whose `friction`, `forces`, `gas_springs`, `ropes` and `end_stops`
+            act.
 
     Attributes:
-        frame_distances: The distances that something acts along; m of them.
-        stick_slip_columns: Columns of the joints whose friction sticks.
-        circuit_friction_columns: Columns of the joints whose Coulomb friction a circuit adds to.
-        circuit_friction: (nv,) how much that is at present [N], [N m]; see `set_circuit_friction`.
+        lengths: The m distances that force elements act along.
+        sticking: Columns of the joints with stick-slip friction.
+        circuit_friction_columns: Columns of the joints with circuit friction.
+        circuit_friction: (nv,) current circuit friction [N], [N m]; see `set_circuit_friction`.
         moving_factor: 0 where friction holds the whole machine at rest, else 1; see
             `set_stick_slip_modes`.
-        law_table: (nv + m, 22) per joint, then per distance: Coulomb friction, its offset, viscous
-            friction, its offset, one over the smoothing velocity, stiction, one over its velocity,
-            and where it sticks, the sign of the slip or the share of the limit that it has at
-            rest, whether it is held, and one over a velocity of the machine
-            (`set_stick_slip_modes`); stiffness, damping, constant force, energy of the spring at q
-            = 0; stiffness and damping of the end stops, lower and upper limit; force of a gas
-            spring at rest, its area over its volume there, where that is, exponent. A rope is an
-            end stop.
+        table: (nv + m, 22) per joint, then per distance: Coulomb friction, its offset, viscous
+            friction, its offset, one over the smoothing velocity, stiction, one over the Stribeck
+            velocity; the stick-slip mode: sign of the slip or share of the limit at rest, whether
+            it is held, one over a velocity of the machine (`set_stick_slip_modes`); stiffness,
+            damping, constant force, energy of the spring at q = 0; stiffness and damping of the
+            end stops, lower and upper limit; force of a gas spring at rest, its area over its
+            volume there, rest position, exponent. A rope is an end stop.
     """
 
     def __init__(self, machine: Machine):
@@ -126,12 +128,12 @@ class JointForces:
 
     @property
     def breakaway(self) -> Array:
-        """(k,) how much friction of the joints that stick can differ from its offset at rest."""
+        """(k,) largest friction of the stick-slip joints at rest, relative to its offset."""
         return self._joint_breakaway + self.circuit_friction[list(self.sticking)]
 
     @property
     def _joint_breakaway(self) -> Array:
-        """The same without what a circuit adds."""
+        """The same without circuit friction."""
         law = self.table[list(self.sticking)]
         limits: Array = (
             law[:, _LAW_FIELDS.index("coulomb")] + law[:, _LAW_FIELDS.index("stiction")]
@@ -139,24 +141,24 @@ class JointForces:
         return limits
 
     def friction_at_rest(self, limit_share: Array) -> Array:
-        """(k,) friction at rest of the joints that stick, with shares (k,) of its limit."""
+        """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
         offset: Array = self.table[list(self.sticking), _LAW_FIELDS.index("coulomb_offset")]
         return offset + limit_share * self.breakaway
 
     @property
     def stick_slip_modes(self) -> tuple[Array, Array, Array]:
-        """(k,) each, as `set_stick_slip_modes` has them."""
+        """(k,) each, the arguments of `set_stick_slip_modes`."""
         slip_sign, is_held, inverse_velocity = self.table[list(self.sticking), _MODE_FIELDS].T
         return slip_sign, is_held, inverse_velocity
 
     def set_stick_slip_modes(
         self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
     ) -> None:
-        """Say what the joints do whose friction sticks.
+        """Set which stick-slip joints slip, rest or are held.
 
         Args:
-            slip_sign: (k,) signs of their slips, or shares of the limit that those at rest have.
-            is_held: (k,) 1 where a joint is kept at rest by what that takes, else 0.
+            slip_sign: (k,) signs of their slips, or shares of the limit for those at rest.
+            is_held: (k,) 1 where a joint is held at rest by the necessary friction, else 0.
             inverse_velocity: (k,) one over velocities of the machine.
             is_moving: Whether anything moves.
         """
@@ -166,11 +168,11 @@ class JointForces:
         )
 
     def set_circuit_friction(self, circuit_friction: Array) -> None:
-        """Set the Coulomb friction (g,) that a circuit adds, of `circuit_friction_columns`."""
+        """Set the circuit friction (g,) of the joints of `circuit_friction_columns`."""
         self.circuit_friction[list(self.circuit_friction_columns)] = circuit_friction
 
     def friction_forces(self, v: Array, use_modes: bool = False) -> Array:
-        """Drive force that friction consumes at every joint.
+        """Drive force that overcomes friction at every joint.
 
         tau_F = (F_C + F_S e^-(v / v_S)^2) s + D_C + F_V v + D_V v s with s = tanh(v / smoothing)
         or sign(v): equation (5) of the reduced-scale forwarder paper with the sign that brakes,
@@ -178,8 +180,8 @@ class JointForces:
 
         Args:
             v: (nv,) [m/s], [rad/s].
-            use_modes: Whether s of the joints whose friction sticks is what `set_stick_slip_modes`
-                says, and F_C has what a circuit adds.
+            use_modes: Whether s of the stick-slip joints comes from `set_stick_slip_modes`, and
+                F_C includes circuit friction.
 
         Returns:
             (nv,) [N], [N m].
@@ -189,7 +191,7 @@ class JointForces:
         sign = np.tanh(v * sharpness)
         if use_modes:
             stick_slip = list(self.sticking)
-            sign[stick_slip] = self.table[stick_slip, _LAW_FIELDS.index("slip")]
+            sign[stick_slip] = self.table[stick_slip, _LAW_FIELDS.index("slip_sign")]
             coulomb = coulomb + self.circuit_friction
         stick_slip_columns = stiction * np.exp(-((v * stribeck) ** 2))
         return (
@@ -199,14 +201,15 @@ class JointForces:
         )
 
     def breakaway_forces(self, v: Array, a: Array) -> Array:
-        """Friction of joints at rest that sticks and is to give way, against their acceleration.
+        """Breakaway friction of stick-slip joints that start to move from rest.
 
         Args:
             v: (nv,) or (N, nv) [m/s], [rad/s].
             a: (nv,) or (N, nv) [m/s^2], [rad/s^2].
 
         Returns:
-            (nv,) or (N, nv) beside `friction_forces`, (F_C + F_S) sign(a) where v = 0 [N], [N m].
+            (nv,) or (N, nv) in addition to `friction_forces`, (F_C + F_S) sign(a) where v = 0 [N],
+            [N m].
         """
         stick_slip = list(self.sticking)
         out = np.zeros_like(v)
@@ -219,8 +222,8 @@ class JointForces:
     def passive_forces(self, q: Array, v: Array) -> Array:
         """Force of springs, dampers, constant forces, gas, end stops and ropes on every joint.
 
-        f = force - stiffness (q - rest) - damping v, and at end stops, d beyond the limit,
-        f = -+ stiffness d max(0, 1 + damping d') (Hunt and Crossley, 1975), and of gas springs
+        f = force - stiffness (q - rest) - damping v; for end stops at a depth d beyond the limit
+        f = -+ stiffness d max(0, 1 + damping d') (Hunt and Crossley, 1975); for gas springs
         f = area pressure (V0 / V)^exponent.
 
         Args:
@@ -233,7 +236,7 @@ class JointForces:
         return self._project_on_joints(*self.passive_forces_by_element(q, v))
 
     def passive_forces_by_element(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """`passive_forces` by what it acts along.
+        """`passive_forces` by joint and distance.
 
         Args:
             q: (nq,) or (N, nq) [m], [rad].
@@ -280,7 +283,7 @@ class JointForces:
         )
 
     def _gas_element_forces(self, q: Array) -> Array:
-        """Of the gas along joints and distances (nv + m,)."""
+        """Gas forces along joints and distances (nv + m,)."""
         out = np.zeros_like(q)
         here = np.flatnonzero(self._gas_force)
         volume_ratio = 1.0 + self._gas_area_per_volume[here] * (
@@ -317,9 +320,9 @@ class JointForces:
 
 
 def find_stick_slip_columns(machine: Machine) -> tuple[int, ...]:
-    """Columns of the joints whose friction sticks, in order.
+    """Columns of the joints with stick-slip friction, in order.
 
-    By their own law, or by what a circuit adds to it where that is not smoothed.
+    By their own law, or by circuit friction if their law is not smoothed.
     """
     laws = machine.friction.items()
     found = {machine.column(joint) for joint, law in laws if law.has_stick_slip}
@@ -328,16 +331,16 @@ def find_stick_slip_columns(machine: Machine) -> tuple[int, ...]:
 
 
 def find_circuit_friction_columns(machine: Machine) -> tuple[int, ...]:
-    """Columns of the joints `Hydraulics.find_circuit_friction_columns`, in their order."""
+    """Columns of the joints with circuit friction, in the order of the circuit."""
     joints = machine.hydraulics.circuit_friction_joints if machine.hydraulics is not None else ()
     return tuple(machine.column(joint) for joint in joints)
 
 
 def _table_rows(machine: Machine) -> tuple[list[int], list[FramePair]]:
-    """The row of the table that each element is in, and the frames of the rows after the joints.
+    """The table row of each force element, and the frames of the rows after the joints.
 
-    Springs between the same frames share one, as those on one joint do, and so do a spring, a gas
-    spring and a rope; of two gas springs or ropes each has its own.
+    Springs between the same frames share a row, as on one joint; so do a spring, a gas spring and
+    a rope. Two gas springs or two ropes have separate rows.
     """
     found: dict[tuple[FramePair, int], int] = {}
     same_pair_count: Counter[tuple[str, FramePair]] = Counter()

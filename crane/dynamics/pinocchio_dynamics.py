@@ -16,10 +16,10 @@ from crane.machine import Machine
 
 
 class ClosedState(NamedTuple):
-    """One closed posture in motion.
+    """A closed configuration with velocities.
 
     Attributes:
-        q: (nv,) posture.
+        q: (nv,) configuration.
         gamma: (nv, n).
         v: (nv,) velocities gamma v_A.
         drift: (nv,) accelerations at a_A = 0.
@@ -32,18 +32,18 @@ class ClosedState(NamedTuple):
 
 
 class _Subtree:
-    """Bodies that move together, on a base that stands still.
+    """Bodies that move together, on a base at rest.
 
     Args:
         tree: The machine's tree.
         bodies: Their indices, a parent before its children.
 
     Attributes:
-        bodies: The same.
-        velocity_columns: Of their joints in v.
-        configuration_indices: Of their joints in Pinocchio's q.
+        bodies: Their indices.
+        velocity_columns: Columns of their joints in v.
+        configuration_indices: Indices of their joints in Pinocchio's q.
         base_body: The body of the tree that they stand on.
-        model: Of them alone; its gravity is written as the base turns.
+        model: Model of these bodies; its gravity is set in the axes of the base.
         data: Its data.
     """
 
@@ -70,15 +70,15 @@ class _Subtree:
 
 
 class _TreeWorkspace:
-    """What evaluating a quantity writes.
+    """Data of one thread that evaluates a quantity.
 
     Args:
         model: The tree.
-        body_groups: Bodies that carry each other, together.
+        body_groups: Bodies that carry each other, by group.
 
     Attributes:
-        data: Of the tree.
-        body_groups: Models of the bodies and their data.
+        data: Data of the tree.
+        subtrees: Models of the groups and their data.
     """
 
     def __init__(self, model: pin.Model, body_groups: Sequence[Sequence[int]]):
@@ -87,18 +87,18 @@ class _TreeWorkspace:
 
 
 class PinocchioDynamics:
-    """Any quantity of `QUANTITIES` at a closed posture, with rnea, crba and the tree's regressor.
+    """Quantities of `QUANTITIES` at a closed configuration, by Pinocchio's algorithms.
 
     Args:
         machine: The machine.
         forces: Its friction and passive forces.
-        carrier_bodies: See `crane.dynamics.formulation`.
+        carrier_bodies: See `crane.dynamics.formula_structure`.
     """
 
     def __init__(self, machine: Machine, forces: JointForces, carrier_bodies: Sequence[int]):
-        # a copy, so that parameters stay those of this moment
+        # a copy, which later changes of the machine's model do not affect
         self._model = pin.Model(machine.model)
-        # added here, not by the parts: Pinocchio's kinetic energy forgets those of some joints
+        # added here: Pinocchio's kinetic energy ignores the armature of some joints
         self._armature = np.array(self._model.armature)
         self._rotor_columns = np.flatnonzero(self._armature)
         self._closure, self._joint_forces = machine.closure, forces
@@ -115,7 +115,7 @@ class PinocchioDynamics:
         )
 
     def _group_bodies(self, carrier_bodies: Sequence[int]) -> list[list[int]]:
-        """Bodies that carry each other, a parent before its children."""
+        """Groups of bodies that carry each other, a parent before its children."""
         joints = [0, *self._coordinates.joints.tolist()]
         roots: dict[int, list[int]] = {}
         root_of = {0: 0}
@@ -127,7 +127,7 @@ class PinocchioDynamics:
 
     @property
     def inertial_parameters(self) -> Array:
-        """See `Dynamics.inertial_parameters`."""
+        """See `Dynamics.parameters`."""
         inertias = list(self._model.inertias)[1:]
         bodies = [inertia.toDynamicParameters() for inertia in inertias]
         return np.concatenate([*bodies, self._armature[self._rotor_columns]])
@@ -137,7 +137,7 @@ class PinocchioDynamics:
 
         Args:
             quantity: Its name.
-            q: (nq,) closed posture.
+            q: (nq,) closed configuration.
             v_a: (n,).
             x: (n,).
 
@@ -174,15 +174,17 @@ class PinocchioDynamics:
                 _, joint_friction, _, holding_forces = self._accelerations_with_stick_slip(
                     state, x
                 )
-                stick_slip, (slip, held, pace) = (
+                stick_slip, (slip_sign, is_held, inverse_velocity) = (
                     list(self._joint_forces.sticking),
                     self._joint_forces.stick_slip_modes,
                 )
-                is_at_rest = (np.abs(slip) < 1) | (
-                    held.any() & (np.abs(v[stick_slip]) * pace < REST_VELOCITY)
+                is_at_rest = (np.abs(slip_sign) < 1) | (
+                    is_held.any() & (np.abs(v[stick_slip]) * inverse_velocity < REST_VELOCITY)
                 )
                 friction_at_rest = np.where(
-                    is_at_rest, self._joint_forces.friction_at_rest(slip) + holding_forces, 0.0
+                    is_at_rest,
+                    self._joint_forces.friction_at_rest(slip_sign) + holding_forces,
+                    0.0,
                 )
                 return np.concatenate(
                     [
@@ -227,14 +229,20 @@ class PinocchioDynamics:
     def _accelerations_with_stick_slip(
         self, state: ClosedState, tau_a: Array
     ) -> tuple[Array, Array, float, Array]:
-        """Accelerations, friction of all joints, transition margin and stick-slip modes."""
+        """a_A, friction of all joints, transition margin, forces of held joints.
+
+        See `DynamicsFormulas.accelerations_with_stick_slip`.
+        """
         forces, stick_slip = self._joint_forces, list(self._joint_forces.sticking)
-        slip, held, pace = forces.stick_slip_modes
+        slip_sign, is_held, inverse_velocity = forces.stick_slip_modes
         joint_friction = forces.friction_forces(state.v, use_modes=True)
         bias = self._inverse_dynamics(state, state.drift, False) + state.gamma.T @ joint_friction
         a_a = self._solve_mass_matrix(state, tau_a - bias)
-        margins, holding_forces = slip * state.v[stick_slip] * pace, np.zeros(len(stick_slip))
-        held_indices = np.flatnonzero(held)
+        margins, holding_forces = (
+            slip_sign * state.v[stick_slip] * inverse_velocity,
+            np.zeros(len(stick_slip)),
+        )
+        held_indices = np.flatnonzero(is_held)
         if len(held_indices):
             rows = state.gamma[stick_slip][held_indices]
             unit_accelerations = np.array([self._solve_mass_matrix(state, row) for row in rows])
@@ -252,7 +260,7 @@ class PinocchioDynamics:
         """M_A^-1 of net forces."""
         mass = self._mass_matrix(state)
         try:
-            np.linalg.cholesky(mass)  # elimination would divide by what rounding leaves
+            np.linalg.cholesky(mass)  # elimination would divide by rounding errors
             return solve_linear(mass, forces)
         except np.linalg.LinAlgError:
             raise MechanismError(
@@ -261,7 +269,6 @@ class PinocchioDynamics:
             ) from None
 
     def _kinetic_and_potential_energy(self, state: ClosedState) -> Array:
-        """Kinetic and potential."""
         configuration = self._coordinates.configuration(state.q)
         kinetic, memory = 0.5 * float(self._armature @ state.v**2), self._workspace.value
         for part in memory.subtrees:
@@ -271,7 +278,7 @@ class PinocchioDynamics:
         return np.array([kinetic, weight + self._joint_forces.potential_energy(state.q)])
 
     def _dissipated_power(self, state: ClosedState) -> float:
-        """Power that friction, dampers and end stops take out."""
+        """Power dissipated by friction, dampers and end stops."""
         conservative = self._joint_forces.passive_forces(state.q, np.zeros_like(state.v))
         braking = conservative - self._joint_forces.passive_forces(state.q, state.v)
         return float(
@@ -299,7 +306,7 @@ class PinocchioDynamics:
         return total
 
     def _tree_inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
-        """Forces along the joints (nv,), part after part."""
+        """Forces along the joints (nv,), by subtree."""
         tau = np.empty_like(v)
         for part, at in self._subtree_configurations(q):
             c = part.velocity_columns
@@ -307,7 +314,7 @@ class PinocchioDynamics:
         return tau + self._armature * a
 
     def _tree_regressor(self, q: Array, v: Array, a: Array) -> Array:
-        """Of the tree (nv, 10 nb + nr), part after part; a column for each rotor."""
+        """Regressor of the tree (nv, 10 nb + nr), by subtree; one column per rotor."""
         size = 10 * (self._model.njoints - 1)
         out = np.zeros((len(v), size + len(self._rotor_columns)))
         out[self._rotor_columns, size + np.arange(len(self._rotor_columns))] = a[
@@ -320,7 +327,7 @@ class PinocchioDynamics:
         return out
 
     def _subtree_configurations(self, q: Array) -> Iterator[tuple[_Subtree, Array]]:
-        """The parts and their configurations, gravity turned into their bases' directions."""
+        """The subtrees and their configurations, with gravity in the axes of their bases."""
         configuration, memory = self._coordinates.configuration(q), self._workspace.value
         pin.forwardKinematics(self._model, memory.data, configuration)
         for part in memory.subtrees:

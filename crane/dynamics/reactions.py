@@ -1,4 +1,4 @@
-"""Forces in the joints: what the bodies of a machine do to each other, at rest and in motion."""
+"""Reactions: the wrenches that joints transmit, at rest and in motion."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -12,26 +12,25 @@ from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_samples
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics.frame_distances import MIN_LENGTH
+from crane.dynamics.frame_jacobians import MIN_LENGTH
 from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
 
-_SINGULAR_TOLERANCE = (
-    1e-10  # share of the largest pivot under which the closure is asked whether it ends there
-)
-_ZERO_STRESS_FACTOR = 10.0  # times what loops may be open by: a share of a stress that is none
+# relative pivot below which the closure checks for a singular configuration
+_SINGULAR_TOLERANCE = 1e-10
+_ZERO_STRESS_FACTOR = 10.0  # factor on the redundancy tolerance: a stress below counts as zero
 
 
 class _StackKinematics(NamedTuple):
-    """N postures.
+    """Kinematics of N configurations.
 
     Attributes:
         rotations: (N, nj + 1, 3, 3) of all bodies in the world, that of the world first.
-        origins: (N, nj + 1, 3) likewise [m].
+        origins: (N, nj + 1, 3) of all bodies [m].
         columns: (N, 6, nv) of the joints, at the world's origin.
         loop_frames: (N, 2 l, 3, 3) and (N, 2 l, 3), the loops' frames.
         loop_wrenches: (N, r, 6) the loops' equations as wrenches at the world's origin.
-        scaled_jacobian: (N, m, nv) of all equations, in shares of the machine's size.
+        scaled_jacobian: (N, m, nv) of all equations, see `LoopEquations.evaluate_scaled`.
     """
 
     rotations: Array
@@ -45,32 +44,31 @@ class _StackKinematics(NamedTuple):
 class Reactions(OneLineRepr):
     """Wrenches in the joints of a machine with closed loops.
 
-    With tau the forces along the tree's joints that its motion asks for (rnea) less those of
-    wrenches from outside and of springs and ropes between frames, f what acts along single joints
-    passively, tau_F friction, I_r rotor inertias, and the loops' Jacobian Phi, the multipliers
-    lambda of the loops follow from the passive rows P of the balance along the joints, and the
-    drives' forces u from the active rows A:
+    With tau the inverse dynamics of the tree (rnea) minus external wrenches and force elements
+    between frames, f the passive forces along single joints, tau_F friction, I_r rotor inertias
+    and the loop Jacobian Phi, the Lagrange multipliers lambda of the loops follow from the passive
+    rows P of the balance along the joints, and the drive forces u from the active rows A:
 
         Phi_P^T lambda = (tau - f + tau_F + I_r a)_P,
         u = (tau - f + tau_F + I_r a)_A - Phi_A^T lambda.
 
-    A loop holds its successor with the wrench sum lambda_r w_r, its predecessor with the opposite;
-    what remains for a joint of the tree is the balance of all bodies that it carries.
+    A loop acts on its successor with the wrench sum lambda_r w_r, on its predecessor with the
+    opposite; the reaction of a joint of the tree is the balance of all bodies that it carries.
 
-    A joint's wrench is all that goes across it, along its axis also the drive, friction, springs
-    and stops on the joint, and what a coupling does (a gear: its teeth act on each joint alike).
-    What acts between frames beside the joints is none of it.
+    The reaction of a joint includes all forces across it: along its axis also the drive, friction,
+    springs and stops of the joint, and forces of couplings (a gear: its teeth act on each joint).
+    Force elements between frames besides the joint are not included.
 
-    **What is not determined.** A loop may have more equations than its bodies need to be held:
-    those of a planar linkage in space also hold it in its plane, once for every loop too many.
-    Forces along pins and moments across them then depend on how stiff the bodies are and how well
-    they fit, which no file says; so do all components of a part that stresses itself. Taken is the
-    least-norm solution, forces counted times the machine's size, as the smallest that bodies have
-    which fit; `statically_determined` tells which components do not depend on that. Drive forces
-    do not, and equal `Dynamics.inverse`, to the digits that the loops are closed by.
+    **Undetermined components.** A loop may have redundant equations: those of a planar linkage in
+    space also hold it in its plane, once per redundant loop. Forces along pins and moments across
+    them then depend on the stiffness and fit of the bodies, which no file gives; so do all
+    components of a part that is prestressed. The least-norm solution is taken, with forces
+    multiplied by the characteristic length; `statically_determined` returns the components that do
+    not depend on this choice. Drive forces do not depend on it, and equal `Dynamics.inverse` up to
+    the closure tolerance.
 
     Args:
-        machine: The machine; its payload and parameters are those at this moment.
+        machine: The machine with its current payload and parameters.
 
     Attributes:
         names: (k,) of the tree's joints in Pinocchio's order, then of the loops.
@@ -88,7 +86,7 @@ class Reactions(OneLineRepr):
         self.names = (*list(model.names)[1:], *(loop.name for loop in equations.loops))
         self._joint_of_column = (
             machine.coordinates.joints - 1
-        )  # by column, the joint in the wrenches' order
+        )  # joint of each column, in the order of the wrenches
         # whether a joint (column) carries a body (row), and a loop's successor but not predecessor
         self._is_carried_by = np.zeros((model.njoints, model.njoints - 1))
         for body in range(1, model.njoints):
@@ -102,7 +100,7 @@ class Reactions(OneLineRepr):
         self._loop_of_row = np.eye(len(equations.loops))[
             :, equations.loop_of_row[: len(self._row_joint_signs)]
         ]
-        # z along the axis, as the loops' frames have it
+        # z along the axis, as in the loops' frames
         of = machine.tree.joints
         self._local_axes = np.array(
             [
@@ -119,26 +117,26 @@ class Reactions(OneLineRepr):
         wrenches: Mapping[str, ArrayLike] | None = None,
         friction: bool = False,
     ) -> Array:
-        """The wrenches by which what carries a joint acts on what the joint moves.
+        """Wrenches that the carrier of a joint exerts on the body that the joint moves.
 
-        Of a loop: by which its predecessor acts on its successor.
+        For a loop: that its predecessor exerts on its successor.
 
         Args:
-            q: (nq,) or (N, nq) closed postures [m], [rad].
+            q: (nq,) or (N, nq) closed configurations [m], [rad].
             v: The same shape, velocities gamma v_A; at rest if not given [m/s], [rad/s].
             a: The same shape, accelerations gamma a_A + drift; those at a_A = 0 if not given
                 [m/s2], [rad/s2].
-            wrenches: From outside by link (6,) or (N, 6), force [N] and moment about the origin of
-                its frame [N m], in the world's axes.
-            friction: Whether there is friction; see `Dynamics.inverse` for what it is at rest.
+            wrenches: External wrenches by link (6,) or (N, 6), force [N] and moment about the
+                origin of its frame [N m], in the world's axes.
+            friction: Whether friction is included; see `Dynamics.inverse` for friction at rest.
 
         Returns:
             (k, 6) or (N, k, 6) in the order of `names`: force [N] and moment about the joint's
-            origin, of a loop that of its successor's frame [N m], in the world's axes.
+            origin, for a loop that of its successor's frame [N m], in the world's axes.
 
         Raises:
-            InputError: Unknown link, or shapes that do not go together.
-            BranchEdgeError: The passive joints are not determined there.
+            InputError: Unknown link, or shapes that do not match.
+            SingularConfigurationError: The passive joints are not determined there.
         """
         return self._solve_wrenches_and_drives(q, v, a, wrenches, friction)[0]
 
@@ -162,15 +160,15 @@ class Reactions(OneLineRepr):
         return self._solve_wrenches_and_drives(q, v, a, wrenches, friction)[1]
 
     def unit_load_wrenches(self, q: ArrayLike, link: str) -> Array:
-        """What a force at a link's origin adds to the wrenches, per force.
+        """Derivatives of the joint wrenches by a force at the origin of a link.
 
         Args:
-            q: (nq,) or (N, nq) closed postures [m], [rad].
-            link: Where it acts.
+            q: (nq,) or (N, nq) closed configurations [m], [rad].
+            link: Link on which the force acts.
 
         Returns:
             (k, 6, 3) or (N, k, 6, 3): `joint_wrenches` of a unit force in the world's x, y, z,
-            less that without.
+            minus those without.
         """
         body, place = self._frame_point(link)
         rows, stacked = self._as_stack(q, "q")
@@ -184,27 +182,27 @@ class Reactions(OneLineRepr):
         return out if stacked else out[0]
 
     def joint_axes(self, q: ArrayLike) -> Array:
-        """The joints' own axes in the world, (k, 3, 3) or (N, k, 3, 3) with x, y, z as columns.
+        """Axes of the joints in the world, (k, 3, 3) or (N, k, 3, 3) with x, y, z as columns.
 
-        z is the axis that the joint turns about or slides along, of a loop that which it leaves
-        free; x and y lie across it in what the joint moves. With them a force (3,) is
-        axes^T force: across the pin x, y, along it z.
+        z is the axis of the joint, for a loop its free axis; x and y are perpendicular to it and
+        fixed to the moved body. axes^T force gives the components of a force (3,): x, y across the
+        pin, z along it.
 
         Args:
-            q: (nq,) or (N, nq) closed postures [m], [rad].
+            q: (nq,) or (N, nq) closed configurations [m], [rad].
         """
         rows, stacked = self._as_stack(q, "q")
         out = self._axes_in_world(self._evaluate_kinematics(rows))
         return out if stacked else out[0]
 
     def statically_determined(self, q: ArrayLike) -> NDArray[np.bool_]:
-        """Which components of the wrenches statics determines, in the joints' own `joint_axes`.
+        """Which components of the wrenches statics determines, in the axes of `joint_axes`.
 
-        Those that no stress of the bodies in themselves has, that is no lambda with
-        Phi_P^T lambda = 0.
+        Those that are zero for every self-stress, that is for every lambda with Phi_P^T lambda =
+        0.
 
         Args:
-            q: (nq,) or (N, nq) closed postures [m], [rad].
+            q: (nq,) or (N, nq) closed configurations [m], [rad].
 
         Returns:
             (k, 6) or (N, k, 6), three forces and three moments.
@@ -233,7 +231,6 @@ class Reactions(OneLineRepr):
         wrenches: Mapping[str, ArrayLike] | None,
         friction: bool,
     ) -> tuple[Array, Array]:
-        """Wrenches and drives."""
         rows, stacked = self._as_stack(q, "q")
         velocities = np.zeros_like(rows) if v is None else self._as_matching_stack(v, rows, "v")
         if a is not None:
@@ -274,14 +271,14 @@ class Reactions(OneLineRepr):
         return (wrench, drive) if stacked else (wrench[0], drive[0])
 
     def _frame_point(self, link: str) -> tuple[int, Array]:
-        """The body that carries a link, and where its origin is in that body's frame."""
+        """The body that carries a link, and the origin of the link in that body's frame."""
         frame = self._model.frames[self.machine.frame(link)]
         return int(frame.parentJoint), frame.placement.translation
 
     def _subtract_wrench(
         self, kinematics: _StackKinematics, carried: Array, point: tuple[int, Array], wrench: Array
     ) -> None:
-        """Take a wrench (6,) or (N, 6) about a point of a body off what joints hold."""
+        """Subtract a wrench (6,) or (N, 6) about a point of a body from `carried`."""
         about = np.array(np.broadcast_to(wrench, (len(carried), 6)))
         about[:, 3:] += np.cross(self._point_in_world(kinematics, *point), about[:, :3])
         carried -= self._is_carried_by[point[0]][:, None] * about[:, None]
@@ -289,14 +286,14 @@ class Reactions(OneLineRepr):
     def _solve_loop_forces(
         self, kinematics: _StackKinematics, q: Array, carried: Array, joint_forces: Array
     ) -> tuple[Array, Array]:
-        """Wrenches about the joints' origins and drives, of c cases at once.
+        """Wrenches about the joints' origins and drive forces, for c load cases.
 
         Args:
-            kinematics: The postures.
-            q: (N, nq) the same.
-            carried: (N, nj, 6, c) what each joint carries, as if there were no loops, at the
-                world's origin.
-            joint_forces: (N, nv, c) what acts along the joints beside the drives.
+            kinematics: Kinematics of the configurations.
+            q: (N, nq) configurations.
+            carried: (N, nj, 6, c) wrench that each joint carries without loops, at the world's
+                origin.
+            joint_forces: (N, nv, c) forces along the joints besides the drives.
 
         Returns:
             (N, k, 6, c) and (N, n, c).
@@ -317,7 +314,7 @@ class Reactions(OneLineRepr):
         right = (
             equations.coordinate_units[closure.passive, None] * required_forces[:, closure.passive]
         )
-        # least squares of numbers that are the same whatever the machine's size
+        # least squares of scaled values
         shares = turn @ np.linalg.solve(np.swapaxes(pivots, 1, 2), right)
         lambdas = shares / equations.residual_units[:, None]
         pull = np.einsum("nmi,nmc->nic", kinematics.scaled_jacobian[:, :, closure.active], shares)
@@ -330,7 +327,7 @@ class Reactions(OneLineRepr):
     def _wrenches_with_loop_forces(
         self, kinematics: _StackKinematics, carried: Array, multipliers: Array
     ) -> Array:
-        """Wrenches (N, k, 6, c) about the joints' origins, under multipliers (N, m, c)."""
+        """Wrenches (N, k, 6, c) about the joints' origins, with multipliers (N, m, c)."""
         loaded = (
             kinematics.loop_wrenches[..., None]
             * multipliers[:, : kinematics.loop_wrenches.shape[1], None, :]
@@ -351,12 +348,15 @@ class Reactions(OneLineRepr):
         v: Array | None = None,
         a: Array | None = None,
     ) -> _StackKinematics:
-        """Postures (N, nq) and the joints' wrenches (N, nj, 6) at the world's origin."""
+        """Kinematics of configurations (N, nq); writes wrenches (N, nj, 6) into `carried`."""
         model, data, equations = self._model, self._data, self._equations
         configurations = self.machine.coordinates.configuration(q)
         columns = np.empty((len(q), 6, model.nv))
         bodies = np.empty((len(q), model.njoints, 4, 4))
-        joint_placements, joint_forces = list(data.oMi), list(data.f)[1:]  # seen as they change
+        joint_placements, joint_forces = (
+            list(data.oMi),
+            list(data.f)[1:],
+        )  # references, updated by Pinocchio
         for i, at in enumerate(configurations):
             columns[i] = pin.computeJointJacobians(model, data, at).reshape(6, -1)
             bodies[i] = [placement.homogeneous for placement in joint_placements]
@@ -389,7 +389,7 @@ class Reactions(OneLineRepr):
     def _point_in_world(
         self, kinematics: _StackKinematics, body: int, local_point: Array
     ) -> Array:
-        """(N, 3) of a point of a body in the world."""
+        """(N, 3) positions of a point of a body in the world."""
         out: Array = kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
         return out
 

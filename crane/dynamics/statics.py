@@ -1,4 +1,4 @@
-"""What loads at rest depend on: weight, tip and passive forces, linear in the load."""
+"""Statics: holding forces under gravity, passive forces and a load at the tip."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from crane.machine import Machine
 
 
 class StaticQuantities(NamedTuple):
-    """A machine at N postures, all in the world's directions.
+    """Static quantities of a machine at N configurations, in the world's axes.
 
     Attributes:
         first_moment: (N, 3) first moment of all masses, s = sum m c, about the origin [kg m].
         moment_jacobian: (N, 3, n) ds/dq_A.
         total_mass: (N,) of the machine [kg].
-        passive_forces: (N, n) gamma^T f, see `Dynamics.passive_forces`.
+        passive_forces: (N, n) gamma^T f, see `Dynamics.passive`.
         tip_positions: (N, 3) [m].
         tip_jacobian: (N, 3, n) dtip/dq_A.
     """
@@ -42,20 +42,20 @@ class StaticQuantities(NamedTuple):
         return -np.asarray(np.einsum("...i,...in->...n", force, self.tip_jacobian))
 
     def select(self, index: NDArray[Any]) -> "StaticQuantities":
-        """Some of the postures, by index or mask."""
+        """The quantities of some configurations, by index or mask."""
         return StaticQuantities(*(x[index] for x in self))
 
 
 class StaticsEvaluator:
-    """A machine at rest, as machine code.
+    """Evaluates static quantities of a machine in machine code.
 
-    With gravity g, a force F at the tip and forces tau_A of the active joints it is at rest where
+    With gravity g, a force F at the tip and forces tau_A of the active joints, equilibrium is
 
         tau_A = -(ds/dq_A)^T g - gamma^T f - (dtip/dq_A)^T F.
 
     Args:
-        machine: The machine; its free joints stay where the postures have them.
-        frame: Where forces act; the tip if not given.
+        machine: The machine; its free joints stay at their coordinates.
+        frame: Frame on which forces act; the tip if not given.
 
     Raises:
         InputError: There is no tip, or no such frame.
@@ -70,20 +70,22 @@ class StaticsEvaluator:
         self.dynamics = Dynamics(self.machine)
         self._n = len(machine.active)
         n = self._n
-        self.layout = Layout(moment=3, slopes=3 * n, mass=1, passive=n, tip=3, ways=3 * n)
+        self.layout = Layout(
+            moment=3, moment_jacobian=3 * n, mass=1, passive=n, tip=3, tip_jacobian=3 * n
+        )
 
     def evaluate(self, q: Array) -> StaticQuantities:
-        """At closed postures (N, nq), which are not checked."""
+        """Static quantities at closed configurations (N, nq), without checks."""
         still = np.zeros((len(q), self._n))
         return self._split_quantities(
             self.dynamics.evaluate_closed("statics", np.ascontiguousarray(q), still, still)
         )
 
     def close_loops(self, q: Array) -> tuple[Array, Array]:
-        """Close the loops at the active coordinates of postures (N, nq) that are nearly closed.
+        """Close the loops at the active coordinates of nearly closed configurations (N, nq).
 
         Returns:
-            Postures (N, nq), and whether each is closed on the branch of home (N,).
+            Configurations (N, nq), and whether each is closed on the branch of home (N,).
         """
         closure = self.machine.closure
         q = np.array(q, order="C")
@@ -103,19 +105,19 @@ class StaticsEvaluator:
         return q, is_closed
 
     def coordinate_derivatives(self, q: Array) -> StaticQuantities:
-        """By q_A, of all at closed postures (N, nq): each with one more axis (n,) at the end."""
+        """Derivatives by q_A at closed configurations (N, nq), along one more last axis (n,)."""
         q_a = np.ascontiguousarray(q[:, self.machine.closure.active])
         found = self.dynamics.derivatives("statics", q_a, by=["q_a"])["q_a"]
         return self._split_quantities(found)
 
     def parameter_derivatives(self, q: Array, names: Sequence[str]) -> StaticQuantities:
-        """The same by named numbers of the machine, at the same q_A."""
+        """Derivatives by named parameters of the machine, at the same q_A."""
         q_a = np.ascontiguousarray(q[:, self.machine.closure.active])
         found = self.dynamics.derivatives("statics", q_a, by=names)
         return self._split_quantities(np.stack([found[name] for name in names], axis=-1))
 
     def _split_quantities(self, rows: Array) -> StaticQuantities:
-        """Of rows (N, size, ...)."""
+        """Static quantities from rows (N, size, ...)."""
         parts, (count, _, *more) = self.layout, rows.shape
 
         def part(name: str, *shape: int) -> Array:
@@ -123,6 +125,6 @@ class StaticsEvaluator:
 
         n = self._n
         return StaticQuantities(
-            part("moment", 3), part("slopes", 3, n), part("mass"), part("passive", n),
-            part("tip", 3), part("ways", 3, n),
+            part("moment", 3), part("moment_jacobian", 3, n), part("mass"), part("passive", n),
+            part("tip", 3), part("tip_jacobian", 3, n),
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Whether a machine tips: what its supports carry, and the moments about its tipping lines."""
+"""Stability against tipping: moments about the tipping lines, and forces of the supports."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,16 +15,16 @@ from crane.description.ground_contact import Contact
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine import Machine
 
-_NEGATIVE_LOAD_TOLERANCE = -1e-9  # of the weight, that a support carries which carries none
+_NEGATIVE_LOAD_TOLERANCE = -1e-9  # force over weight of an unloaded support
 
 
 class TippingMargins(NamedTuple):
-    """How far a machine is from tipping, at N postures with k tipping lines.
+    """Stability margins at N configurations with k tipping lines.
 
     Attributes:
-        moments: (N, k) about each line, that hold the machine down [N m]; below 0 it tips.
-        weight_ratios: (N, k) the same as a share of the machine's weight: what the support that is
-            farthest from the line would carry of it, if it alone held against the moment.
+        moments: (N, k) stabilizing moment about each line [N m]; the machine tips below 0.
+        weight_ratios: (N, k) the moment divided by the weight and by the distance of the line from
+            the support that is farthest from it.
     """
 
     moments: Array
@@ -32,41 +32,41 @@ class TippingMargins(NamedTuple):
 
     @property
     def smallest_ratio(self) -> Array:
-        """(N,) the smallest share."""
+        """(N,) the smallest weight ratio."""
         least: Array = self.weight_ratios.min(axis=1)
         return least
 
 
 class TippingStability:
-    """The tipping lines of a machine, the edges of the hull around its supports seen from above.
+    """The tipping lines of a machine: edges of the convex hull of its supports, seen from above.
 
-    With G, M the force and the moment about the world's origin by which the ground holds it, and a
-    line from support i to the next one anticlockwise, j,
+    With G, M the force and the moment about the world's origin that the ground exerts, and a line
+    from support i to the next one anticlockwise, j,
 
         moment = (p_j - p_i) / |p_j - p_i| . (M - p_i x G),
 
-    which is what turns the machine about the line onto its supports: its static part is that of
-    ISO 10567 and EN 13000, inertial forces belong to it too (Ghasempoor and Sepehri, A measure of
-    machine stability for moving base manipulators, ICRA 1995). Of a machine that is fixed to the
-    world they follow from its motion,
+    which turns the machine about the line onto its supports. The static part is that of ISO 10567
+    and EN 13000; inertial forces are included (Ghasempoor and Sepehri, A measure of machine
+    stability for moving base manipulators, ICRA 1995). For a machine that is fixed to the world G
+    and M follow from its motion,
 
         G = d(momentum)/dt - m g - sum F,
         M = d(angular momentum)/dt - sum r x m g - sum (r x F + M_F),
 
-    with wrenches F, M_F from outside. Of one on contacts they are what those press with.
+    with external wrenches F, M_F. For a machine on contacts they are the contact forces.
 
     Args:
-        machine: With `find_supports`, or at least three contacts.
+        machine: With `supports`, or at least three contacts.
 
     Attributes:
-        support_names: Of the supports.
-        line_names: Of each line the names of its two supports.
-        line_indices: Of each line the indices of its two supports.
+        support_names: Names of the supports.
+        line_names: Names of the two supports of each line.
+        line_indices: Indices of the two supports of each line.
         is_stationary: Whether no support moves.
-        mass: Of the machine [kg].
+        mass: Mass of the machine [kg].
 
     Raises:
-        InputError: It has fewer than three supports, or all in one line.
+        InputError: It has fewer than three supports, or all on one line.
     """
 
     def __init__(self, machine: Machine):
@@ -76,7 +76,7 @@ class TippingStability:
             [name for name, _ in support_list],
             [link for _, link in support_list],
         )
-        # which of the forces from outside are those of supports
+        # indices of the external forces that are supports
         self._support_contacts = [
             k
             for k, force in enumerate(machine.external_forces)
@@ -109,7 +109,7 @@ class TippingStability:
         self._gravity = self._model.gravity.linear.copy()
 
     def static_margins(self, q_a: ArrayLike) -> TippingMargins:
-        """At rest, without forces from outside.
+        """Margins at rest, without external forces.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
@@ -124,11 +124,11 @@ class TippingStability:
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
-            frame: Where it hangs; the tip if not given.
+            frame: Frame that carries the mass; the tip if not given.
 
         Returns:
-            (N,) [kg], infinite where it hangs between the supports, below 0 where the machine
-            tips without it; and about which line, "A to B", "" about none.
+            (N,) [kg], infinite for a frame between the supports, below 0 where the machine tips
+            without it; and the tipping line, "A to B", "" if there is none.
         """
         machine = self.machine
         link = machine.tip if frame is None else frame
@@ -156,22 +156,21 @@ class TippingStability:
         a: Array | None = None,
         external_wrenches: Array | None = None,
     ) -> Array:
-        """The wrench by which the ground holds it (N, 6), about the world's origin.
+        """The wrench that the ground exerts (N, 6), about the world's origin.
 
         Args:
-            q: (N, nv) closed postures.
+            q: (N, nv) closed configurations.
             v: (N, nv) velocities; at rest if not given.
-            a: (N, nv) accelerations, likewise.
-            external_wrenches: (N, .) wrench and channels of each force from outside as a run
-                records them; none act if not given. Those of contacts that are supports are left
-                out.
+            a: (N, nv) accelerations; 0 if not given.
+            external_wrenches: (N, .) wrench and channels of each external force as in a recording;
+                none if not given. Those of contacts that are supports are left out.
         """
         rates, centres = np.zeros((len(q), 6)), np.empty((len(q), 3))
         data = self._workspace.value
         still = np.zeros(self._model.nv)
         moves = v is not None or a is not None
-        for i, posture in enumerate(q):
-            at = self.machine.coordinates.configuration(posture)
+        for i, one in enumerate(q):
+            at = self.machine.coordinates.configuration(one)
             if moves:
                 rates[i] = pin.computeCentroidalMomentumTimeVariation(
                     self._model, data, at,
@@ -180,9 +179,9 @@ class TippingStability:
             else:
                 pin.centerOfMass(self._model, data, at, False)
             centres[i] = data.com[0]
-        own = self._model.inertias[0]  # what stands has no momentum
+        own = self._model.inertias[0]  # fixed bodies have no momentum
         out = rates - self.mass * np.append(self._gravity, np.zeros(3))
-        # the momentum's rate counts about the centre of what moves
+        # the rate of momentum acts at the centre of mass of the moving bodies
         moved = rates[:, :3] - (self.mass - own.mass) * self._gravity
         out[:, 3:] += np.cross(centres, moved) - np.cross(own.mass * own.lever, self._gravity)
         if external_wrenches is not None:
@@ -192,17 +191,17 @@ class TippingStability:
         return out
 
     def contact_wrench(self, q: Array, external_wrenches: Array) -> Array:
-        """The wrench (N, 6) by which its contacts hold it, about the world's origin."""
+        """The wrench (N, 6) that its contacts exert, about the world's origin."""
         out = np.zeros((len(q), 6))
         for k in self._support_contacts:
             out += self._external_wrench_about_origin(q, k, external_wrenches)
         return out
 
     def tipping_margins(self, q: Array, ground_wrench: Array) -> TippingMargins:
-        """About all lines.
+        """Margins about all lines.
 
         Args:
-            q: (N, nv) closed postures.
+            q: (N, nv) closed configurations.
             ground_wrench: (N, 6) see `ground_wrench`.
         """
         points = self.support_positions(q)
@@ -221,10 +220,10 @@ class TippingStability:
         return TippingMargins(moments, shares)
 
     def support_forces(self, q: Array, ground_wrench: Array) -> Array:
-        """What each support carries (N, s) [N], of equal stiffness under a rigid frame.
+        """Force of each support (N, s) [N], for supports of equal stiffness under a rigid frame.
 
-        Of all forces above 0 that are in balance with the ground's, those with the least sum of
-        squares; where it tips, those nearest to balance.
+        Of all nonnegative forces that balance the ground wrench, those with the least sum of
+        squares; where the machine tips, those nearest to balance.
         """
         points = self.support_positions(q)
         x, y, z = np.moveaxis(points, 2, 0)
@@ -240,7 +239,7 @@ class TippingStability:
         return out
 
     def support_positions(self, q: Array) -> Array:
-        """(N, s, 3) where the supports are."""
+        """(N, s, 3) positions of the supports."""
         found = self._frame_jacobians.frame_origins(
             q[:1] if self.is_stationary else q, self._support_links
         )
@@ -258,7 +257,7 @@ class TippingStability:
         return out
 
     def _external_wrench_about_origin(self, q: Array, k: int, external_wrenches: Array) -> Array:
-        """(N, 6) of force k from outside."""
+        """(N, 6) wrench of external force k about the world's origin."""
         first = sum(
             len(WRENCH_COMPONENTS) + len(x.channels) for x in self.machine.external_forces[:k]
         )
@@ -272,14 +271,14 @@ class TippingStability:
 
 
 def find_supports(machine: Machine) -> list[tuple[str, str]]:
-    """Names and links of what a machine stands on: `find_supports`, or its contacts."""
+    """Names and links of a machine's supports: `Machine.supports`, or its contacts."""
     if machine.supports:
         return [(link, link) for link in machine.supports]
     return [(x.name, x.frame) for x in machine.external_forces if isinstance(x, Contact)]
 
 
 def has_supports(machine: Machine) -> bool:
-    """Whether there is a `TippingStability` of it."""
+    """Whether `TippingStability` is available for a machine."""
     try:
         return len(find_supports(machine)) > 2 and bool(TippingStability(machine).line_names)
     except InputError:
@@ -287,7 +286,7 @@ def has_supports(machine: Machine) -> bool:
 
 
 def _nonnegative_support_forces(balance: Array, required: Array) -> Array:
-    """Forces of at least 0 with balance (3, s) @ forces = wanted (3,) and least squares."""
+    """Least-squares nonnegative forces with balance (3, s) @ forces = required (3,)."""
     loaded: Sequence[int] = range(balance.shape[1])
     out = np.zeros(balance.shape[1])
     while len(loaded) > 2:

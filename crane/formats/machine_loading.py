@@ -13,13 +13,13 @@ import pinocchio as pin
 
 from crane.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
-from crane.common.errors import CraneWarning, DescriptionError, InputError
-from crane.common.message_groups import summarize_warnings
+from crane.common.errors import CraneWarning, DescriptionError, InputError, summarize_warnings
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
     use_load_options,
 )
+from crane.common.samples import read_only_copy
 from crane.description import (
     Coupling,
     LoopSpec,
@@ -35,10 +35,13 @@ from crane.formats.assembly_warnings import warn_about_assembly_modes
 from crane.formats.home_warnings import add_remedy, check_home
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.machine.drive_selection import select_free_joints, select_motors
-from crane.machine.frame_element_checks import check_frame_elements
-from crane.machine.machine import Machine, read_only_copy
+from crane.machine.machine import Machine
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
-from crane.machine.mass_checks import check_masses, replace_infeasible_inertias
+from crane.machine.machine_checks import (
+    check_frame_elements,
+    check_masses,
+    replace_infeasible_inertias,
+)
 
 
 def load(
@@ -76,7 +79,7 @@ def load(
             `nearest_assembly`, true to take an assembly that is far from the home that a file
             says.
         strict: Whether to refuse, as `check` does, what can be computed with in spite of its
-            form: inertias that no body has, see `crane.machine.mass_checks`.
+            form: inertias that no body has, see `crane.machine.machine_checks`.
 
     Returns:
         The machine, its home posture closed.

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.description.key_types import (
     Key,
     MapKey,

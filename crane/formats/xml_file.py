@@ -8,7 +8,7 @@ from pathlib import Path
 from lxml import etree
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
 from crane.description.kinematic_tree import Placement, Vector
 from crane.description.specification import AXISLESS_TYPES, unit_vector

@@ -1,4 +1,4 @@
-"""An axis that keeps a linkage from moving in its plane, which shows as other errors."""
+"""Diagnosis of joint axes that keep a planar linkage from moving."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -11,12 +11,12 @@ from crane.common.errors import CraneError, MechanismError
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec
 
-_PARALLEL_TOLERANCE = 1e-6  # sine of an angle that counts as none
+_PARALLEL_TOLERANCE = 1e-6  # sine of an angle that counts as zero
 _REVOLUTE_LOOP_TYPES = (
     "revolute",
     "cylindrical",
     "planar",
-)  # loops whose axis is normal to their plane
+)  # loop types whose axis is normal to the plane
 
 
 def find_wrong_axis(
@@ -25,21 +25,24 @@ def find_wrong_axis(
     loops: Sequence[LoopSpec],
     close_loops: Callable[[MachineSpec, Sequence[LoopSpec]], object],
 ) -> MechanismError | None:
-    """The error about an axis, if there is one with which the machine closes once it is turned.
+    """Find a wrong axis: one with which the machine closes after correction.
 
-    In a plane all axes of a ring that turn are parallel, and all that slide are at right angles
-    to them. Where that holds for all joints of a ring and its loop but one, that one is turned
-    and the machine closed anew.
+    In a planar linkage all revolute axes of a loop are parallel, and prismatic ones perpendicular
+    to them. Where this holds for all joints of a loop but one, the axis of that one is corrected
+    and the machine closed again.
 
     Args:
         spec: The machine as read.
         model: Its tree.
         loops: Its loops.
         close_loops: Assembles and closes a machine with some loops, or raises.
+
+    Returns:
+        The error to report, None if no axis is wrong.
     """
     equations = LoopEquations(model, loops, spec.couplings)
     data = model.createData()
-    # at zero a wrong axis has turned nothing out of the plane yet
+    # at zero coordinates a wrong axis has not moved anything out of the plane
     coordinates = equations.coordinates
     at = coordinates.configuration(np.zeros(model.nv))
     jacobian = pin.computeJointJacobians(model, data, at).reshape(6, -1)
@@ -58,7 +61,7 @@ def find_wrong_axis(
         for odd, normal in _misaligned_axes(axes, is_rotation):
             column = loop_columns[odd] if odd < len(loop_columns) else None
             if column is not None and not model.existJointName(names[column]):
-                continue  # of a body that floats, which has no axes
+                continue  # a floating base has no axes
             frame = _axis_frame(model, data, loop if column is None else names[column])
             corrected_axis = _corrected_axis(
                 frame.T @ axes[odd][0], frame.T @ normal, is_rotation[odd]
@@ -80,7 +83,7 @@ def find_wrong_axis(
 
 
 def _axis_frame(model: pin.Model, data: pin.Data, element: LoopSpec | str) -> Array:
-    """Axes (3, 3) of the frame that the axis of a loop is written in, or of a joint's."""
+    """Axes (3, 3) of the frame in which the axis of a loop or joint is written."""
     if isinstance(element, LoopSpec):
         link = model.frames[frame_id(model, element.predecessor)]
         frame: Array = data.oMi[link.parentJoint].rotation @ link.placement.rotation
@@ -92,11 +95,11 @@ def _axis_frame(model: pin.Model, data: pin.Data, element: LoopSpec | str) -> Ar
 
 
 def _misaligned_axes(axes: list[list[Array]], is_rotation: list[bool]) -> list[tuple[int, Array]]:
-    """Those whose axes do not fit where all others move in one plane, and its normal.
+    """Indices of single axes that do not fit the plane of all others, and the plane's normal.
 
     Args:
-        axes: Directions (3,) of each joint, of a loop in both its frames.
-        is_rotation: Whether each turns about its axis, else slides along it.
+        axes: Directions (3,) of each joint; of a loop in both its frames.
+        is_rotation: Whether each joint is revolute, else prismatic.
     """
 
     def fits(k: int, normal: Array) -> bool:
@@ -118,7 +121,7 @@ def _misaligned_axes(axes: list[list[Array]], is_rotation: list[bool]) -> list[t
 
 
 def _corrected_axis(axis: Array, normal: Array, is_rotation: bool) -> tuple[float, float, float]:
-    """The direction nearest to an axis that fits a plane, both in the frame it is written in."""
+    """The direction nearest to an axis that fits a plane, in the frame of the axis."""
     corrected = (
         normal * (np.sign(axis @ normal) or 1.0)
         if is_rotation
@@ -126,7 +129,7 @@ def _corrected_axis(axis: Array, normal: Array, is_rotation: bool) -> tuple[floa
     )
     if (
         np.linalg.norm(corrected) < _PARALLEL_TOLERANCE
-    ):  # a slide out of the plane may mean any in it
+    ):  # a prismatic axis normal to the plane: any direction in the plane
         corrected = np.cross(np.eye(3)[np.abs(normal).argmin()], normal)
     corrected = corrected / np.linalg.norm(corrected)
     corrected = np.where(np.abs(corrected) < 1e-9, 0.0, corrected)

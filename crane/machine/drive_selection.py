@@ -1,4 +1,4 @@
-"""Who drives what: active joints that a file leaves open, free ones, and drives in surplus."""
+"""Selection of active and free joints, and of redundant drives, from a description."""
 
 import warnings
 from collections.abc import Sequence
@@ -26,19 +26,19 @@ _SECTIONS_OF_ACTIVE_JOINTS = {
     "tasks",
     "control",
     "hydraulics",
-}  # sections that only active joints can have
+}  # sections that only active joints may have
 
 
 def specified_driven_joints(spec: MachineSpec) -> tuple[str, ...]:
-    """Joints that the file says are driven, each once, in its order."""
+    """Joints that the file specifies as driven, each once, in its order."""
     named = [joint for drive in spec.drives for joint in drive.factors] or list(spec.active or ())
     return tuple(dict.fromkeys(named))
 
 
 def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
-    """The independent coordinates as far as the file names them: driven ones, then free ones.
+    """Active joints that the file names: driven ones, then free ones.
 
-    An open chain that names none has all of them, but those that follow others by a coupling.
+    For an open chain without names, all coordinates except those that follow others by a coupling.
     """
     if spec.active is not None:
         return tuple(dict.fromkeys((*spec.active, *specified_free_joints(spec))))
@@ -47,13 +47,13 @@ def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, .
 
 
 def specified_free_joints(spec: MachineSpec) -> tuple[str, ...]:
-    """Coordinates that the file calls free, and those of bodies that float."""
+    """Coordinates that the file names as free, and those of floating bases."""
     floating = (joint for series in floating_series(spec).values() for joint in series)
     return tuple(dict.fromkeys((*spec.free, *floating)))
 
 
 def select_free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:
-    """Those of the independent coordinates that nothing drives."""
+    """Those of the active joints that no drive moves."""
     driven = specified_driven_joints(spec)
     free = specified_free_joints(spec)
     if not driven:
@@ -62,7 +62,7 @@ def select_free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, .
 
 
 def select_motors(spec: MachineSpec, active: Sequence[str]) -> tuple[Drive, ...]:
-    """What the file says that motors act on; every joint that it calls active if not all are."""
+    """The drives of the file; one per named joint where not all named joints are active."""
     named = spec.active or ()
     if spec.drives or all(name in active for name in named):
         return spec.drives
@@ -72,21 +72,20 @@ def select_motors(spec: MachineSpec, active: Sequence[str]) -> tuple[Drive, ...]
 def complete_active_joints(
     spec: MachineSpec, model: pin.Model, equations: LoopEquations, jacobian: Array
 ) -> tuple[tuple[str, ...], str] | None:
-    """Independent coordinates where the file names too few, too many or none.
+    """Active joints where the file names too few, too many or none.
 
-    Joints that are named stay as far as they are independent, in their order. What they leave
-    open is completed by the joints of the best condition (see
-    `crane.closure.active_joint_selection`), which are
-    free: nothing drives them. Where no joint is named, those are proposed that look driven.
+    Named joints are kept as far as they are independent, in their order. Missing ones are added
+    with the best condition number (see `crane.closure.active_joint_selection`) as free joints. If
+    no joint is named, joints that look driven are proposed.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        equations: Its loops.
-        jacobian: (m, nv) of all loop equations at a closed posture.
+        equations: Its loop equations.
+        jacobian: (m, nv) of all loop equations at a closed configuration.
 
     Returns:
-        Names, and what to say of them; None where there is no such choice.
+        Names, and a text about the completion; None if there is no selection.
     """
     basis = null_space_basis(jacobian, motion_scales(model), DEAD_CENTRE_TOLERANCE)
     names = equations.coordinates.names
@@ -98,7 +97,7 @@ def complete_active_joints(
     is_undecided = not driven and _SECTIONS_OF_ACTIVE_JOINTS & spec.source_locations.keys()
     is_dependent = (
         spec.active and len(specified) == mobility
-    )  # as many as there are, and not independent
+    )  # the right number, but not independent
     if not mobility or is_undecided or (is_dependent and not spec.drives):
         return None
     if not driven:
@@ -140,7 +139,7 @@ def complete_active_joints(
 
 
 def _independent_columns(basis: Array, columns: Sequence[int]) -> list[int]:
-    """The columns that are independent of those before them, at most as many as freedoms."""
+    """Columns that are independent of those before them, at most one per degree of freedom."""
     independent: list[int] = []
     for column in columns:
         values = np.linalg.svd(basis[[*independent, column]], compute_uv=False)
@@ -154,6 +153,6 @@ def _format_mobility(count: int) -> str:
 
 
 def warn_about_completion(spec: MachineSpec, text: str) -> None:
-    """Say which coordinates were chosen."""
+    """Warn of the completed active joints."""
     where = spec.source_locations.get("active", spec.path.name)
     warnings.warn(f"{where}: {text}; name them as active and free", CraneWarning, stacklevel=4)

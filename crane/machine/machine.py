@@ -1,12 +1,13 @@
-"""Machine: the assembled, immutable result of reading and closing a description."""
+"""`Machine`: the immutable result of assembling and closing a description."""
 
 import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +18,7 @@ from crane.closure.coordinates import Coordinates
 from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
-from crane.common.samples import Array, as_number, as_sample, as_samples
+from crane.common.samples import Array, as_samples, read_only_copy
 from crane.description import (
     AnyForceElement,
     Chain,
@@ -32,7 +33,6 @@ from crane.description import (
     Task,
     bundled_machines,
     example_robots,
-    inertia_problem,
 )
 from crane.description.estimation_settings import EstimationSettings
 from crane.description.external_forces import ExternalForce, PhasedWrench
@@ -40,69 +40,50 @@ from crane.description.kinematic_tree import Tree
 from crane.description.machine_lookup import CHANGES_SEPARATOR, command_line_arguments
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.hydraulics import Hydraulics
-from crane.machine.frame_element_checks import frame_element_problems
+from crane.machine.machine_checks import check_force_elements, check_limited
+from crane.machine.payload import Payload
 
-_LIMIT_TOLERANCE = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
-
-
-@dataclass(frozen=True, repr=False)
-class Payload(OneLineRepr):
-    """A rigid load put on a frame at run time.
-
-    Attributes:
-        frame: A link of the machine.
-        mass: [kg].
-        com: Centre of mass in the frame [m].
-        inertia: (3, 3) about the centre of mass, in the frame's directions [kg m2]; zero for a
-            point mass.
-    """
-
-    frame: str
-    mass: float
-    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    inertia: ArrayLike = field(default_factory=lambda: np.zeros((3, 3)))
+_LIMIT_TOLERANCE = 1e-9  # scaled distance beyond a limit that counts as on it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Machine(OneLineRepr):
-    """A machine with closed kinematic chains, ready to be computed with.
+    """A machine with closed kinematic chains, assembled and closed.
 
     Attributes:
         name: Its name.
-        source: Where its numbers come from.
-        path: The machine file or URDF it was read from.
+        source: Source of its parameters.
+        path: The machine file or URDF that it was read from.
         chains: Its open sub-chains.
-        tree: Its links and joints, all sub-chains hung onto each other.
-        model: Pinocchio's model of the spanning tree, depth-first; nq = nv unless it floats, see
-            `coordinates`.
+        tree: Its links and joints, all sub-chains connected.
+        model: Pinocchio's model of the spanning tree, depth-first; nq = nv without floating bases,
+            see `coordinates`.
         closure: Its loops.
         active: Names of the active joints, in the order of q_A.
         lower: (n,) lower limits of the active joints [m], [rad].
         upper: (n,) upper limits of the active joints [m], [rad].
         friction: Friction by joint.
         forces: Passive force elements.
-        gas_springs: Enclosed gas along joints, at most one per joint, and between frames.
+        gas_springs: Gas springs along joints, at most one per joint, and between frames.
         ropes: Ropes between frames.
         end_stops: End stops.
-        tip: Name of the tip's frame.
-        tasks: Named reference motions.
+        tip: Name of the tip frame.
+        tasks: Reference trajectories by name.
         control: PI gains by active joint.
-        hydraulics: The circuit that drives it, None for a machine without.
-        estimation: What `identify` estimates, and knows before.
-        sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
-        free: Active joints that nothing drives: no force but friction, springs and stops.
-        external_forces: Forces from outside.
-        supports: Links that it stands on; none where those are its contacts.
-        pin_capacities: The largest force that pins bear, by joint or loop [N].
-        explicit_drives: What the file says that motors act on (actuators of a MJCF), or all drives
-            where there are more than freedoms; empty where `drives` are the active joints.
-        parameter_changes: Numbers that are not those of its files, by name.
-        locked_joints: Where joints are held that its files let move, by name [m], [rad].
-        chosen_joints: Active and free joints that are not those of its file, under "active" and
-            "free".
-        floating_base: Whether its root was made to float, which its file lets stand on the ground,
-            or by which freedoms.
-        packages: Folders in which its files' packages were sought.
+        hydraulics: Hydraulic circuit, None for a machine without.
+        estimation: Unknowns and priors of `identify`.
+        sensors: Sensor data by quantity, see `crane.description.sensors`.
+        free: Active joints without drive: only friction, springs and stops act on them.
+        external_forces: External forces.
+        supports: Links that stand on the ground; empty if its contacts do.
+        pin_capacities: Largest force that pins bear, by joint or loop [N].
+        explicit_drives: Drives of the file (actuators of a MJCF), or all drives where they are
+            redundant; empty where `drives` are the active joints.
+        parameter_changes: Parameters that differ from its files, by name.
+        locked_joints: Coordinates of joints that were locked, by name [m], [rad].
+        chosen_joints: Active and free joints that differ from its file, under "active" and "free".
+        floating_base: Whether its root was made a floating base, or with which degrees of freedom.
+        packages: Folders in which packages were searched for.
         arguments: Values of its file's arguments.
     """
 
@@ -140,7 +121,6 @@ class Machine(OneLineRepr):
     arguments: Mapping[str, str]
 
     def _one_line(self) -> str:
-        """Name, degrees of freedom, joints, loops, and what is special about what drives it."""
         words = [
             repr(self.name),
             format_count(len(self.active), "degree of freedom", "degrees of freedom"),
@@ -153,26 +133,27 @@ class Machine(OneLineRepr):
 
     @property
     def home(self) -> Array:
-        """(nv,) the home posture, closed."""
+        """(nv,) closed home configuration."""
         return self.closure.home
 
     @property
     def has_traceable_forces(self) -> bool:
-        """Whether all that acts on it from outside can become machine code."""
+        """Whether all external forces can be compiled."""
         return all(force.is_traceable for force in self.external_forces)
 
     @property
     def force_elements(self) -> tuple[AnyForceElement, ...]:
-        """Its force elements, gas springs and ropes, along joints and between frames."""
+        """Force elements, gas springs and ropes, along joints and between frames."""
         return (*self.forces, *self.gas_springs, *self.ropes)
 
     @property
     def undriven_joints(self) -> tuple[str, ...]:
-        """Active joints that are not free, and that nothing is said to drive either.
+        """Active joints that are not free and for which no drive is specified.
 
-        A joint is driven that has an `effort` above 0 in the `<limit>` of its URDF, a cylinder,
-        gains under `control`, or a motor by its file's format. All others are active because the
-        machine has their freedom: a grapple that swings, which is best named under `free`.
+        A joint has a drive if its URDF `<limit>` has an `effort` above 0, or if it has a cylinder,
+        gains under `control`, or a motor in the file. Others are active only because of the
+        mobility of the machine, for example a swinging grapple; they should be listed under
+        `free`.
         """
         driven = {
             *self.free,
@@ -190,7 +171,7 @@ class Machine(OneLineRepr):
 
     @cached_property
     def drives(self) -> tuple[Drive, ...]:
-        """What acts on the machine: its motors, or one drive along each driven active joint."""
+        """The drives of the machine: those of the file, or one along each driven active joint."""
         return self.explicit_drives or tuple(
             Drive(joint, {joint: 1.0}) for joint in self.driven_joints
         )
@@ -202,11 +183,11 @@ class Machine(OneLineRepr):
 
     @cached_property
     def is_driven(self) -> NDArray[np.bool_]:
-        """(n,) whether each active joint is driven, which free ones are not."""
+        """(n,) whether each active joint is driven, that is not free."""
         return np.array([joint not in self.free for joint in self.active])
 
     def expand_driven(self, x: ArrayLike, label: str) -> Array:
-        """Something of the k driven joints, (k,) or (N, k), with zeros of the free ones: (., n).
+        """Expand values of the k driven joints, (k,) or (N, k), by zeros to (n,) or (N, n).
 
         Raises:
             InputError: Wrong shape or not finite.
@@ -218,7 +199,7 @@ class Machine(OneLineRepr):
 
     @cached_property
     def load_name(self) -> str:
-        """What `load` takes to load it again: the bundled name, or the path."""
+        """Argument of `crane.load` for this machine: the bundled name, or the path."""
         known_as = self.path.stem
         bundle = bundled_machines()
         named = bundle if known_as in bundle else example_robots()
@@ -226,9 +207,9 @@ class Machine(OneLineRepr):
 
     @property
     def load_expression(self) -> str:
-        """What `recalled` takes to load it again, changes and locks included.
+        """Text from which this machine can be loaded again, with its changes and locks.
 
-        Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
+        For example 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
         given = {
             "changes": dict(self.parameter_changes),
@@ -244,7 +225,7 @@ class Machine(OneLineRepr):
 
     @property
     def command_line_arguments(self) -> str:
-        """Arguments of commands that load it again, quoted for a shell."""
+        """Command line arguments that load this machine again, quoted for a shell."""
         load_options = LoadOptions(self.packages, self.arguments, bool(self.floating_base))
         active, free = self.chosen_joints.get("active"), self.chosen_joints.get("free")
         return command_line_arguments(
@@ -253,19 +234,19 @@ class Machine(OneLineRepr):
 
     @property
     def coordinates(self) -> Coordinates:
-        """Those of the tree, and the way to Pinocchio's configurations."""
+        """Coordinates of the tree, and their conversion to Pinocchio's configurations."""
         return self.closure.equations.coordinates
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of all coordinates of the tree, in the order of q: joints, freedoms of a base."""
+        """Names of all coordinates of the tree in the order of q, with those of floating bases."""
         return self.coordinates.names
 
     def column(self, joint: str) -> int:
         """Index of a joint in q and v.
 
         Raises:
-            InputError: There is no such joint.
+            InputError: Unknown joint.
         """
         return self.coordinates.column(joint)
 
@@ -278,7 +259,7 @@ class Machine(OneLineRepr):
         """Pinocchio's index of a link's frame.
 
         Raises:
-            InputError: There is no such link.
+            InputError: Unknown link.
         """
         if not self.model.existFrame(link, pin.FrameType.BODY):
             links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
@@ -286,11 +267,11 @@ class Machine(OneLineRepr):
         return frame_id(self.model, link)
 
     def check_limits(self, q_a: ArrayLike, label: str = "q_a") -> Array:
-        """Active coordinates (n,) or (N, n) that lie within the limits.
+        """Check that active coordinates (n,) or (N, n) are within the limits, and return them.
 
         Raises:
             InputError: Wrong shape or not finite.
-            LimitError: A coordinate lies outside of its limits.
+            LimitError: A coordinate is outside of its limits.
         """
         q_a = as_samples(q_a, len(self.active), label, self.active)
         slack = _LIMIT_TOLERANCE * self.closure.units[self.closure.active]
@@ -320,60 +301,39 @@ class Machine(OneLineRepr):
         sensors: Mapping[str, Sensor] | None = None,
         estimation: EstimationSettings | None = None,
     ) -> "Machine":
-        """The same machine with other friction, springs, ropes, stops, hydraulics or sensors.
+        """A copy with other friction, force elements, stops, hydraulics, sensors or settings.
 
         Raises:
-            InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
-                limits, or a cylinder without being active; or the frames of an element are
-                unknown, make one body or meet at home.
+            InputError: A joint or frame is unknown or does not fit the element.
         """
+        elements: list[AnyForceElement] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
+        check_force_elements(self.closure, elements, self.frame)
         for joint in friction or {}:
             self.column(joint)
-        elements: list[AnyForceElement] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
-        for item in elements:
-            if item.between is None:
-                self.column(item.joint)
-            else:
-                for link in item.between:
-                    self.frame(link)
-        for problem in frame_element_problems(self.closure, elements):
-            raise InputError(problem)
-        for spring in gas_springs or ():
-            if [other.joint for other in gas_springs or ()].count(spring.joint) > 1:
-                raise InputError(f"joint '{spring.joint}' has two gas springs, keep one")
         for stop in end_stops or ():
-            column = self.column(stop.joint)
-            limits = self.coordinates.lower[column], self.coordinates.upper[column]
-            if not np.isfinite(limits).all():
-                raise InputError(f"joint '{stop.joint}' has no limits to stop at, give it some")
+            check_limited(self.coordinates, stop.joint, " to stop at, give it some")
         for joint in hydraulics.joints if hydraulics else ():
             if joint not in self.active:
-                raise InputError(
-                    f"'{joint}' has a cylinder and is not active, "
-                    f"{suggest_names(self.active, joint)}"
-                )
-            i = self.active.index(joint)
-            if not np.isfinite([self.lower[i], self.upper[i]]).all():
-                raise InputError(
-                    f"joint '{joint}' has no limits, a cylinder needs those of its stroke"
-                )
-        return dataclasses.replace(
-            self,
-            friction=self.friction if friction is None else MappingProxyType(dict(friction)),
-            forces=self.forces if forces is None else tuple(forces),
-            gas_springs=self.gas_springs if gas_springs is None else tuple(gas_springs),
-            ropes=self.ropes if ropes is None else tuple(ropes),
-            end_stops=self.end_stops if end_stops is None else tuple(end_stops),
-            hydraulics=self.hydraulics if hydraulics is None else hydraulics,
-            sensors=self.sensors if sensors is None else MappingProxyType(dict(sensors)),
-            estimation=self.estimation if estimation is None else estimation,
-        )
+                hint = suggest_names(self.active, joint)
+                raise InputError(f"'{joint}' has a cylinder and is not active, {hint}")
+            check_limited(self.coordinates, joint, ", a cylinder needs those of its stroke")
+        changes: dict[str, Any] = {
+            "friction": friction, "sensors": sensors, "hydraulics": hydraulics,
+            "estimation": estimation, "forces": forces, "gas_springs": gas_springs,
+            "ropes": ropes, "end_stops": end_stops,
+        }  # fmt: skip
+        for name, value in changes.items():
+            if isinstance(value, Mapping):
+                changes[name] = MappingProxyType(dict(value))
+            elif isinstance(value, list):
+                changes[name] = tuple(value)
+        return dataclasses.replace(self, **{k: x for k, x in changes.items() if x is not None})
 
     def with_active_joints(self, names: Sequence[str]) -> "Machine":
-        """The same machine with other active joints: the angles of its booms, say.
+        """A copy with other active joints, for example the angles of its booms.
 
-        Home posture and assembly branch stay. With q_B the new active coordinates and q_A those
-        of this machine, gamma_A the rows of gamma = dq/dq_B that belong to q_A,
+        Home configuration and branch stay. With the new active coordinates q_B, those of this
+        machine q_A, and the rows gamma_A of gamma = dq/dq_B that belong to q_A,
 
             v_A = gamma_A v_B,    tau_B = gamma_A^T tau_A,
 
@@ -381,9 +341,8 @@ class Machine(OneLineRepr):
         tau_i = F_i dx_i/dq_i, for any choice of joints.
 
         The circuit keeps the cylinders whose joints are still active. Gains and tasks of active
-        joints are dropped unless they belong to the same joints. `load_name` and
-        `parameter_changes` stay: what loads the machine again gives it with the active joints of
-        its file.
+        joints are dropped unless the joints are the same. `load_name` and `parameter_changes`
+        stay: they load the machine with the active joints of its file.
 
         Args:
             names: As many joints as there are degrees of freedom, in the order of q_B.
@@ -399,37 +358,32 @@ class Machine(OneLineRepr):
                 raise InputError(
                     f"joint '{name}' is named twice among the active ones, once will do"
                 )
-        return self._with_closure(names, self._create_closure(names, self.home))
+        return self._with_closure(names, self.home)
 
     def with_home_configuration(self, q: Array, names: tuple[str, ...]) -> "Machine":
-        """`with_active_joints` at another home, whose assembly branch may differ.
+        """`with_active_joints` at another home configuration, which may be on another branch.
 
         Args:
-            q: (nq,) closed posture, whose whole turns stay.
+            q: (nq,) closed configuration, whose full revolutions are kept.
             names: Active joints.
 
         Raises:
             MechanismError: See `with_active_joints`.
         """
         known = self.closure.with_home_configuration(q) if names == self.active else None
-        return self._with_closure(
-            names, known or self._create_closure(names, q, keep_revolutions=True)
-        )
+        return self._with_closure(names, q, known, keep_revolutions=True)
 
-    def _create_closure(
-        self, names: tuple[str, ...], home: Array, keep_revolutions: bool = False
-    ) -> Closure:
-        equations = self.closure.equations
-        return Closure(
-            self.model,
-            equations.loops,
-            names,
-            home,
-            equations.couplings,
-            keep_revolutions=keep_revolutions,
-        )
-
-    def _with_closure(self, names: tuple[str, ...], closure: Closure) -> "Machine":
+    def _with_closure(
+        self,
+        names: tuple[str, ...],
+        home: Array,
+        closure: Closure | None = None,
+        keep_revolutions: bool = False,
+    ) -> "Machine":
+        if closure is None:
+            equations = self.closure.equations
+            arguments = self.model, equations.loops, names, home, equations.couplings
+            closure = Closure(*arguments, keep_revolutions=keep_revolutions)
         same = set(names) == set(self.active)
         return dataclasses.replace(
             self,
@@ -447,16 +401,16 @@ class Machine(OneLineRepr):
         )
 
     def with_external_forces(self, *forces: ExternalForce) -> "Machine":
-        """The same machine under more forces from outside.
+        """A copy with additional external forces.
 
         Raises:
-            InputError: What is no such force, a frame that is unknown or does not move, or a name
-                that is taken.
+            InputError: Not an external force, an unknown or fixed frame, or a name that exists
+                already.
         """
         every = (*self.external_forces, *forces)
         for force in forces:
             if not isinstance(force, ExternalForce):
-                raise InputError(f"{force!r} is no force from outside, give a crane.Wrench")
+                raise InputError(f"{force!r} is no external force, give a crane.Wrench")
             if not self.model.frames[self.frame(force.frame)].parentJoint:
                 raise InputError(f"'{force.frame}' does not move, a load on it does nothing")
             if [other.name for other in every].count(force.name) > 1:
@@ -464,57 +418,32 @@ class Machine(OneLineRepr):
         return dataclasses.replace(self, external_forces=every)
 
     def with_clock(self, clock: Callable[[Array], Array] | None) -> "Machine":
-        """The same machine, with the forces that count phases by the clock of a run.
+        """A copy whose phased external forces use the clock of a simulation.
 
         Args:
-            clock: Tells the phase (N,) at times (N,) [s]; None where there are none.
+            clock: Returns the phase (N,) at times (N,) [s]; None if there are no phases.
 
         Raises:
-            InputError: There is no clock for them.
+            InputError: A phased force without a clock.
         """
-        phased_forces = [
-            force for force in self.external_forces if isinstance(force, PhasedWrench)
-        ]
-        if not phased_forces:
+        phased = [force for force in self.external_forces if isinstance(force, PhasedWrench)]
+        if not phased:
             return self
         if clock is None:
-            raise InputError(
-                f"the load '{phased_forces[0].name}' counts phases, simulate it with the task "
-                f"of levers "
-                "that has them"
-            )
-        every = (x.with_clock(clock) if x in phased_forces else x for x in self.external_forces)
+            hint = "simulate it with the task of levers that has them"
+            raise InputError(f"the load '{phased[0].name}' counts phases, {hint}")
+        every = (x.with_clock(clock) if x in phased else x for x in self.external_forces)
         return dataclasses.replace(self, external_forces=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":
-        """The same machine carrying a payload.
+        """A copy that carries a payload.
 
         Raises:
-            InputError: Unknown frame, or no possible mass and inertia.
+            InputError: Unknown frame, or infeasible mass and inertia.
         """
         frame = self.model.frames[self.frame(payload.frame)]
-        com = as_sample(payload.com, 3, "the payload's com")
-        tensor = as_samples(payload.inertia, 3, "the payload's inertia")
-        mass = as_number(payload.mass, "the payload's mass", "kg")
-        if mass < 0:
-            raise InputError(f"the payload's mass is {mass:g} kg, it must not be negative")
-        asymmetry = np.abs(tensor - tensor.T).max() if tensor.shape == (3, 3) else np.inf
-        if asymmetry > 1e-9 * np.abs(tensor).max():
-            raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
-        if not mass and tensor.any():
-            raise InputError("the payload has an inertia but no mass, give it a mass")
-        problem = inertia_problem(mass, tensor)
-        if problem and tensor.any():
-            raise InputError(f"the payload has {problem}")
-        load = pin.Inertia(mass, com, tensor)
+        load = payload.rigid_body()
         model = pin.Model(self.model)
         model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
         tree = add_rigid_load(self.tree, payload.frame, load)
         return dataclasses.replace(self, model=model, tree=tree)
-
-
-def read_only_copy(array: Array) -> Array:
-    """A copy that cannot be changed."""
-    out = array.copy()
-    out.flags.writeable = False
-    return out

@@ -1,4 +1,4 @@
-"""The spanning tree and its closure, from a description."""
+"""Assembly of the spanning tree and the closure from a description."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,8 +25,8 @@ from crane.machine.drive_selection import (
     warn_about_completion,
 )
 
-_MAX_MOVING_JOINTS = 1000  # joints that move; closing takes the cube of it
-_DIRECTION_TOLERANCE = 1e-12  # difference of two directions that is none, as Pinocchio has it
+_MAX_MOVING_JOINTS = 1000  # closing takes time in proportion to its cube
+_DIRECTION_TOLERANCE = 1e-12  # difference of equal directions, as in Pinocchio
 _AXIS_ALIGNED_JOINTS = (
     (pin.JointModelRX, pin.JointModelPX),
     (pin.JointModelRY, pin.JointModelPY),
@@ -35,10 +35,10 @@ _AXIS_ALIGNED_JOINTS = (
 
 
 def home_initial_guess(spec: MachineSpec, model: pin.Model) -> Array:
-    """(nq,) coordinates under `home`, of other joints zero or the limit nearest to it.
+    """(nq,) coordinates under `home`; for other joints zero, or the limit nearest to zero.
 
     Raises:
-        DescriptionError: An active joint is at home outside of its limits.
+        DescriptionError: The home coordinate of an active joint is outside of its limits.
     """
     active = specified_active_joints(spec, model)
     coordinates = Coordinates(model)
@@ -62,20 +62,20 @@ def build_closure(
     initial_guess: Array,
     loops: Sequence[LoopSpec] | None = None,
 ) -> Closure:
-    """The closure of a tree.
+    """Build the closure of a tree.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        initial_guess: (nq,) home posture to start from.
+        initial_guess: (nq,) initial guess of home.
         loops: Loops to close, if not all.
 
     Raises:
         OpenLoopError: A loop does not close; with file and line.
-        MechanismError: The parts do not make a machine that can be driven; likewise.
+        MechanismError: The parts do not form a machine that can be driven; with file and line.
     """
     loops = spec.loops if loops is None else loops
-    # while findings are collected, joints that close rings are no part of the tree
+    # while findings are collected, joints that close loops are missing in the tree
     known_names = set(Coordinates(model).names)
     present_couplings = tuple(x for x in spec.couplings if known_names >= x.factors.keys())
     spec = dataclasses.replace(spec, couplings=present_couplings)
@@ -110,7 +110,7 @@ def _create_closure(
     initial_guess: Array,
     loops: Sequence[LoopSpec],
 ) -> Closure:
-    """The closure, its home sought where the file does not say it."""
+    """The closure; joints whose home the file does not specify may move in the home search."""
     movable = set(select_free_joints(spec, names)) - spec.home.keys()
     return Closure(model, loops, names, initial_guess, spec.couplings, spec.home, movable)
 
@@ -122,7 +122,7 @@ def _closure_with_completed_joints(
     loops: Sequence[LoopSpec],
     active_joint_error: ActiveJointError,
 ) -> Closure | None:
-    """The closure with active joints chosen as the file leaves it, None where that is none."""
+    """The closure with completed active joints, None if there is no selection."""
     equations = LoopEquations(model, loops, spec.couplings)
     choice = complete_active_joints(spec, model, equations, active_joint_error.jacobian)
     if choice is None:
@@ -137,7 +137,7 @@ def _closure_with_completed_joints(
             )
         except MechanismError:
             return None
-    if closure.home_search is not None:  # far from where they were chosen
+    if closure.home_search is not None:  # home is far from where they were selected
         jacobian = equations.evaluate(closure.home)[1][closure.structure.independent_rows]
         improved = complete_active_joints(spec, model, equations, jacobian)
         if improved is not None and improved[0] != names:
@@ -148,7 +148,7 @@ def _closure_with_completed_joints(
 
 
 def _closure_by_other_joints(closure: Closure, names: Sequence[str]) -> Closure:
-    """The same closure by other independent coordinates."""
+    """The same closure with other active joints."""
     equations = closure.equations
     try:
         other = Closure(closure.model, equations.loops, names, closure.home, equations.couplings)
@@ -165,12 +165,11 @@ def _closure_by_other_joints(closure: Closure, names: Sequence[str]) -> Closure:
 def assemble_tree(spec: MachineSpec) -> pin.Model:
     """Pinocchio's model of the tree.
 
-    Joints are added depth-first, because joints appended chain by chain make Pinocchio's crba
-    wrong without a word; those on one link in the order of their names, as Pinocchio's reader of
-    URDF adds them.
+    Joints are added depth-first, because Pinocchio's crba is silently wrong for joints appended
+    chain by chain; joints on one link are added by name, as Pinocchio's URDF reader does.
 
     Raises:
-        DescriptionError: The tree is too large, or a body has an impossible inertia.
+        DescriptionError: The tree is too large, or a body has an infeasible inertia.
     """
     tree, joints_by_parent = spec.tree, spec.tree.joints_by_parent()
     if (moving := len(tree.moving_joints)) > _MAX_MOVING_JOINTS:
@@ -201,7 +200,7 @@ def assemble_tree(spec: MachineSpec) -> pin.Model:
         mass = inertia_from_inertial(tree.links[joint.child].inertial)
         try:
             frames[joint.child] = _add_joint(model, frames[joint.parent], joint, mass)
-        except (ValueError, RuntimeError) as error:  # it has its own words for names
+        except (ValueError, RuntimeError) as error:  # Pinocchio refuses some names
             reason = str(error).strip().splitlines()[0]
             raise DescriptionError(
                 f"{joint.source_location}: cannot be assembled ({reason})"
@@ -221,11 +220,11 @@ def _joints_in_reverse_order(
 
 
 def _add_joint(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -> int:
-    """Add a joint and the link that it moves; the frame of the link.
+    """Add a joint and the link that it moves; returns the frame of the link.
 
     Args:
-        model: Where to.
-        parent: Frame of the link that the joint stands on.
+        model: Model to extend.
+        parent: Frame of the joint's parent link.
         joint: The joint.
         mass: Inertia of the link that it moves.
     """
@@ -252,7 +251,7 @@ def _add_joint(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -
 def _add_floating_base(
     model: pin.Model, frames: dict[str, int], name: str, series: Sequence[str], tree: Tree
 ) -> str:
-    """Add a free-flyer in place of a series of six joints; the link that it moves."""
+    """Add a free-flyer joint for a series of six joints; returns the link that it moves."""
     joints = [tree.joints[part] for part in series]
     parent_frame = model.frames[frames[joints[0].parent]]
     placement = parent_frame.placement * se3_from_xyz_rpy(joints[0].xyz, joints[0].rpy)
@@ -267,7 +266,7 @@ def _add_floating_base(
 
 
 def _pinocchio_joint_model(joint: Joint) -> pin.JointModel:
-    """Pinocchio's joint, one for each direction of the frame's axes: they are faster."""
+    """Pinocchio's joint model; axis-aligned models are faster."""
     is_revolute, axis = joint.kind == "revolute", np.array(joint.axis)
     for direction, kinds in zip(np.eye(3), _AXIS_ALIGNED_JOINTS, strict=True):
         if np.linalg.norm(axis - direction) < _DIRECTION_TOLERANCE:
@@ -302,7 +301,7 @@ def _has_inertia_finding(link: Link) -> bool:
 
 
 def _check_body_inertia(link: Link, inertia: pin.Inertia, has_finding: bool) -> None:
-    """Refuse a body that cannot be; of doubtful parts only where their form is no excuse."""
+    """Refuse an infeasible inertia; formal problems that were already reported are accepted."""
     problem = inertia_problem(inertia.mass, inertia.inertia)
     is_accepted = has_finding and (_has_inertia_finding(link) or not is_strict())
     if problem is not None and not (is_accepted and problem.is_formal):

@@ -1,15 +1,15 @@
-"""The number of a description that keeps its loops from closing where the file says home is.
+"""Parameters that keep the loops from closing at the home configuration of the file.
 
-A linkage of which one length is wrong does not close at the home that its file says, or only far
-from it. With p a length and q_P the passive joints, the question of each length is which change
-of it closes the loops with the joints nearest to where they are said to be:
+If one length of a linkage is wrong, it does not close at the home configuration of its file, or
+only far from it. For each length p, with the passive joints q_P, the change that closes the loops
+with the joints nearest to their specified coordinates q_S solves
 
-    min |q_P - said|^2    such that    phi(q_P, p) = 0,
+    min |q_P - q_S|^2    such that    phi(q_P, p) = 0
 
-by Newton's method; phi is linear in p, which places a pin. The wrong length leaves the joints
-where they are said to be, but for the digits; any other one turns them. Where the file says no
-passive joint, it is the least change with which the loops close at all. Driven joints at home are
-tried like lengths.
+by Newton's method; phi is linear in p, which places a pin. The wrong length leaves the joints at
+their specified coordinates, up to rounding of the file; any other length moves them. If the file
+specifies no passive joint, the least change that closes the loops is searched for. Home
+coordinates of driven joints are tried like lengths.
 """
 
 import dataclasses
@@ -29,22 +29,22 @@ from crane.description.parameter_changes import parameter_value, tree_parameters
 from crane.machine.drive_selection import specified_active_joints
 from crane.machine.machine_assembly import assemble_tree
 
-_LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not say
+_LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not specify
 _ITERATIONS, _CHANGES, _EVALUATIONS = 25, 6, 30
-_LEVER = 0.1  # share of a length's slope along the gap, below which it does not close it
-_CLEAR = 0.05  # [rad], shares: joints are where they are said to be
-_ALIKE, _DIGIT = 2.0, 2e-3  # ratio of distances that decides nothing, and digits of a home
+_LEVER = 0.1  # least cosine of a length's derivative and the gap that it closes
+_CLEAR = 0.05  # scaled distance of joints at their specified coordinates
+_ALIKE, _DIGIT = 2.0, 2e-3  # ratio of indecisive distances, and rounding of a home in a file
 _LISTED = 2
 
 
 @dataclass(frozen=True)
 class Remedy:
-    """A number that would let the loops close.
+    """A parameter whose change would close the loops.
 
     Attributes:
-        name: As `crane.description.parameters` has it, or `home JOINT`.
+        name: As in `crane.description.parameters`, or `home JOINT`.
         now: Its value [m], [rad].
-        then: The value with which they close.
+        then: The value that closes the loops.
         turns: Whether it is an angle.
     """
 
@@ -59,12 +59,12 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Misfit:
-    """Where a machine does not close at the home that its file says.
+    """A machine that does not close at the home configuration of its file.
 
     Attributes:
-        loop: The loop whose frames are farthest apart there.
-        gap: By how much [m].
-        remedies: Numbers that would close it, the likeliest first; none where no single one does.
+        loop: The loop with the largest gap there.
+        gap: The gap [m].
+        remedies: Parameters that would close it, the likeliest first; empty if no single one does.
     """
 
     loop: str
@@ -78,21 +78,21 @@ class Misfit:
 
     @property
     def listed(self) -> str:
-        """The remedies in words."""
+        """The remedies as text."""
         return " or ".join(map(str, self.remedies))
 
 
 def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
-    """What keeps a machine from closing at the home that its file says.
+    """Find what keeps a machine from closing at the home configuration of its file.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        guess: (nq,) home as the file says it.
+        guess: (nq,) home as specified; joints that the file does not specify are moved to the
+            smallest gap.
 
     Returns:
-        None where no frames are apart there. Joints that the file does not say are where frames
-        come nearest to each other.
+        None if no loop has a gap there.
     """
     equations = LoopEquations(model, spec.loops, spec.couplings)
     names = equations.coordinates.names
@@ -129,7 +129,7 @@ def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
     return Misfit(spec.loops[worst].name, float(gaps[worst]), tuple(alike[:_LISTED]))
 
 
-# at a posture (nq,) and a change of a number, all in shares: phi (m,), dphi/dq, dphi/dp
+# from q (nq,) and the scaled change of a parameter: phi (m,), dphi/dq, dphi/dp, all scaled
 Changed = Callable[[Array, float], tuple[Array, Array, Array]]
 
 
@@ -140,20 +140,20 @@ def _numbers(
     guess: Array,
     active: Sequence[int],
 ) -> Iterator[tuple[str, float, float, bool, Changed]]:
-    """Lengths that loops go through, and driven joints: name, value, unit, whether it turns."""
+    """Lengths in loops and driven joints: name, value, unit, is angle, residual function."""
     joints = {joint for loop in loops for joint in _joints(spec, loop)}
     size = equations.characteristic_length
 
     def length(other: LoopEquations) -> Changed:
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
-            (phi, slopes), (there, others) = equations.evaluate(q), other.evaluate(q)
-            shares = equations.residual_units
-            slopes = (
-                (slopes + change * (others - slopes))
-                / shares[:, None]
+            (phi, jacobian), (other_phi, other_jacobian) = equations.evaluate(q), other.evaluate(q)
+            units = equations.residual_units
+            jacobian = (
+                (jacobian + change * (other_jacobian - jacobian))
+                / units[:, None]
                 * equations.coordinate_units
             )
-            return (phi + change * (there - phi)) / shares, slopes, (there - phi) / shares
+            return (phi + change * (other_phi - phi)) / units, jacobian, (other_phi - phi) / units
 
         return changed
 
@@ -161,8 +161,8 @@ def _numbers(
         def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
             there = q.copy()
             there[column] += change * equations.coordinate_units[column]
-            phi, slopes = equations.evaluate_scaled(there)
-            return phi, slopes, slopes[:, column]
+            phi, jacobian = equations.evaluate_scaled(there)
+            return phi, jacobian, jacobian[:, column]
 
         return changed
 
@@ -185,7 +185,7 @@ def _numbers(
 
 
 def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
-    """Joints of the tree that a loop goes through, fixed ones among them."""
+    """Joints of the tree in a loop, including fixed ones."""
     above = {joint.child: joint for joint in spec.tree.joints.values()}
     ways = []
     for link in (loop.predecessor, loop.successor):
@@ -198,7 +198,7 @@ def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
 
 
 def _gaps(equations: LoopEquations, q: Array) -> Array:
-    """(l,) how far apart the frames of loops are along what they lock [m]."""
+    """(l,) distances of the loops' frames along locked translations [m]."""
     phi = equations.evaluate(q)[0]
     return np.array([
         np.linalg.norm(phi[(equations.loop_of_row == i) & equations.is_translation])
@@ -213,15 +213,15 @@ def _change(
     said: NDArray[np.bool_],
     changed: Changed,
 ) -> tuple[float, float] | None:
-    """The change of a number in its unit that turns joints least that are said, by how much."""
+    """The scaled change of a parameter that closes the loops with least joint motion."""
     x, units = np.zeros(len(passive) + 1), equations.coordinate_units[passive]
     weights = np.append(np.where(said, 1.0, _LOOSE), _LOOSE)
     for _ in range(_ITERATIONS):
         q = guess.copy()
         q[passive] += x[:-1] * units
-        gap, jacobian, slope = changed(q, float(x[-1]))
-        slopes = np.column_stack([jacobian[:, passive], slope])
-        wanted = np.linalg.lstsq(slopes / weights, slopes @ x - gap, rcond=1e-12)[0] / weights
+        gap, jacobian, derivative = changed(q, float(x[-1]))
+        matrix = np.column_stack([jacobian[:, passive], derivative])
+        wanted = np.linalg.lstsq(matrix / weights, matrix @ x - gap, rcond=1e-12)[0] / weights
         step = np.abs(wanted - x).max()
         if not step < 1.0:  # also NaN
             return None
@@ -236,18 +236,18 @@ def _change(
 def _least(
     equations: LoopEquations, guess: Array, passive: Indices, changed: Changed
 ) -> tuple[float, float] | None:
-    """The least change of a number in its unit that closes the loops, and its amount.
+    """The least scaled change of a parameter that closes the loops, and its magnitude.
 
-    Of the gap |phi| that is left at the nearest approach the slope is phi . (dphi/dp) / |phi|.
+    At the nearest approach the derivative of the gap |phi| is phi . (dphi/dp) / |phi|.
     """
     q, change = guess.copy(), 0.0
     for _ in range(_CHANGES):
         q = _nearest(equations, q, passive, changed, change)
-        phi, _, slope = changed(q, change)
+        phi, _, derivative = changed(q, change)
         if np.abs(phi).max() < FILE_PRECISION:
             return change, abs(change)
-        lever = float(phi @ slope)
-        if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(slope)):
+        lever = float(phi @ derivative)
+        if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(derivative)):
             return None
         change -= float(phi @ phi) / lever
     return None
@@ -256,8 +256,8 @@ def _least(
 def _nearest(
     equations: LoopEquations, q: Array, free: Indices, changed: Changed, change: float = 0.0
 ) -> Array:
-    """The posture in which loops come nearest to closing, from one beside it."""
-    from scipy.optimize import least_squares  # slow to import, and not needed where they close
+    """The configuration of least squared residuals, from one nearby."""
+    from scipy.optimize import least_squares  # slow to import, only needed for open loops
 
     def there(x: Array) -> Array:
         out = q.copy()
@@ -270,7 +270,7 @@ def _nearest(
     def gap(x: Array) -> Array:
         return changed(there(x), change)[0]
 
-    def slope(x: Array) -> Array:
+    def jacobian(x: Array) -> Array:
         return changed(there(x), change)[1][:, free]
 
-    return there(least_squares(gap, np.zeros(len(free)), slope, max_nfev=_EVALUATIONS).x)
+    return there(least_squares(gap, np.zeros(len(free)), jacobian, max_nfev=_EVALUATIONS).x)

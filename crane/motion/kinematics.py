@@ -7,13 +7,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from crane.closure.kinematics_formulas import (
-    FormulaConstants,
-    LoopFormulas,
-    PositionKinematics,
-    VelocityKinematics,
-    folding_pattern,
-)
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics, folding_pattern
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
 from crane.codegen import FormulaTooLongError, Program, Scalar, Tape
 from crane.codegen.symbolic import add_vectors, cross, dot, matvec, scale_vector, subtract_vectors
 from crane.common.errors import ClosureError, InputError, UnreachableTipError, suggest_names

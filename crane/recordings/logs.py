@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import RecordingError, suggest_names
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen import Scalar, Tape
 from crane.codegen.casadi_expressions import casadi_expressions
 from crane.codegen.symbolic import add_vectors, matvec, subtract_vectors, transpose
@@ -125,7 +126,7 @@ def _dynamics_quantity(
         dynamics_formulas, x
     )
     zeros = [0.0] * n
-    arguments = [geometry, ("q",), dynamics.numbers, *((name,) for name in names)]
+    arguments = [geometry, ("q",), dynamics.formula_constants, *((name,) for name in names)]
     arguments += [zeros] * (2 - len(names))
     sizes = {"q": len(q)} | dict.fromkeys(names, n)
     return sizes, arguments, {quantity: (formulas, dynamics.result_shape(quantity))}
@@ -180,7 +181,7 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
     )
     numbers = (
         machine.closure.compiled_closure.geometry.constants,
-        chart.dynamics.numbers,
+        chart.dynamics.formula_constants,
         drive.settings,
     )
     sizes = {

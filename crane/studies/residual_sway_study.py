@@ -10,7 +10,7 @@ from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
-from crane.common.text_tables import format_table
+from crane.common.units import format_table
 from crane.control import ValveFeedforward, fastest_trajectory
 from crane.formats import load
 from crane.machine import Machine

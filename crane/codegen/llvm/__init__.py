@@ -1,4 +1,4 @@
-"""Programs in LLVM's language, and from there to machine code."""
+"""Translation of programs to LLVM's intermediate language and to machine code."""
 
 from crane.codegen.llvm.machine_code import MachineCode, compiler_settings
 

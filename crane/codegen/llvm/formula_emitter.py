@@ -1,41 +1,133 @@
-"""Straight formulas in LLVM's language, long ones in pieces.
+"""Formulas in LLVM IR; long ones are split into pieces.
 
-What takes a compiler time grows faster than a function's length; so a long formula becomes several
-functions, one called after the other, that hand each other numbers in memory.
+Compile time grows faster than the length of a function, so that a long formula becomes several
+functions, called one after another, which exchange values in memory. Dot products of one vector
+with several are computed by one vector instruction per element: long formulas are limited by the
+instruction cache of the processor, about 32 kB, and a vector instruction is as long as a scalar
+one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from crane.codegen.intermediate_representation import Formula
-from crane.codegen.llvm.dot_products import (
-    FAST_MATH_FLAGS,
-    emit_dot_product_stores,
-    emit_dot_products,
-    format_operand,
-    shared_operands,
-)
 from crane.codegen.llvm.vector_functions import MAX_VECTOR_WIDTH, VECTOR_FUNCTIONS, format_real
 from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
 
-MAX_SINGLE_FUNCTION_LENGTH = (
-    6500  # operations of a formula that stays one function, which runs faster
-)
-PIECE_LENGTH = 1000  # of one of several
+# Allows fused multiply-add; reordering sums would gain nothing and could cancel NaN.
+FAST_MATH_FLAGS = "nsz arcp contract"
+Operands = Sequence[float | int]
+
+
+def format_operand(operand: float | int) -> str:
+    """A number, or the register of an operation."""
+    return f"%v{operand}" if isinstance(operand, int) else format_real(operand)
+
+
+def shared_operands(operation: tuple) -> tuple:
+    """Common part of dot operations that are computed together: name and first vector."""
+    return operation[: 1 + len(operation) // 2]
+
+
+def emit_dot_products(
+    indices: Sequence[int], operands: Sequence[Operands], known_vectors: set[str]
+) -> list[str]:
+    """Lines that compute `%d` and the first index, and each dot product as a scalar.
+
+    Args:
+        indices: Indices of the dot operations.
+        operands: Operands of each.
+        known_vectors: Names of vectors that exist; new ones are added.
+    """
+    kind, half, name = _vector_type(len(indices)), len(operands[0]) // 2, f"%d{indices[0]}"
+    lines: list[str] = []
+    total = ""
+    for i in range(half):
+        factor = _emit_vector([operands[0][i]] * len(indices), known_vectors, lines)
+        other = _emit_vector([each[half + i] for each in operands], known_vectors, lines)
+        made = name if half == 1 else f"{name}_{i}"
+        lines.append(f"  {made} = fmul {FAST_MATH_FLAGS} {kind} {factor}, {other}")
+        if i:
+            before, made = made, name if i == half - 1 else f"{name}_{i}_"
+            lines.append(f"  {made} = fadd {FAST_MATH_FLAGS} {kind} {total}, {before}")
+        total = made
+    lines += [
+        f"  %v{index} = extractelement {kind} {name}, i32 {lane}"
+        for lane, index in enumerate(indices)
+    ]
+    return lines
+
+
+def emit_dot_product_stores(
+    indices: Sequence[int], output_lanes: Iterable[tuple[int, int]]
+) -> list[str]:
+    """Lines that store dot products to the outputs, adjacent ones together.
+
+    Args:
+        indices: Indices of the dot operations.
+        output_lanes: Index of an output, and the lane of its dot product.
+    """
+    lines: list[str] = []
+    runs: list[list[tuple[int, int]]] = []
+    for at, lane in sorted(output_lanes):
+        if runs and runs[-1][-1] == (at - 1, lane - 1):
+            runs[-1].append((at, lane))
+        else:
+            runs.append([(at, lane)])
+    for run in runs:
+        at, kind, short = run[0][0], _vector_type(len(indices)), _vector_type(len(run))
+        lanes = ", ".join(f"i32 {lane}" for _, lane in run)
+        lines += [
+            f"  %s{at} = shufflevector {kind} %d{indices[0]}, {kind} poison, "
+            f"<{len(run)} x i32> <{lanes}>",
+            f"  %q{at} = getelementptr double, ptr %out, i64 {at}",
+            f"  store {short} %s{at}, ptr %q{at}, align 8",
+        ]
+    return lines
+
+
+def _emit_vector(operands: Operands, known_vectors: set[str], lines: list[str]) -> str:
+    """The name of a vector of scalars; appends the lines that create it if it is new."""
+    kind, words = _vector_type(len(operands)), [format_operand(x) for x in operands]
+    same = len(set(words)) == 1
+    name = "%w" + "_".join(word.removeprefix("%") for word in words)
+    if name in known_vectors:
+        return name
+    known_vectors.add(name)
+    vector = "poison"
+    for lane, word in enumerate(words[:1] if same else words):
+        made = name if lane == len(words) - 1 else f"{name}.{lane}"
+        lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
+        vector = made
+    if vector != name:
+        lines.append(
+            f"  {name} = shufflevector {kind} {vector}, {kind} poison, "
+            f"<{len(words)} x i32> zeroinitializer"
+        )
+    return name
+
+
+def _vector_type(count: int) -> str:
+    return f"<{count} x double>"
+
+
+# operations up to which a formula stays one function, which runs faster
+MAX_SINGLE_FUNCTION_LENGTH = 6500
+PIECE_LENGTH = 1000  # operations of a piece
 _ARITHMETIC = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
 _INTRINSICS = {
     "sqrt": "@llvm.sqrt.f64", "abs": "@llvm.fabs.f64", "maximum": "@larger",
     "copysign": "@llvm.copysign.f64", "positive": "@chosen",
 }  # fmt: skip
-# Numbers that registers have no room for are reached with a byte less through the frame pointer.
-# A processor keeps some 32 kB of instructions at hand, and waits for those of longer formulas.
+# Spilled registers take one byte less per access through the frame pointer, which matters for
+# formulas larger than the instruction cache (about 32 kB).
 _FRAME_POINTER_ATTRIBUTES = '"frame-pointer"="all" "no-realign-stack"'
 _VECTORIZED = VECTOR_FUNCTIONS | {"dot"}
 _FUNCTION_END = "  ret void\n}"
 
 
 def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
-    """A straight function; adds to `functions` what it calls of `definitions`."""
+    """A formula as a function; adds the vector functions that it calls to `functions`."""
     tapes = {value.tape for value in formula.outputs if isinstance(value, SymbolicExpression)}
     operations = tapes.pop().operations if tapes else []
     pieces = [
@@ -82,7 +174,7 @@ def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
 
 
 def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[list[int]]:
-    """Operations in an order that can be computed, those of `_VECTORIZED` several at once."""
+    """Operations in an order of computation, those of `_VECTORIZED` in groups."""
     steps: list[list[int]] = []
     for level in _dependency_levels(operations, required_operations(formula.outputs)):
         same: dict[tuple, list[int]] = {}
@@ -101,7 +193,7 @@ def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[lis
 
 
 def _split_steps(steps: list[list[int]]) -> list[list[list[int]]]:
-    """Pieces of about equal length; a short formula stays whole, and one without steps is one."""
+    """Pieces of about equal length; a short formula is a single piece."""
     count = round(len(steps) / PIECE_LENGTH) if len(steps) > MAX_SINGLE_FUNCTION_LENGTH else 1
     size = -(-len(steps) // count) if steps else 1
     return [steps[start : start + size] for start in range(0, max(1, len(steps)), size)]
@@ -111,12 +203,12 @@ class _FormulaPiece:
     """Consecutive operations of a formula.
 
     Args:
-        operations: All of the formula.
-        steps: Those of the piece, in their order.
+        operations: All operations of the formula.
+        steps: Groups of operations of the piece, in their order.
 
     Attributes:
-        computed: What it computes.
-        required: What it needs of earlier pieces.
+        computed: Indices of its operations.
+        required: Indices of operations of earlier pieces that it needs.
     """
 
     def __init__(self, operations: Sequence[tuple], steps: list[list[int]]):
@@ -135,12 +227,12 @@ class _FormulaPiece:
         output_indices: dict[int, list[int]],
         functions: set[tuple[str, int]],
     ) -> list[str]:
-        """Its statements.
+        """The lines of the piece.
 
         Args:
-            memory_slots: Where in memory pieces find each other's numbers.
-            output_indices: Which outputs a number is.
-            functions: Takes what it calls of `definitions`.
+            memory_slots: Memory slots of values that pieces exchange.
+            output_indices: Indices of the outputs that an operation computes.
+            functions: Receives the vector functions that are called.
         """
         lines, available = [], set(self.computed)
         vectors: set[str] = set()
@@ -174,7 +266,7 @@ class _FormulaPiece:
         return _emit_vector_call(name, width, [(i, self._operations[i][1]) for i in step])
 
     def _emit_load(self, index: int, memory_slots: dict[int, int]) -> list[str]:
-        """A number from an argument of the formula or an earlier piece."""
+        """Load a value from an argument of the formula or from an earlier piece."""
         kind, *where = self._operations[index]
         array, at = (
             (f"in{where[0]}", where[1]) if kind == "load" else ("between", memory_slots[index])
@@ -186,7 +278,7 @@ class _FormulaPiece:
 
 
 def _emit_copied_output(at: int, value: Scalar, operations: Sequence[tuple]) -> list[str]:
-    """An output that nothing has to be computed for."""
+    """An output that is a constant or an argument."""
     if not isinstance(value, SymbolicExpression):
         return _emit_store(f"q{at}", "out", at, format_real(float(value)))
     _, array, index = operations[value.index]
@@ -211,7 +303,7 @@ def _operand_indices(operation: tuple) -> list[int]:
 
 
 def _assign_memory_slots(pieces: Sequence[_FormulaPiece]) -> dict[int, int]:
-    """Memory for what later pieces need, used again behind the last one that does."""
+    """Memory slots of values for later pieces, reused after the last use."""
     last = {index: number for number, piece in enumerate(pieces) for index in piece.required}
     memory_slots: dict[int, int] = {}
     free: list[int] = []
@@ -226,7 +318,7 @@ def _assign_memory_slots(pieces: Sequence[_FormulaPiece]) -> dict[int, int]:
 
 
 def _dependency_levels(operations: Sequence[tuple], indices: Sequence[int]) -> list[list[int]]:
-    """Operations by how many of `_VECTORIZED` come after each other on the way to them."""
+    """Operations by the largest number of `_VECTORIZED` operations on a path to them."""
     level: dict[int, int] = {}
     out: list[list[int]] = []
     for index in indices:
@@ -240,10 +332,10 @@ def _dependency_levels(operations: Sequence[tuple], indices: Sequence[int]) -> l
 
 
 def _emit_vector_call(name: str, width: int, calls: list[tuple[int, Any]]) -> list[str]:
-    """One call of a function of `width` numbers, of which there may be fewer."""
+    """One call of a function of `width` values, the last of which may be unused."""
     lines = []
     kind, vector = f"<{width} x double>", "poison"
-    for lane in range(width):  # the first once more where there are too few
+    for lane in range(width):  # unused lanes repeat the first value
         _, operand = calls[lane] if lane < len(calls) else calls[0]
         word, made = format_operand(operand), f"%{name}{calls[0][0]}_{lane}"
         lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
@@ -258,7 +350,6 @@ def _emit_vector_call(name: str, width: int, calls: list[tuple[int, Any]]) -> li
 
 
 def _emit_scalar_operation(index: int, kind: str, *operands: Any) -> str:
-    """One operation of one number."""
     words = [format_operand(operand) for operand in operands]
     if kind == "negate":
         return f"  %v{index} = fneg double {words[0]}"

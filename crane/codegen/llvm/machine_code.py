@@ -1,4 +1,4 @@
-"""From LLVM's text to functions that can be called."""
+"""LLVM modules of programs, and their compilation to functions that can be called."""
 
 import ctypes
 import functools
@@ -6,12 +6,63 @@ from collections.abc import Iterable
 from typing import Any
 
 from crane.codegen.intermediate_representation import Formula, Routine
-from crane.codegen.llvm.module_emitter import ENTRY_POINT_NAME, emit_module
+from crane.codegen.llvm.formula_emitter import emit_formula
+from crane.codegen.llvm.routine_emitter import emit_routine
+from crane.codegen.llvm.vector_functions import define_functions
 from crane.common.file_cache import cached_object_code, entry_name, read_entry
 
-_OPTIMIZATION_LEVEL = (
-    1  # of LLVM's levels of optimisation; higher ones take longer and gain nothing here
-)
+ENTRY_POINT_NAME = "{}.entry"  # the function that takes all arguments by one pointer
+_DECLARATIONS = """
+declare double @llvm.sqrt.f64(double)
+declare double @llvm.fabs.f64(double)
+declare double @llvm.copysign.f64(double, double)
+declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
+define internal double @chosen(double %x, double %yes, double %no) alwaysinline {
+  %positive = fcmp ogt double %x, 0.0
+  %out = select i1 %positive, double %yes, double %no
+  ret double %out
+}
+define internal double @larger(double %a, double %b) alwaysinline {
+  %more = fcmp oge double %a, %b
+  %out = select i1 %more, double %a, double %b
+  %odd = fcmp uno double %a, %a
+  %seen = select i1 %odd, double %a, double %out
+  ret double %seen
+}
+"""
+
+
+def emit_module(functions: Iterable[Formula | Routine]) -> str:
+    """The LLVM IR of formulas and routines."""
+    vector_functions: set[tuple[str, int]] = set()
+    texts = [_DECLARATIONS]
+    for function in functions:
+        if isinstance(function, Formula):
+            texts += [
+                emit_formula(function, vector_functions),
+                _emit_entry_point(function, "void"),
+            ]
+        else:
+            texts += [emit_routine(function), _emit_entry_point(function, "i64")]
+    return "\n".join([*texts, define_functions(vector_functions)])
+
+
+def _emit_entry_point(function: Formula | Routine, return_type: str) -> str:
+    """A function that takes one pointer to all arguments."""
+    lines, words = [f"define i64 @{ENTRY_POINT_NAME.format(function.name)}(ptr %a) {{"], []
+    for i, argument in enumerate(function.argument_kinds):
+        kind = "i64" if argument == "count" else "ptr"
+        lines.append(f"  %p{i} = getelementptr i64, ptr %a, i64 {i}")
+        lines.append(f"  %v{i} = load {kind}, ptr %p{i}")
+        words.append(f"{kind} %v{i}")
+    call = f"call {return_type} @{function.name}({', '.join(words)})"
+    if return_type == "void":
+        return "\n".join([*lines, f"  {call}", "  ret i64 0", "}"])
+    return "\n".join([*lines, f"  %answer = {call}", "  ret i64 %answer", "}"])
+
+
+# LLVM optimization level; higher ones take longer and gain nothing here
+_OPTIMIZATION_LEVEL = 1
 _TUNING_OPTIONS = {"slp_vectorization": False}  # takes long and gains nothing here
 
 
@@ -19,8 +70,11 @@ class MachineCode:
     """Machine code of a program.
 
     Args:
-        cache_name: Under which it is kept, see `crane.common.file_cache`.
-        object_code: As LLVM put it out.
+        name: Name of the cache entry, see `crane.common.file_cache`.
+        object_code: Object file from LLVM.
+
+    Attributes:
+        cache_name: Name of the cache entry.
     """
 
     def __init__(self, name: str, object_code: bytes):
@@ -34,7 +88,7 @@ class MachineCode:
 
     @classmethod
     def compile_functions(cls, functions: Iterable[Formula | Routine]) -> "MachineCode":
-        """Translate functions, or read what became of them before."""
+        """Compile functions, or read their machine code from the cache."""
         text = emit_module(functions)
         depends = f"{compiler_settings()} {text}"
         return cls(
@@ -44,19 +98,19 @@ class MachineCode:
 
     @classmethod
     def from_cache(cls, name: str) -> "MachineCode | None":
-        """What is kept under a name; None if nothing is, or the name is empty."""
+        """The machine code of a cache entry; None if there is none, or the name is empty."""
         code = read_entry(name) if name else None
         return None if code is None else cls(name, code)
 
     def function_address(self, name: str) -> int:
-        """Where a function is."""
+        """Address of a function."""
         return int(self._engine.get_function_address(name))
 
     def entry_point(self, name: str) -> Any:
         """The function that takes the address of its arguments' addresses."""
         found = self._entry_points.get(name)
         if found is None:
-            # ctypes lets other threads run meanwhile
+            # ctypes releases the global interpreter lock
             kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
             found = self._entry_points[name] = kind(
                 self.function_address(ENTRY_POINT_NAME.format(name))
@@ -66,7 +120,7 @@ class MachineCode:
 
 @functools.cache
 def compiler_settings() -> str:
-    """All that machine code depends on besides the program: LLVM, the processor, what is asked."""
+    """Everything that machine code depends on besides the program: LLVM, processor, options."""
     import llvmlite
     import llvmlite.binding as llvm
 
@@ -78,14 +132,13 @@ def compiler_settings() -> str:
 
 
 def _host_cpu() -> tuple[str, str]:
-    """Name and features of this processor."""
     import llvmlite.binding as llvm
 
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
 
 
 def _target_machine() -> Any:
-    """What to translate for; one per program, because its engine owns it."""
+    """A target machine; one per program, because the engine of the program owns it."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()

@@ -1,4 +1,4 @@
-"""Routines in LLVM's language."""
+"""Routines in LLVM IR."""
 
 from crane.codegen.intermediate_representation import (
     ArrayPointer,
@@ -33,16 +33,16 @@ def emit_routine(routine: Routine) -> str:
 
 
 class _RoutineWriter:
-    """Writes one routine; variables live in memory, from which LLVM takes them."""
+    """Writes one routine; variables live in memory, and LLVM moves them to registers."""
 
     def __init__(self, routine: Routine):
         self._routine = routine
         self._lines: list[str] = []
         self._count = 0
-        self._loop_end_labels: list[str] = []  # labels behind the loops that are open
+        self._loop_end_labels: list[str] = []  # end labels of the enclosing loops
 
     def emit(self) -> str:
-        """The function."""
+        """The lines of the function."""
         routine = self._routine
         arguments = [
             *(f"i64 %{name}" for name in routine.counts),
@@ -58,7 +58,7 @@ class _RoutineWriter:
             *(f"  %{v.operands[0]} = alloca {_TYPES[v.kind]}" for v in routine.variables),
         ]
         self._emit_statements(routine.body)
-        # what is behind the last statement is not reached, or returns nothing done
+        # unreachable, or 0 items done
         return "\n".join([*head, *self._lines, "  ret i64 0", "}"])
 
     def _emit_statements(self, statements: list[Statement]) -> None:
@@ -148,7 +148,7 @@ class _RoutineWriter:
 
     def _break(self, s: Break) -> None:
         self._emit_line(f"br label %{self._loop_end_labels[-1]}")
-        self._begin_block(self._new_label())  # what follows is not reached
+        self._begin_block(self._new_label())  # unreachable code needs a block
 
     def _return(self, s: Return) -> None:
         self._emit_line(f"ret i64 {self._evaluate(s.value)}")
@@ -161,7 +161,7 @@ class _RoutineWriter:
         return self._emit_value(f"getelementptr double, ptr %{array.name}, i64 {offset}")
 
     def _evaluate(self, value: RoutineValue) -> str:
-        """A word that stands for a value, computed here."""
+        """Emit the computation of a value; returns its register or constant."""
         kind, operands = _TYPES[value.kind], value.operands
         match value.operation:
             case "constant":

@@ -1,16 +1,16 @@
-"""sin, cos, exp, log and tanh of several numbers at once, in LLVM's language.
+"""sin, cos, exp, log and tanh of vectors in LLVM IR.
 
-A library's functions take one number each and keep no register alive; these are inlined, take as
-many numbers as a register holds, and have no branches. They are correct to 1.5 units in the last
-place. exp beyond 709 is infinite, below -708 zero; log of what is not positive and normal is NaN,
-and so are sin and cos of angles of 2^48 and more, which doubles know to 0.06 at best.
+Unlike library functions, which take one value and clobber registers, these are inlined, take as
+many values as a register holds, and have no branches. They are accurate to 1.5 units in the last
+place. exp is infinite above 709, zero below -708; log of values that are not positive and normal
+is NaN, and so are sin and cos of angles of 2^48 and more, whose resolution is 0.06 at best.
 """
 
 import math
 import struct
 from collections.abc import Collection
 
-MAX_VECTOR_WIDTH = 8  # numbers at once
+MAX_VECTOR_WIDTH = 8  # values per call
 
 # Minimax polynomials of FDLIBM (k_sin.c, k_cos.c) on [-pi/4, pi/4], highest power first.
 _SIN = (
@@ -36,7 +36,7 @@ _LOG = (
     6.666666666666735130e-01,
 )  # fmt: skip
 _LN2_PARTS = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # the first has 32 bits
-# A sum with it has the other term, rounded to an integer, in its last bits.
+# Adding it rounds a float to an integer, in the lowest bits of the sum.
 _ROUNDING_SHIFT = 1.5 * 2.0**52
 _RIGHT_ANGLE = 0.5 * math.pi, 6.123233995736766e-17, -1.4973849048591833e-33  # to 159 bits
 _LN2 = 6.93145751953125e-1, 1.42860682030941723212e-6  # the first has 21 bits
@@ -48,12 +48,12 @@ def _float_bits(value: float) -> int:
 
 
 def format_real(value: float) -> str:
-    """A number in LLVM's language."""
+    """A number in LLVM IR."""
     return f"0x{_float_bits(value):016X}"
 
 
 class _VectorFunctionWriter:
-    """Lines of one function of a vector.
+    """Writes the lines of one vector function.
 
     Args:
         name: Its name.
@@ -67,25 +67,25 @@ class _VectorFunctionWriter:
         self._lines: list[str] = []
 
     def emit(self, text: str) -> str:
-        """A new value."""
+        """Emit an instruction; returns its register."""
         self._count += 1
         self._lines.append(f"  %t{self._count} = {text}")
         return f"%t{self._count}"
 
     def float_constant(self, value: float) -> str:
-        """The same number everywhere."""
+        """A vector of equal floats."""
         return "<" + ", ".join([f"double {format_real(value)}"] * self._width) + ">"
 
     def integer_constant(self, value: int) -> str:
-        """The same integer everywhere."""
+        """A vector of equal integers."""
         return "<" + ", ".join([f"i64 {value}"] * self._width) + ">"
 
     def float_operation(self, operation: str, a: str, b: str) -> str:
-        """Arithmetic of numbers."""
+        """Emit arithmetic of floats."""
         return self.emit(f"{operation} {self.kind} {a}, {b}")
 
     def integer_operation(self, operation: str, a: str, b: str) -> str:
-        """Arithmetic of integers."""
+        """Emit arithmetic of integers."""
         return self.emit(f"{operation} {self.integer_type} {a}, {b}")
 
     def fma(self, a: str, b: str, c: str) -> str:
@@ -104,15 +104,15 @@ class _VectorFunctionWriter:
         return total
 
     def bits(self, x: str) -> str:
-        """A number's bits."""
+        """Bit patterns of floats."""
         return self.emit(f"bitcast {self.kind} {x} to {self.integer_type}")
 
     def from_bits(self, x: str) -> str:
-        """The number of these bits."""
+        """Floats from bit patterns."""
         return self.emit(f"bitcast {self.integer_type} {x} to {self.kind}")
 
     def emit_select(self, comparison: str, a: str, b: str, yes: str, no: str) -> str:
-        """One of two, number by number."""
+        """Elementwise selection by a comparison of a and b."""
         test = self.emit(f"fcmp {comparison} {self.kind} {a}, {b}")
         return self.emit(
             f"select <{self._width} x i1> {test}, {self.kind} {yes}, {self.kind} {no}"
@@ -123,7 +123,7 @@ class _VectorFunctionWriter:
         return self.emit(f"call {self.kind} @llvm.fabs.v{self._width}f64({self.kind} {x})")
 
     def round_quotient(self, x: str, divisor: float) -> tuple[str, str]:
-        """Nearest integer of x / per: bits that end with it, and as a number."""
+        """Nearest integer of x / divisor: in the lowest bits of an integer, and as a float."""
         shifted = self.fma(
             x, self.float_constant(1.0 / divisor), self.float_constant(_ROUNDING_SHIFT)
         )
@@ -132,14 +132,14 @@ class _VectorFunctionWriter:
         )
 
     def subtract_multiple(self, x: str, multiple: str, units: tuple[float, ...]) -> str:
-        """Rest of x - times (sum of units), hardly rounded."""
+        """Remainder x - multiple (sum of units) with extra precision."""
         back = self.emit(f"fneg {self.kind} {multiple}")
         for unit in units:
             x = self.fma(back, self.float_constant(unit), x)
         return x
 
     def exponential(self, x: str) -> str:
-        """e^x where 2^1023 is out of reach."""
+        """e^x for results below 2^1023."""
         power, twos = self.round_quotient(x, math.log(2.0))
         r = self.subtract_multiple(x, twos, _LN2)
         square = self.float_operation("fmul", r, r)
@@ -153,7 +153,7 @@ class _VectorFunctionWriter:
         return self.float_operation("fmul", mantissa, scale)
 
     def finish(self, result: str) -> str:
-        """The whole function."""
+        """The complete function."""
         return "\n".join(
             [
                 self._head,
@@ -279,7 +279,7 @@ VECTOR_FUNCTIONS = frozenset(_DEFINITIONS)
 
 
 def define_functions(required: Collection[tuple[str, int]]) -> str:
-    """The functions @<name><width>, each one of `VECTOR_FUNCTIONS` of so many numbers."""
+    """Definitions of the functions @<name><width>, with names of `VECTOR_FUNCTIONS`."""
     texts = []
     for width in sorted({width for _, width in required}):
         kind = f"<{width} x double>"

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from crane.closure import Closure
 from crane.common.atomic_output import portable_file_name
-from crane.common.errors import CraneWarning
-from crane.common.message_groups import message_kind
+from crane.common.errors import CraneWarning, message_kind
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
@@ -27,7 +26,7 @@ from crane.formats.check.mechanism_check import check_mechanism
 from crane.formats.check.plausibility_check import warn_about_implausible_values
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.robot_files import is_simulator_file
-from crane.machine.mass_checks import has_mass
+from crane.machine.machine_checks import has_mass
 
 # "four_bar.yaml:12: what", or a file that has no line to point at
 _LOCATION_PATTERN = re.compile(

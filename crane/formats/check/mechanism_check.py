@@ -17,9 +17,12 @@ from crane.description.findings import Findings, report_error
 from crane.formats.assembly_warnings import warn_about_assembly_modes
 from crane.formats.check.strokes import warn_of_strokes, warn_of_tasks
 from crane.formats.home_warnings import add_remedy, check_home
-from crane.machine.frame_element_checks import check_frame_elements
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
-from crane.machine.mass_checks import check_masses, replace_infeasible_inertias
+from crane.machine.machine_checks import (
+    check_frame_elements,
+    check_masses,
+    replace_infeasible_inertias,
+)
 
 _OPEN_TOLERANCE = 1e-6  # [rad], [machine's size] from which on a loop is said to be open
 

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from crane.common.errors import InputError
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.hydraulics.opening_curve import OpeningCurve

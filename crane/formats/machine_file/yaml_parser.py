@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from crane.common.errors import DescriptionError
-from crane.common.file_contents import read_plain_file
+from crane.common.package_search import read_plain_file
 from crane.description.findings import report_error
 
 MAX_FILE_SIZE = 2_000_000  # bytes of a file; parsing ten million takes a minute

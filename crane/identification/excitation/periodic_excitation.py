@@ -13,8 +13,8 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
-from crane.common.text_tables import format_table
 from crane.common.threads import with_single_threaded_blas
+from crane.common.units import format_table
 from crane.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import (
     CRITERIA,

@@ -12,9 +12,8 @@ from crane.common.one_line_repr import format_count
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
-from crane.common.text_tables import format_table
 from crane.common.threads import with_single_threaded_blas
-from crane.common.units import format_quantity
+from crane.common.units import format_quantity, format_table
 from crane.control.valve_commands import require_circuit
 from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown

@@ -11,7 +11,7 @@ import numpy as np
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
-from crane.common.text_tables import format_table
+from crane.common.units import format_table
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions

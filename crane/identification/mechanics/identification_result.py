@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from crane.common.atomic_output import replace_file
 from crane.common.result import Result
 from crane.common.samples import Array
-from crane.common.text_tables import format_table
+from crane.common.units import format_table
 from crane.identification.estimation.estimators import Estimate
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison

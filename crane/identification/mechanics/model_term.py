@@ -9,7 +9,7 @@ import numpy as np
 from crane.common.errors import InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.dynamics.frame_distances import FrameDistances
+from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine import Machine
 
 

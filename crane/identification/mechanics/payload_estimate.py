@@ -7,7 +7,7 @@ import numpy as np
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.common.text_tables import format_table
+from crane.common.units import format_table
 from crane.dynamics import Dynamics
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from crane.closure import rotation_vector_formulas
+from crane.closure import spatial_vectors
 from crane.closure.compiled_closure import CompiledClosure
 from crane.closure.kinematics_formulas import FormulaConstants
 from crane.codegen import (
@@ -36,8 +36,8 @@ _AT_REST_SUFFIX = "_rest"
 
 def exceeds_chart_limits(routine: Routine, closure_result: Place) -> RoutineValue:
     """Whether a closed posture is beyond a chart's limits, see `MachineCodeStepper.bounds`."""
-    return (closure_result["steepest"] > routine.bounds[3]) | (
-        closure_result["edge"] < routine.bounds[4]
+    return (closure_result["largest_gamma"] > routine.bounds[3]) | (
+        closure_result["determinant"] < routine.bounds[4]
     )
 
 
@@ -214,7 +214,7 @@ def trace_machine(
     v_a = (
         parts.v_a
         if chart.has_user_coordinates
-        else [dynamics_formulas.rates[i + 1] for i in chart.user_columns]
+        else [dynamics_formulas.joint_velocities[i + 1] for i in chart.user_columns]
     )
     applied = external_forces.trace_external_forces(
         chart.machine, dynamics_formulas, external_references, parts.shear
@@ -265,7 +265,7 @@ class MachineCodeStepper:
         machine = chart.machine
         self.closure_code, self._dynamics_constants = (
             machine.closure.compiled_closure,
-            chart.dynamics.numbers,
+            chart.dynamics.formula_constants,
         )
         self._chart, self._control = chart, control
         self.bounds = np.concatenate([self.closure_code.tolerances, chart.chart_limits, [0.0]])
@@ -385,7 +385,7 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
     """A state, q first, with rotation vectors of at most pi."""
     out = list(state)
     for column in chart.machine.coordinates.floating_base_columns:
-        out[column + 3 : column + 6] = rotation_vector_formulas.wrap_rotation_vector(
+        out[column + 3 : column + 6] = spatial_vectors.wrap_rotation_vector(
             out[column + 3 : column + 6]
         )
     return out

@@ -11,7 +11,7 @@ from crane.codegen.symbolic import subtract_vectors
 from crane.common.samples import Array
 from crane.control import ControllerInputs, ValveDrive, ValveSignals
 from crane.dynamics import Dynamics, JointForces
-from crane.dynamics.force_law_formulas import friction_sign
+from crane.dynamics.joint_force_formulas import friction_sign
 from crane.hydraulics.circuit_equations import BALANCE_UNITS
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS

@@ -243,7 +243,7 @@ class RateProgram:
             return sweep.q[columns[name]], 1.0
         joint = name.removesuffix(VELOCITY_SUFFIX)
         if joint in columns:
-            return sweep.rates[columns[joint] + 1], 1.0
+            return sweep.joint_velocities[columns[joint] + 1], 1.0
         joint = name.removesuffix(FORCE_SUFFIX)
         if joint in user_machine.active:
             return tau[user_machine.active.index(joint)], 1.0
@@ -287,7 +287,7 @@ def _frame_output(
 ) -> tuple[Scalar, Scalar]:
     """Position of the tip, or inclination of a link's x axis and its rate."""
     dynamics_formulas = machine.dynamics_formulas
-    kinematics = dynamics_formulas.posture
+    kinematics = dynamics_formulas.kinematics
     if not name.startswith(INCLINATION_PREFIX):
         place = add_vectors(
             kinematics.origin[body], matvec(kinematics.rotation[body], frame_constants[:3])

@@ -313,7 +313,7 @@ class SimulatedMotion:
         """The simulation's numbers at some nodes, with what sticks."""
         references = nodes.interpolate(constants.references)
         return constants._replace(
-            dynamics_constants=self.chart.dynamics.numbers, references=references
+            dynamics_constants=self.chart.dynamics.formula_constants, references=references
         )
 
     def sensitivity_jump(

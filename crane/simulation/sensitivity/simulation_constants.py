@@ -21,7 +21,7 @@ class SimulationConstants(NamedTuple):
     Attributes:
         geometry: Where joints and loops are, see `crane.closure.kinematics_formulas.TreeGeometry`.
         dynamics_constants: Masses and force laws, see
-            `crane.dynamics.dynamics_formulas.dynamics_constants`, without what joints do whose
+            `crane.dynamics.formula_structure.dynamics_constants`, without what joints do whose
             friction sticks.
         settings: Of the controller; a circuit's are among them.
         frames: Per frame that is observed, where it is on its body (3,) and its x axis (3,).

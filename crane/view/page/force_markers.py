@@ -6,7 +6,7 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.description.specification import ForceElement, GasSpring
-from crane.dynamics.frame_distances import FrameDistances
+from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine import Machine
 from crane.view.page.machine_visuals import largest_body_extent
 from crane.view.page.packed_arrays import pack_base64

@@ -1,15 +1,20 @@
-"""Bodies without mass or inertia: allowed where the others leave the mass matrix definite."""
+"""Checks of an assembled machine: masses and inertias, force elements between frames.
+
+Massless bodies are allowed if the mass matrix is definite.
+"""
 
 import dataclasses
 import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure import Closure
-from crane.common.errors import CraneWarning, DescriptionError
+from crane.closure import Closure, frame_id
+from crane.closure.coordinates import Coordinates
+from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.samples import Array
-from crane.description import MachineSpec
+from crane.description import AnyForceElement, GasSpring, MachineSpec
 from crane.description.findings import is_strict, report_error
 from crane.description.inertia_feasibility import (
     InertiaProblem,
@@ -18,20 +23,22 @@ from crane.description.inertia_feasibility import (
     nearest_inertia,
 )
 from crane.description.kinematic_tree import Joint, Link
+from crane.description.specification import element_name
 from crane.machine.machine_assembly import assemble_tree
 
-_DEFINITE_TOLERANCE = 1e-12  # least eigenvalue of M_A with a diagonal of ones
+_DEFINITE_TOLERANCE = 1e-12  # least eigenvalue of M_A scaled to unit diagonal
 
 
 def replace_infeasible_inertias(
     spec: MachineSpec, model: pin.Model, closure: Closure
 ) -> tuple[MachineSpec, pin.Model]:
-    """The description and its tree with inertias that dynamics can be computed with.
+    """Replace infeasible inertias by ones that dynamics can be computed with.
 
-    Of those that are no body's for their form alone the file's numbers stay where they give the
-    kinetic energy of every motion: a body's is 1/2 (m v^2 + w^T I w), positive wherever I has no
-    negative principal moment, whatever the sum of the others. In place of one that has, and of
-    all where a motion of the machine would move no mass, stand the nearest possible ones.
+    Inertias that are only formally infeasible are kept if they give every motion a positive
+    kinetic energy: that of a body is 1/2 (m v^2 + w^T I w), positive if no principal moment is
+    negative, whatever the triangle inequality says. Inertias with a negative moment, and all
+    infeasible ones if some motion of the machine would have no kinetic energy, are replaced by the
+    nearest feasible ones.
     """
     findings: dict[str, tuple[Link, InertiaProblem]] = {}
     for link in spec.tree.links.values():
@@ -52,7 +59,7 @@ def replace_infeasible_inertias(
         improved = _replace_by_nearest_feasible(spec, model, others)
         if not len(_massless_motions(improved[1], closure)):
             (spec, model), replaced_links = improved, [*replaced_links, *others]
-    if not is_strict():  # then it has been told when it was read
+    if not is_strict():  # otherwise reported while reading
         for link, problem in findings.values():
             _warn_about_inertia(link, problem, link in replaced_links)
     return spec, model
@@ -88,13 +95,12 @@ def _warn_about_inertia(link: Link, problem: InertiaProblem, is_replaced: bool) 
 def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
     """Warn of moving links without mass; refuse those that make the mass matrix singular.
 
-    M_A = gamma^T M gamma at home. It is definite, as M is, where each joint moves some inertia of
-    its own link, S^T I S > 0: then so does it with those that hang on it, from the ends of the
-    tree on. A machine without any mass is one of kinematics alone, which `Dynamics` refuses, not
-    the loading.
+    M_A = gamma^T M gamma at home is definite if each joint moves some inertia of its own link,
+    S^T I S > 0, by induction from the ends of the tree. A machine without any mass has kinematics
+    only, which `Dynamics` refuses, not the loading.
 
     Raises:
-        DescriptionError: A motion of the machine moves no mass.
+        DescriptionError: Some motion of the machine moves no mass.
     """
     coordinates = closure.equations.coordinates
 
@@ -111,7 +117,7 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
         moments = np.linalg.eigvalsh(inertia.inertia)
         if (
             links[joint.parent].composite_joint is not None
-        ):  # others of its series move the link as well
+        ):  # other joints of its series move the link as well
             return not inertia.mass > 0 or bool(moments[0] <= _DEFINITE_TOLERANCE * moments[2])
         if joint.kind == "prismatic":
             return not inertia.mass > 0
@@ -159,7 +165,7 @@ def has_mass(model: pin.Model) -> bool:
 
 
 def _massless_motions(model: pin.Model, closure: Closure) -> Array:
-    """Velocities (k, nv) of the motions at home that move no mass, none where M_A is definite."""
+    """Velocities (k, nv) of motions at home that move no mass; empty where M_A is definite."""
     gamma = closure.gamma_velocity_drift(closure.home, np.zeros(closure.degrees_of_freedom))[
         0
     ]  # uncompiled
@@ -170,3 +176,82 @@ def _massless_motions(model: pin.Model, closure: Closure) -> Array:
     scale = 1 / np.where(largest > 0, largest, 1.0)
     values, vectors = np.linalg.eigh(mass * scale * scale[:, None])
     return np.asarray((gamma @ (scale[:, None] * vectors[:, values < _DEFINITE_TOLERANCE])).T)
+
+
+_COINCIDENT_TOLERANCE = 1e-9  # [m]
+
+
+def check_frame_elements(spec: MachineSpec, closure: Closure) -> None:
+    """Check that elements between frames have a direction at home and connect two bodies.
+
+    Raises:
+        DescriptionError: With file and line of the section.
+    """
+    for section in ("forces", "gas_springs", "ropes"):
+        for problem in frame_element_problems(closure, getattr(spec, section)):
+            place = spec.source_locations.get(section, spec.path.name)
+            report_error(DescriptionError(f"{place}: {problem}"), harmless=True)
+
+
+def check_force_elements(
+    closure: Closure, elements: Sequence[AnyForceElement], find_frame: Callable[[str], int]
+) -> None:
+    """Check that the joints and frames of force elements exist and fit.
+
+    Raises:
+        InputError: They do not, or a joint has two gas springs.
+    """
+    gas_springs = [item.joint for item in elements if isinstance(item, GasSpring)]
+    for item in elements:
+        if item.between is None:
+            closure.equations.coordinates.column(item.joint)
+        else:
+            for link in item.between:
+                find_frame(link)
+    for problem in frame_element_problems(closure, elements):
+        raise InputError(problem)
+    for joint in gas_springs:
+        if gas_springs.count(joint) > 1:
+            raise InputError(f"joint '{joint}' has two gas springs, keep one")
+
+
+def check_limited(coordinates: Coordinates, joint: str, hint: str) -> None:
+    """Check that a joint has limits.
+
+    Raises:
+        InputError: It has none.
+    """
+    column = coordinates.column(joint)
+    if not np.isfinite([coordinates.lower[column], coordinates.upper[column]]).all():
+        raise InputError(f"joint '{joint}' has no limits{hint}")
+
+
+def frame_element_problems(closure: Closure, items: Iterable[AnyForceElement]) -> Iterator[str]:
+    """Problems of elements between existing frames, as text.
+
+    Where frames coincide, their distance has no direction. During a motion an element exerts no
+    force there; at home it is refused, unless its law gives no force either: a slack rope, a
+    spring of length zero.
+
+    Args:
+        closure: Closure of the machine.
+        items: Its force elements, including those along joints.
+    """
+    model, data = closure.model, None
+    for item in items:
+        if item.between is None:
+            continue
+        if data is None:
+            data = model.createData()
+            coordinates = closure.equations.coordinates
+            pin.framesForwardKinematics(model, data, coordinates.configuration(closure.home))
+        one, two = (frame_id(model, link) for link in item.between)
+        if model.frames[one].parentJoint == model.frames[two].parentJoint:
+            yield f"the {element_name(item)} is within one body, choose frames of two"
+            continue
+        vector = data.oMf[two].translation - data.oMf[one].translation
+        if item.requires_direction and np.linalg.norm(vector) < _COINCIDENT_TOLERANCE:
+            yield (
+                f"the {element_name(item)} has no direction, its frames meet at home: choose "
+                "others or another home"
+            )

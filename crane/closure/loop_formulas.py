@@ -1,0 +1,296 @@
+"""Loop equations, gamma and velocity kinematics of one machine as symbolic formulas."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
+from crane.closure.kinematics_formulas import PositionKinematics, largest_scaled_value
+from crane.closure.loop_equations import LoopEquations, aligned_axes
+from crane.closure.spatial_vectors import (
+    SpatialVector,
+    Vector,
+    spatial_dot,
+    subtract_spatial,
+)
+from crane.codegen.symbolic import (
+    Scalar,
+    add_vectors,
+    cross,
+    dot,
+    scale_vector,
+    solve_linear_system,
+    subtract_vectors,
+)  # fmt: skip
+from crane.common.samples import Array
+from crane.description import LOOP_TYPES
+
+
+@dataclass(frozen=True)
+class LoopEquationFormula:
+    """One symbolic loop equation; see `LoopEquations`.
+
+    Attributes:
+        bodies: Bodies of the two frames.
+        is_translation: Whether the equation is a length.
+        has_fixed_axis: Whether the axis rate may be left out, because the origins coincide.
+        axis: Axis of the first frame.
+        arm: Axis or origin of the second frame.
+        wrench: Wrench w of the row, phi' = w . (V_2 - V_1).
+        phi: Residual.
+        jacobian: dphi/dq by joint.
+    """
+
+    bodies: tuple[int, int]
+    is_translation: bool
+    has_fixed_axis: bool
+    axis: Vector
+    arm: Vector
+    wrench: SpatialVector
+    phi: Scalar
+    jacobian: dict[int, Scalar]
+
+    def axis_and_arm_rates(
+        self, first_motion: SpatialVector, second_motion: SpatialVector
+    ) -> tuple[Vector, Vector]:
+        """Time derivatives of axis and arm, from the motions of the two bodies."""
+        axis: Vector = [0.0] * 3 if self.has_fixed_axis else cross(first_motion[1], self.axis)
+        arm = cross(second_motion[1], self.arm)
+        return axis, add_vectors(arm, second_motion[0]) if self.is_translation else arm
+
+    def wrench_rate(
+        self, first_motion: SpatialVector, second_motion: SpatialVector
+    ) -> SpatialVector:
+        """Time derivative of the wrench."""
+        axis, arm = self.axis_and_arm_rates(first_motion, second_motion)
+        moment = add_vectors(cross(arm, self.axis), cross(self.arm, axis))
+        return (axis if self.is_translation else [0.0] * 3), moment
+
+
+def _coupling_formula(factors: Array, offset: float, q: Sequence[Scalar]) -> LoopEquationFormula:
+    """The equation of a coupling, whose Jacobian is constant."""
+    zero: Vector = [0.0] * 3
+    jacobian: dict[int, Scalar] = {i + 1: float(x) for i, x in enumerate(factors) if x}
+    phi = dot([float(x) for x in factors], q) - float(offset)
+    return LoopEquationFormula((0, 0), False, False, zero, zero, (zero, zero), phi, jacobian)
+
+
+class LoopFormulas:
+    """The symbolic independent loop equations at one configuration.
+
+    `alignments` are cosines that are 1 where the axes of the loop frames are not opposed.
+
+    Args:
+        equations: All equations of the machine.
+        structure: Independent equations.
+        active: Columns of the active joints.
+        passive: Columns of the other joints.
+        kinematics: Position kinematics.
+    """
+
+    def __init__(
+        self,
+        equations: LoopEquations,
+        structure: ConstraintStructure,
+        active: Indices,
+        passive: Indices,
+        kinematics: PositionKinematics,
+    ):
+        self._structure, self._kinematics = structure, kinematics
+        self._is_translation = equations.is_translation
+        self.active_joints = [int(column) + 1 for column in active]
+        self.passive_joints = [int(column) + 1 for column in passive]
+        self._frames = [
+            kinematics.loop_frame(i) for i in range(len(kinematics.geometry.frame_bodies))
+        ]
+        self.rows = [
+            self._equation_formula(equations, int(row), kinematics)
+            for row in structure.independent_rows
+        ]
+        self.alignments = [
+            dot([line[k] for line in one[0]], [line[k] for line in two[0]])
+            for loop, one, two in zip(
+                equations.loops, self._frames[::2], self._frames[1::2], strict=True
+            )
+            for k in aligned_axes(loop.type)
+        ]
+        self._redundant_rows = [
+            self._equation_formula(equations, int(row), kinematics)
+            for row in structure.redundant_rows
+        ]
+
+    def _equation_formula(
+        self, equations: LoopEquations, row: int, kinematics: PositionKinematics
+    ) -> LoopEquationFormula:
+        coupling = int(equations.loop_of_row[row]) - len(equations.loops)
+        if coupling >= 0:
+            return _coupling_formula(
+                equations.coupling_factors[coupling],
+                equations.coupling_offsets[coupling],
+                kinematics.q,
+            )
+        one = 2 * int(equations.loop_of_row[row])
+        (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
+        axis = [line[equations.axis_of_frame1[row]] for line in axes1]
+        is_translation = bool(equations.is_translation[row])
+        if is_translation:
+            arm = origin2
+            wrench, phi = (axis, cross(arm, axis)), dot(axis, subtract_vectors(origin2, origin1))
+        else:
+            arm = [line[equations.axis_of_frame2[row]] for line in axes2]
+            wrench, phi = ([0.0] * 3, cross(arm, axis)), dot(axis, arm)
+        jacobian = {}
+        for column, sign in enumerate(equations.sign[one // 2]):
+            if sign:
+                linear, angular = kinematics.joint_axes[column + 1]
+                derivative = dot(wrench[0], linear) + dot(wrench[1], angular)
+                jacobian[column + 1] = float(sign) * derivative
+        bodies = kinematics.geometry.frame_bodies
+        locks_all_translations = all(LOOP_TYPES[equations.loops[one // 2].type][:3])
+        has_fixed_axis = (
+            is_translation
+            and locks_all_translations
+            and self._structure.redundancy.tolerance <= CLOSED_TOLERANCE
+        )
+        pair = bodies[one], bodies[one + 1]
+        return LoopEquationFormula(
+            pair, is_translation, has_fixed_axis, axis, arm, wrench, phi, jacobian
+        )
+
+    def solve_passive(
+        self, active_rows: dict[int, Vector], right_sides: Sequence[Vector]
+    ) -> tuple[dict[int, Vector], list[Scalar]]:
+        """Solve J x = right_sides for the passive joints, block by block.
+
+        Args:
+            active_rows: Rows of x of the active joints, by joint.
+            right_sides: Right-hand sides, by row.
+
+        Returns:
+            Rows of x of all joints, and the determinants of the blocks.
+        """
+        x = dict(active_rows)
+        determinants = []
+        for rows, columns in self._structure.blocks:
+            joints = [self.passive_joints[c] for c in columns]
+            matrix = [[self.rows[r].jacobian.get(joint, 0.0) for joint in joints] for r in rows]
+            # the block order accounts for derivatives that vanish everywhere
+            before = {joint: row for joint, row in x.items() if joint not in joints}
+            sides = [self._right_side(r, before, right_sides[r]) for r in rows]
+            found, determinant = solve_linear_system(matrix, sides)
+            determinants.append(determinant)
+            x |= dict(zip(joints, found, strict=True))
+        return x, determinants
+
+    def _right_side(self, row: int, known: dict[int, Vector], side: Vector) -> Vector:
+        """Right-hand side of a row minus the contributions of known joints."""
+        for joint, derivative in self.rows[row].jacobian.items():
+            if joint in known:
+                side = subtract_vectors(side, scale_vector(derivative, known[joint]))
+        return side
+
+    @cached_property
+    def _gamma_and_determinants(self) -> tuple[dict[int, Vector], list[Scalar]]:
+        n = len(self.active_joints)
+        known: dict[int, Vector] = {
+            joint: [float(i == k) for k in range(n)] for i, joint in enumerate(self.active_joints)
+        }
+        return self.solve_passive(known, [[0.0] * n for _ in self.rows])
+
+    @property
+    def gamma(self) -> dict[int, Vector]:
+        """Rows of gamma (n,) by joint."""
+        return self._gamma_and_determinants[0]
+
+    @property
+    def determinants(self) -> list[Scalar]:
+        """Determinants of the blocks, in their order."""
+        return self._gamma_and_determinants[1]
+
+    @cached_property
+    def newton_step(self) -> dict[int, Scalar]:
+        """Newton step of the passive joints, by joint."""
+        held: dict[int, Vector] = {joint: [0.0] for joint in self.active_joints}
+        x, _ = self.solve_passive(held, [[-row.phi] for row in self.rows])
+        return {joint: x[joint][0] for joint in self.passive_joints}
+
+    @property
+    def largest_residual(self) -> Scalar:
+        """The largest absolute scaled residual of the independent equations."""
+        return self._largest_scaled_residual(self.rows, self._structure.independent_rows)
+
+    @property
+    def largest_redundant_residual(self) -> Scalar:
+        """The largest absolute scaled residual of the redundant equations."""
+        return self._largest_scaled_residual(self._redundant_rows, self._structure.redundant_rows)
+
+    def _largest_scaled_residual(
+        self, rows: Sequence[LoopEquationFormula], indices: Indices
+    ) -> Scalar:
+        long = self._is_translation[indices].tolist()
+        return largest_scaled_value(
+            [row.phi for row in rows], long, self._kinematics.inverse_characteristic_length
+        )
+
+
+class VelocityKinematics:
+    """Symbolic velocities and bias accelerations of the bodies.
+
+    Args:
+        kinematics: Position kinematics.
+        loops: Loop formulas.
+        joint_velocities: (nb + 1,) joint velocities, 0 for the world.
+        gravity: (3,) in the axes of the reference body; the world accelerates with -gravity, so
+            that weights need no terms of their own.
+        carriers: (nb + 1,) the body whose motion each body shares, its parent or 0.
+
+    Attributes:
+        velocities: Velocity of every body, linear at the reference origin, angular.
+        bias_accelerations: Accelerations at zero joint acceleration.
+    """
+
+    def __init__(
+        self,
+        kinematics: PositionKinematics,
+        loops: LoopFormulas,
+        joint_velocities: Sequence[Scalar],
+        gravity: Sequence[Scalar],
+        carriers: Sequence[int],
+    ):
+        self._kinematics, self._loops = kinematics, loops
+        self.velocities: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
+        self.bias_accelerations: list[tuple[Vector, Vector]] = [([-g for g in gravity], [0.0] * 3)]
+        for i in range(1, len(kinematics.joint_axes)):
+            parent = carriers[i]
+            linear, angular = (
+                scale_vector(joint_velocities[i], part) for part in kinematics.joint_axes[i]
+            )
+            v, w = self.velocities[parent]
+            a, e = self.bias_accelerations[parent]
+            if (
+                i not in kinematics.geometry.floating_bodies
+            ):  # whose columns turn with the last of its bodies
+                a = add_vectors(a, cross(w, linear), cross(v, angular))
+                e = add_vectors(e, cross(w, angular))
+            self.bias_accelerations.append((a, e))
+            self.velocities.append((add_vectors(v, linear), add_vectors(w, angular)))
+
+    @cached_property
+    def drift(self) -> Vector:
+        """(nb + 1,) accelerations of the joints at a_A = 0."""
+        held: dict[int, Vector] = {joint: [0.0] for joint in self._loops.active_joints}
+        x, _ = self._loops.solve_passive(
+            held, [[-self.acceleration_bias(row)] for row in self._loops.rows]
+        )
+        return [0.0] + [x[i][0] for i in range(1, len(self._kinematics.joint_axes))]
+
+    def acceleration_bias(self, row: LoopEquationFormula) -> Scalar:
+        """Second derivative of phi at zero joint acceleration, see `LoopEquations`."""
+        one, two = row.bodies
+        first, second = self.velocities[one], self.velocities[two]
+        turned = spatial_dot(row.wrench_rate(first, second), subtract_spatial(second, first))
+        return turned + spatial_dot(
+            row.wrench,
+            subtract_spatial(self.bias_accelerations[two], self.bias_accelerations[one]),
+        )

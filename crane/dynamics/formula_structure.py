@@ -1,0 +1,154 @@
+"""Constants and structure of the dynamics formulas of a machine, and the two formulations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.closure.kinematics_formulas import (
+    TreeGeometry,
+)
+from crane.common.errors import InputError, suggest_names
+from crane.common.samples import Array
+from crane.dynamics.cluster_recursion import (
+    RecursionPlan,
+    plan_recursion,
+)
+from crane.dynamics.joint_force_formulas import LAW_SIZE, SLIP_INDEX, DistanceBodies
+from crane.dynamics.joint_forces import JointForces
+from crane.machine import Machine
+
+BODY_SIZE = 10  # inertia constants of a body
+_UPPER_TRIANGLE = np.triu_indices(3)
+FORMULATIONS = ("exact", "decoupled")
+
+
+def carrier_bodies(machine: Machine, formulation: str) -> tuple[int, ...]:
+    """The body whose motion each body shares.
+
+    "exact": the parent in the tree. "decoupled": the same within a sub-chain, but every sub-chain
+    stands on a base held still at its current pose, equations (16) to (21) of the reduced-scale
+    forwarder paper; the forces of a chain on the chain that carries it are left out.
+
+    Args:
+        machine: The machine.
+        formulation: One of `FORMULATIONS`.
+
+    Returns:
+        (nv + 1,) indices in the numbering of `Coordinates.parents`; 0 for the world, which is at
+        rest.
+
+    Raises:
+        InputError: Unknown formulation.
+    """
+    if formulation not in FORMULATIONS:
+        raise InputError(
+            f"formulation '{formulation}' is unknown, {suggest_names(FORMULATIONS, formulation)}"
+        )
+    parents = machine.coordinates.parents
+    if formulation == "exact":
+        return parents
+    chain = {joint: chain.name for chain in machine.chains for joint in chain.joints}
+    names = [None, *(chain[joint] for joint in machine.joints)]
+    return tuple(p if names[p] == names[i] else 0 for i, p in enumerate(parents))
+
+
+def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointForces) -> Array:
+    """Inertias, force laws and gravity in the order in which `DynamicsFormulas` reads them.
+
+    Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the axes of the geometry;
+    per joint the 22 values of `JointForces.table`; gravity (3); per joint its rotor inertia; per
+    distance its 22 values and the attachment points on its two bodies; the moving factor; circuit
+    friction of joints (`JointForces.circuit_friction`); mass and first moment of the fixed bodies
+    (4); the tip point on its body, if there is a tip.
+    """
+    bodies = []
+    for i, joint in enumerate(machine.coordinates.joints, start=1):
+        if i in geometry.massless_bodies:
+            bodies.append([0.0] * BODY_SIZE)
+            continue
+        turn, inertia = geometry.body_rotations[i], machine.model.inertias[int(joint)]
+        tensor = turn.T @ inertia.inertia @ turn
+        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER_TRIANGLE]])
+    gravity = machine.model.gravity.linear
+    rotors = machine.model.armature
+    joint_laws, distance_laws = np.split(forces.table, [len(bodies)])
+    numbers = [np.ravel(bodies), np.ravel(joint_laws), gravity, rotors]
+    for law, ends in zip(distance_laws, forces.lengths.end_points, strict=True):
+        turns = (
+            geometry.body_rotations[machine.coordinates.body_of_joint[joint]] for joint, _ in ends
+        )
+        places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
+        numbers += [law, *places]
+    numbers += [
+        [forces.moving_factor],
+        forces.circuit_friction[list(forces.circuit_friction_columns)],
+    ]
+    fixed_inertia = machine.model.inertias[0]
+    numbers += [[fixed_inertia.mass], fixed_inertia.mass * fixed_inertia.lever]
+    if machine.tip is not None:
+        body, place = tip_body_and_point(machine)
+        numbers.append(geometry.body_rotations[body].T @ place)
+    return np.concatenate(numbers)
+
+
+def tip_body_and_point(machine: Machine) -> tuple[int, Array]:
+    """The body of a machine's tip, and the point on it (3,) [m]."""
+    assert machine.tip is not None
+    frame = machine.model.frames[machine.frame(machine.tip)]
+    return machine.coordinates.body_of_joint[frame.parentJoint], np.array(
+        frame.placement.translation
+    )
+
+
+def circuit_friction_indices(machine: Machine, forces: JointForces) -> list[int]:
+    """Indices in `dynamics_constants` of what `JointForces.set_circuit_friction` sets."""
+    first = stick_slip_mode_indices(machine, forces)[-1] + 1
+    return list(range(first, first + len(forces.circuit_friction_columns)))
+
+
+def stick_slip_mode_indices(machine: Machine, forces: JointForces) -> list[int]:
+    """Indices in `dynamics_constants` of the values of `JointForces.set_stick_slip_modes`."""
+    bodies = machine.model.nv
+    first = BODY_SIZE * bodies + SLIP_INDEX
+    last = (
+        (BODY_SIZE + LAW_SIZE + 1) * bodies + 3 + (LAW_SIZE + 6) * len(forces.lengths.end_points)
+    )
+    return [first + LAW_SIZE * i + k for i in forces.sticking for k in range(3)] + [last]
+
+
+@dataclass(frozen=True)
+class FormulaStructure:
+    """What the formulas of a machine depend on besides its loops and constants.
+
+    Attributes:
+        carrier_bodies: See `carrier_bodies`.
+        recursion_plan: How forward dynamics reduces the machine's clusters; see
+            `crane.dynamics.cluster_recursion`.
+        distance_bodies: Bodies of the two ends of each distance of `JointForces.lengths`.
+        stick_slip_columns: Columns of the joints with stick-slip friction.
+        circuit_friction_columns: Columns of the joints with circuit friction.
+        tip_body: Body of the tip, if there is one.
+    """
+
+    carrier_bodies: tuple[int, ...]
+    recursion_plan: RecursionPlan
+    distance_bodies: DistanceBodies
+    stick_slip_columns: tuple[int, ...]
+    circuit_friction_columns: tuple[int, ...]
+    tip_body: int | None
+
+    @classmethod
+    def from_machine(
+        cls, machine: Machine, formulation: str, forces: JointForces
+    ) -> "FormulaStructure":
+        """The formula structure of a machine.
+
+        Raises:
+            InputError: Unknown formulation.
+        """
+        bodies = machine.coordinates.body_of_joint
+        spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.end_points)
+        plan = plan_recursion(machine) if formulation == "exact" else ()
+        kinds = forces.sticking, forces.circuit_friction_columns
+        tip = None if machine.tip is None else tip_body_and_point(machine)[0]
+        return cls(carrier_bodies(machine, formulation), plan, tuple(spans), *kinds, tip)

@@ -1,0 +1,303 @@
+"""Inertial and gravity forces, mass matrix and energies as symbolic formulas."""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
+from crane.closure.spatial_vectors import (
+    SpatialVector,
+    Vector,
+    rotation_matrix,
+    rotation_vector_derivative,
+)
+from crane.codegen.symbolic import (
+    Scalar,
+    add_vectors,
+    cross,
+    dot,
+    matmul,
+    matvec,
+    scale_vector,
+    subtract_vectors,
+)  # fmt: skip
+from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
+from crane.dynamics.joint_force_formulas import LAW_SIZE, JointForceFormulas
+from crane.dynamics.spatial_inertia import CompositeMassMatrix
+
+
+class InertialForceFormulas(JointForceFormulas):
+    """Symbolic inertial forces and energies; base class of `DynamicsFormulas`."""
+
+    def __init__(
+        self,
+        kinematics: PositionKinematics,
+        loops: LoopFormulas,
+        constants: FormulaConstants,
+        q: Sequence[Scalar],
+        v_a: Sequence[Scalar],
+        formula_structure: FormulaStructure,
+        use_modes: bool = False,
+        drift: Vector | None = None,
+    ):
+        self.formula_structure, self._use_modes = formula_structure, use_modes
+        self._distance_bodies = formula_structure.distance_bodies
+        self._stick_slip_columns = formula_structure.stick_slip_columns
+        self.v_a = list(v_a)
+        self.kinematics, self.loops, self.q = kinematics, loops, q
+        self._body_count = len(kinematics.geometry.parents)
+        self._mobility = len(v_a)
+        bodies = self._body_count - 1
+        self._inertia_constants = [
+            constants.vector(BODY_SIZE * i, BODY_SIZE) for i in range(bodies)
+        ]
+        first = BODY_SIZE * bodies
+        self._joint_laws = [
+            constants.vector(first + LAW_SIZE * i, LAW_SIZE) for i in range(bodies)
+        ]
+        gravity = constants.vector((BODY_SIZE + LAW_SIZE) * bodies)
+        self._gravity = matvec(kinematics.rotation[0], gravity)
+        self.rotor_inertias: Vector = [
+            0.0,
+            *constants.vector((BODY_SIZE + LAW_SIZE) * bodies + 3, bodies),
+        ]
+        after = (BODY_SIZE + LAW_SIZE + 1) * bodies + 3
+        self._distance_constants = [
+            constants.vector(after + (LAW_SIZE + 6) * k, LAW_SIZE + 6)
+            for k in range(len(formula_structure.distance_bodies))
+        ]
+        last = after + (LAW_SIZE + 6) * len(formula_structure.distance_bodies)
+        self._moving_factor = constants[last]
+        self.circuit_friction = constants.vector(
+            last + 1, len(formula_structure.circuit_friction_columns)
+        )
+        last += len(formula_structure.circuit_friction_columns)
+        self._fixed_inertia = constants.vector(last + 1, 4)
+        self._tip_point = (
+            None if formula_structure.tip_body is None else constants.vector(last + 5)
+        )
+        self.gamma = loops.gamma
+        self.joint_velocities: Vector = [
+            0.0,
+            *(dot(self.gamma[i], v_a) for i in range(1, self._body_count)),
+        ]
+        # the drift of the loops is that of the whole machine in both formulations
+        tree_velocities, carrier_velocities = (
+            VelocityKinematics(kinematics, loops, self.joint_velocities, self._gravity, parents)
+            for parents in (kinematics.geometry.parents, formula_structure.carrier_bodies)
+        )
+        self.drift = tree_velocities.drift if drift is None else drift
+        self._tree_velocities, self._carrier_velocities = tree_velocities, carrier_velocities
+
+    @cached_property
+    def _body_jacobians(self) -> list[list[tuple[Vector, Vector]]]:
+        """Per body dV/dv_A (linear at the reference origin, angular) by column, then the drift."""
+        columns: list[list[tuple[Vector, Vector]]] = [
+            [([0.0] * 3, [0.0] * 3)] * (self._mobility + 1)
+        ]
+        for i in range(1, self._body_count):
+            linear, angular = self.kinematics.joint_axes[i]
+            factors = [*self.gamma[i], self.drift[i]]
+            carried = columns[self.formula_structure.carrier_bodies[i]]
+            columns.append(
+                [
+                    (
+                        add_vectors(v, scale_vector(factor, linear)),
+                        add_vectors(w, scale_vector(factor, angular)),
+                    )
+                    for factor, (v, w) in zip(factors, carried, strict=True)
+                ]
+            )
+        return columns
+
+    @cached_property
+    def _body_inertias(self) -> list[tuple[Scalar, Vector, list[Vector]]]:
+        """Per body mass, lever from origin to COM, inertia about it, in reference axes."""
+        out: list[tuple[Scalar, Vector, list[Vector]]] = []
+        for i in range(1, self._body_count):
+            mass, *rest = self._inertia_constants[i - 1]
+            rotation = self.kinematics.rotation[i]
+            xx, xy, xz, yy, yz, zz = rest[3:]
+            half = matmul(rotation, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            tensor: list[Vector] = [[0.0] * 3 for _ in range(3)]
+            for r in range(3):
+                for c in range(r + 1):
+                    tensor[r][c] = tensor[c][r] = dot(half[r], rotation[c])
+            out.append((mass, matvec(rotation, rest[:3]), tensor))
+        return out
+
+    @cached_property
+    def body_inertias(self) -> list[tuple[Scalar, Vector, list[Vector]]]:
+        """Per body mass, COM, inertia about it, in the frame of the reference body."""
+        origins = self.kinematics.origin[1:]
+        return [
+            (mass, add_vectors(origin, lever), tensor)
+            for origin, (mass, lever, tensor) in zip(origins, self._body_inertias, strict=True)
+        ]
+
+    def _centre_of_mass_jacobian(self, i: int) -> list[tuple[Vector, Vector]]:
+        """Columns of body i: linear at its COM, angular."""
+        _, centre, _ = self.body_inertias[i - 1]
+        return [
+            (add_vectors(v, cross(w, centre)), w)
+            for v, w in self._body_jacobians[i][: self._mobility]
+        ]
+
+    @cached_property
+    def mass_matrix(self) -> list[Vector]:
+        """M_A = sum J_b^T I_b J_b + sum gamma_i^T I_r,i gamma_i."""
+        if self.formula_structure.recursion_plan:
+            clusters = [cluster for cluster, _ in self.formula_structure.recursion_plan]
+            masses, rotors = self._body_inertias, self.rotor_inertias
+            return CompositeMassMatrix(
+                self.kinematics, self.loops, masses, rotors, clusters
+            ).mass_matrix
+        out: list[Vector] = [[0.0] * self._mobility for _ in range(self._mobility)]
+        for i in range(1, self._body_count):
+            mass, _, tensor = self.body_inertias[i - 1]
+            columns = self._centre_of_mass_jacobian(i)
+            for k, (v, w) in enumerate(columns):
+                momentum, spin = scale_vector(mass, v), matvec(tensor, w)
+                for j in range(k + 1):
+                    out[k][j] = out[k][j] + dot(momentum, columns[j][0]) + dot(spin, columns[j][1])
+                    out[j][k] = out[k][j]
+        for i, row in self.gamma.items():
+            for k in range(self._mobility):
+                for j in range(k + 1):
+                    out[j][k] = out[k][j] = out[k][j] + self.rotor_inertias[i] * row[k] * row[j]
+        return out
+
+    def _propagate_wrenches(self, wrenches: Sequence[SpatialVector]) -> Vector:
+        """Forces along the joints (nb + 1,) that balance wrenches at the bodies' COMs."""
+        forces = [force for force, _ in wrenches]
+        moments = [
+            add_vectors(moment, cross(lever, force))
+            for (_, lever, _), (force, moment) in zip(self._body_inertias, wrenches, strict=True)
+        ]
+        out: Vector = [0.0] * self._body_count
+        for i in range(self._body_count - 1, 0, -1):
+            force, moment = forces[i - 1], moments[i - 1]
+            axis = self.kinematics.joint_axis(i)
+            out[i] = dot(axis, moment if self.kinematics.geometry.is_revolute[i] else force)
+            carrier = self.formula_structure.carrier_bodies[i]
+            if carrier:
+                arm = self.kinematics.offsets[i]
+                forces[carrier - 1] = add_vectors(forces[carrier - 1], force)
+                moments[carrier - 1] = add_vectors(moments[carrier - 1], moment, cross(arm, force))
+        return out
+
+    def body_motions(
+        self, joint_accelerations: Sequence[Scalar]
+    ) -> tuple[list[SpatialVector], list[SpatialVector]]:
+        """Velocities and accelerations of the bodies for joint accelerations (nb + 1,).
+
+        Linear at the reference origin, angular; the world accelerates with -gravity.
+        """
+        added_accelerations: list[SpatialVector] = [([0.0] * 3, [0.0] * 3)]
+        for i in range(1, self._body_count):
+            linear, angular = (
+                scale_vector(joint_accelerations[i], part)
+                for part in self.kinematics.joint_axes[i]
+            )
+            before = added_accelerations[self.formula_structure.carrier_bodies[i]]
+            added_accelerations.append(
+                (add_vectors(before[0], linear), add_vectors(before[1], angular))
+            )
+        accelerations = [
+            (add_vectors(a, more), add_vectors(e, turned))
+            for (a, e), (more, turned) in zip(
+                self._carrier_velocities.bias_accelerations, added_accelerations, strict=True
+            )
+        ]
+        return self._carrier_velocities.velocities, accelerations
+
+    def body_wrenches(self, joint_accelerations: Sequence[Scalar]) -> list[SpatialVector]:
+        """Wrenches about the COMs for joint accelerations (nb + 1,), weights included."""
+        wrenches: list[SpatialVector] = []
+        velocities, accelerations = self.body_motions(joint_accelerations)
+        for i in range(1, self._body_count):
+            mass, centre, tensor = self.body_inertias[i - 1]
+            (v, w), (a, e) = velocities[i], accelerations[i]
+            at = add_vectors(a, cross(e, centre), cross(w, add_vectors(v, cross(w, centre))))
+            wrenches.append(
+                (
+                    scale_vector(mass, at),
+                    add_vectors(matvec(tensor, e), cross(w, matvec(tensor, w))),
+                )
+            )
+        return wrenches
+
+    def _inertial_joint_forces(self, joint_accelerations: Sequence[Scalar]) -> Vector:
+        """Joint forces (nb + 1,) for joint accelerations (nb + 1,), weights included."""
+        rotor_inertias = [
+            inertia * rate
+            for inertia, rate in zip(self.rotor_inertias, joint_accelerations, strict=True)
+        ]
+        return add_vectors(
+            self._propagate_wrenches(self.body_wrenches(joint_accelerations)), rotor_inertias
+        )
+
+    @cached_property
+    def inertial_bias(self) -> Vector:
+        """Sum J_b^T (I_b a_b + v_b x* I_b v_b) at a_A = 0, weights and rotors included."""
+        return self.project(self._inertial_joint_forces(self.drift))
+
+    @cached_property
+    def gravity_force(self) -> Vector:
+        """gamma^T g(q)."""
+        wrenches: list[SpatialVector] = [
+            (scale_vector(-mass, self._gravity), [0.0] * 3) for mass, _, _ in self._body_inertias
+        ]
+        return self.project(self._propagate_wrenches(wrenches))
+
+    @property
+    def coordinate_derivatives(self) -> Vector:
+        """Time derivatives of the coordinates (nb,): the rates, except for rotation vectors."""
+        return self._coordinate_derivatives(self.joint_velocities)
+
+    def coordinate_direction(self, k: int) -> Vector:
+        """Derivatives of the coordinates (nb,) along the motion v_k = 1."""
+        return self._coordinate_derivatives(
+            [0.0, *(self.gamma[i][k] for i in range(1, self._body_count))]
+        )
+
+    def _coordinate_derivatives(self, joint_velocities: Vector) -> Vector:
+        out = list(joint_velocities[1:])
+        for i in self.kinematics.geometry.floating_bases:
+            linear, angular = out[i - 1 : i + 2], out[i + 2 : i + 5]
+            vector = self.q[i + 2 : i + 5]
+            out[i - 1 : i + 2] = matvec(rotation_matrix(vector), linear)
+            out[i + 2 : i + 5] = rotation_vector_derivative(vector, angular)
+        return out
+
+    @property
+    def rate_jacobian(self) -> list[Vector]:
+        """d(rates)/dv_A (nb, n), zero for floating bases."""
+        flying = {i + k for i in self.kinematics.geometry.floating_bases for k in range(6)}
+        none: Vector = [0.0] * self._mobility
+        return [none if i in flying else self.gamma[i] for i in range(1, self._body_count)]
+
+    @cached_property
+    def kinetic(self) -> Scalar:
+        """v_A^T M_A v_A / 2, summed over bodies [J]."""
+        velocity = self._carrier_velocities.velocities
+        total: Scalar = 0.0
+        for i in range(1, self._body_count):
+            mass, centre, tensor = self.body_inertias[i - 1]
+            v, w = velocity[i]
+            at = add_vectors(v, cross(w, centre))
+            total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, matvec(tensor, w))
+        for inertia, rate in zip(self.rotor_inertias, self.joint_velocities, strict=True):
+            total = total + 0.5 * inertia * rate * rate
+        return total
+
+    @cached_property
+    def potential(self) -> Scalar:
+        """Weights, springs, constant forces, gas, end stops, ropes [J]."""
+        total: Scalar = 0.0
+        for found in self._law_values:
+            total = total + found.stored_energy
+        for mass, centre, _ in self.body_inertias:
+            height = subtract_vectors(centre, self.kinematics.origin[0])
+            total = total - mass * dot(self._gravity, height)
+        return total

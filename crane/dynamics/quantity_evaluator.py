@@ -1,0 +1,289 @@
+"""Evaluation of the quantities of a machine's dynamics, compiled or by Pinocchio."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.closure.kinematics_formulas import tree_geometry
+from crane.codegen import FormulaTooLongError, run_with_fallback
+from crane.common.errors import InputError, MechanismError, suggest_names
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
+from crane.dynamics.compiled_dynamics import (
+    DERIVATIVES_OF,
+    CompiledParameterDerivatives,
+    CompiledQuantity,
+)
+from crane.dynamics.constant_derivatives import ConstantDerivatives
+from crane.dynamics.formula_structure import (
+    FormulaStructure,
+    circuit_friction_indices,
+    dynamics_constants,
+    stick_slip_mode_indices,
+)
+from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
+from crane.machine import Machine
+from crane.machine.machine_checks import has_mass
+
+BACKENDS = ("compiled", "pinocchio")
+
+
+class QuantityEvaluator(OneLineRepr):
+    """Evaluates quantities of `crane.dynamics.compiled_dynamics.QUANTITIES`; base of `Dynamics`.
+
+    Args:
+        machine: See `Dynamics`.
+        formulation: See `Dynamics`.
+        backend: See `Dynamics`.
+
+    Attributes:
+        forces: Forces along the joints.
+        formula_structure: What the formulas depend on besides constants.
+        backend: "compiled" or "pinocchio".
+        tree_dynamics: The quantities by Pinocchio.
+        formula_constants: Constants of the formulas, see `dynamics_constants`.
+        constant_pattern: Constants to fold into formulas, NaN for those that change.
+    """
+
+    def __init__(self, machine: Machine, formulation: str = "exact", backend: str = "compiled"):
+        if backend not in BACKENDS:
+            raise InputError(f"backend '{backend}' is unknown, {suggest_names(BACKENDS, backend)}")
+        if not isinstance(machine, Machine):
+            raise InputError(f"{machine!r} is not a machine, load it with crane.load")
+        if not has_mass(machine.model):
+            raise MechanismError(
+                f"no link of '{machine.name}' that moves has a mass, give each an <inertial>: "
+                "without masses there is kinematics, and no dynamics"
+            )
+        self.machine, self.formulation = machine, formulation
+        self.forces = JointForces(machine)
+        self.formula_structure = FormulaStructure.from_machine(machine, formulation, self.forces)
+        self.backend = backend if machine.closure.is_compiled else "pinocchio"
+        self.tree_dynamics = PinocchioDynamics(
+            machine, self.forces, self.formula_structure.carrier_bodies
+        )
+        self._compiled_quantities: dict[str, CompiledQuantity | None] = {}
+        self._parameter_derivatives: dict[
+            tuple[str, tuple[str, ...]], CompiledParameterDerivatives
+        ] = {}
+        self.formula_constants = np.zeros(0)
+        if self.backend == "compiled":
+            geometry = machine.closure.compiled_closure.geometry
+            self.formula_constants = np.ascontiguousarray(
+                dynamics_constants(machine, geometry, self.forces)
+            )
+        # constants to fold into formulas; NaN for those that change with the motion
+        self.constant_pattern = self.formula_constants.copy()
+        self._mode_indices = (
+            stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
+        )
+        self.constant_pattern[self._mode_indices] = np.nan
+        self._circuit_friction_indices = (
+            circuit_friction_indices(machine, self.forces) if self.backend == "compiled" else []
+        )
+        self.constant_pattern[self._circuit_friction_indices] = np.nan
+
+    @property
+    def _mobility(self) -> int:
+        return len(self.machine.active)
+
+    def backend_of(self, quantity: str = "forward") -> str:
+        """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
+        return "pinocchio" if self._compiled_quantity(quantity) is None else "compiled"
+
+    def evaluate_closed(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
+        """A quantity at configurations that are closed already, without checks.
+
+        Args:
+            quantity: A key of `crane.dynamics.compiled_dynamics.QUANTITIES`.
+            q: (nq,) or (N, nq) closed configurations.
+            v_a: (n,) or (N, n) [m/s], [rad/s].
+            x: The same shape, a_A or tau_A, depending on the quantity.
+
+        Returns:
+            The results, each flattened.
+        """
+        formula = self._compiled_quantity(quantity)
+        if formula is None:
+            return apply_per_sample(
+                lambda *one: self.tree_dynamics.evaluate(quantity, *one), q, v_a, x
+            )
+        inputs = np.ascontiguousarray(np.concatenate([v_a, x], axis=-1))
+        if q.ndim == 1:
+            return formula.evaluate_closed(np.ascontiguousarray(q), inputs)
+        out = np.empty((len(q), formula.size))
+        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, out)
+        return out
+
+    def set_stick_slip_modes(
+        self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
+    ) -> None:
+        """Set the stick-slip modes; see `JointForces.set_stick_slip_modes`.
+
+        They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
+        """
+        self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
+        if self._mode_indices:
+            self.formula_constants[self._mode_indices] = [
+                *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
+                is_moving,
+            ]
+
+    def set_circuit_friction(self, circuit_friction: Array) -> None:
+        """Set the circuit friction; see `JointForces.set_circuit_friction`.
+
+        It only affects the quantities of the integration, `STICK_SLIP_QUANTITIES`.
+        """
+        self.forces.set_circuit_friction(circuit_friction)
+        if self.backend == "compiled":
+            self.formula_constants[self._circuit_friction_indices] = circuit_friction
+
+    def result_shape(self, quantity: str) -> tuple[int, ...]:
+        """Shape of one sample of a quantity of `derivatives`."""
+        n, model = self._mobility, self.machine.model
+        shapes = {
+            "mass_matrix": (n, n),
+            "energy": (2,),
+            "statics": (4 + 4 * n + (0 if self.machine.tip is None else 3 + 3 * n),),
+            "regressor": (n, 10 * (model.njoints - 1) + np.count_nonzero(model.armature)),
+        }
+        return shapes.get(quantity, (n,))
+
+    def constants_of(self, variant: Machine) -> Array:
+        """Constants of the formulas of a variant: geometry, then `dynamics_constants`."""
+        variant = replace(variant, tip=self.machine.tip)
+        geometry = tree_geometry(variant.closure.equations)
+        if geometry.parents != self.machine.closure.compiled_closure.geometry.parents:
+            raise InputError("the tree is not the same")
+        return np.concatenate(
+            [geometry.constants, dynamics_constants(variant, geometry, JointForces(variant))]
+        )
+
+    def _compiled_quantity(self, quantity: str) -> CompiledQuantity | None:
+        """Machine code of a quantity, or None on the Pinocchio backend."""
+        if quantity not in self._compiled_quantities:
+            made = None
+            try:
+                if self.backend == "compiled":
+                    made = CompiledQuantity(
+                        quantity,
+                        self.machine,
+                        self.formula_constants,
+                        self.constant_pattern,
+                        self.formula_structure,
+                    )
+            except FormulaTooLongError:
+                pass
+            # if two threads compile it at the same time, both use the first
+            self._compiled_quantities.setdefault(quantity, made)
+        return self._compiled_quantities[quantity]
+
+    def _required_formula(self, quantity: str) -> CompiledQuantity:
+        formula = self._compiled_quantity(quantity)
+        if formula is None:
+            raise InputError(
+                f"'{self.machine.name}' has no formulas to differentiate, "
+                + (
+                    "take the compiled backend"
+                    if self.machine.closure.is_compiled and self.backend != "compiled"
+                    else "it is too large: lock joints"
+                )
+            )
+        return formula
+
+    def _argument_derivatives(self, quantity: str, q: Array, inputs: Array) -> Array:
+        """Derivatives (N, 3 size) by the arguments at closed configurations (N, nq)."""
+        formula = self._required_formula(DERIVATIVES_OF + quantity)
+        flat = np.empty((len(q), formula.size))
+        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, flat)
+        return flat
+
+    def _parameter_derivatives_at(
+        self, quantity: str, names: Sequence[str], q: Array, inputs: Array
+    ) -> Array:
+        """Derivatives (N, size, k) by parameters at closed configurations (N, nq)."""
+        code = self._parameter_derivative_code(quantity, names)
+        return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
+
+    def _parameter_derivative_code(
+        self, quantity: str, names: Sequence[str]
+    ) -> CompiledParameterDerivatives:
+        """Machine code of derivatives by parameters of the machine."""
+        self._required_formula(quantity)
+        key = quantity, tuple(names)
+        if key not in self._parameter_derivatives:
+            closure = self.machine.closure
+            constants = ConstantDerivatives(self.machine).jacobian(names, self.constants_of)
+            geometry, numbers = np.split(
+                constants, [len(closure.compiled_closure.geometry.constants)], axis=1
+            )
+            geometry[:, -1] = 0.0  # the characteristic length only scales residuals
+            self._parameter_derivatives[key] = CompiledParameterDerivatives(
+                quantity,
+                self.machine,
+                self.formula_constants,
+                self.constant_pattern,
+                self.formula_structure,
+                geometry,
+                numbers,
+            )
+        return self._parameter_derivatives[key]
+
+    def _evaluate(
+        self,
+        quantity: str,
+        shape: tuple[int, ...],
+        q_a: ArrayLike,
+        v_a: ArrayLike | None = None,
+        x: ArrayLike | None = None,
+        x_name: str = "",
+    ) -> Array:
+        """A quantity of samples or stacks; single samples apply to every row of a stack.
+
+        `shape` is that of one result, () for a vector.
+        """
+        formula = self._compiled_quantities.get(quantity)
+        if formula is not None and (out := formula.evaluate_sample(q_a, v_a, x)) is not None:
+            return out.reshape(shape) if shape else out
+        names, n = self.machine.active, self._mobility
+        q_a = as_samples(q_a, n, "q_a", names)
+        checked = [
+            as_samples(value, n, what, names)
+            for what, value in (("v_a", v_a), (x_name, x))
+            if value is not None
+        ]
+        length = stack_length((q_a, *checked))
+        count = 1 if length is None else length
+        if count == 0:
+            raise InputError("the stack is empty, give at least one sample")
+        rows = np.zeros((count, 2 * n))
+        for i, array in enumerate(checked):
+            rows[:, i * n : (i + 1) * n] = array
+        targets = np.ascontiguousarray(np.broadcast_to(q_a, (count, n)))
+        out = self._evaluate_stack(quantity, targets, rows, q_a.ndim == 2)
+        if shape:
+            return out.reshape(shape if length is None else (count, *shape))
+        return out[0] if length is None else out
+
+    def _evaluate_stack(self, quantity: str, targets: Array, rows: Array, is_stack: bool) -> Array:
+        closure, n = self.machine.closure, self._mobility
+        formula = self._compiled_quantity(quantity)
+        if formula is None:
+            return self.evaluate_closed(quantity, closure.solve(targets), rows[:, :n], rows[:, n:])
+        out = np.empty((len(targets), formula.size))
+
+        def reach(i: int) -> None:
+            sample = f" (sample {i})" if is_stack else ""
+            out[i] = formula.evaluate_closed(
+                closure.continue_from_home(formula.cursor, targets[i], sample), rows[i]
+            )
+
+        run_with_fallback(
+            len(targets),
+            lambda i, _: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
+            reach,
+        )
+        return out
