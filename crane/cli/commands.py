@@ -96,7 +96,7 @@ def info(
     if parameters or pattern is not None:
         from crane.common.package_search import check_package_folders, use_load_options
         from crane.description import parameters as parameters_of
-        from crane.description.name_search import names_by_kind, search_names
+        from crane.description.machine_parameters import names_by_kind, search_names
         from crane.formats import read_machine_spec
 
         with use_load_options(check_package_folders(packages or ()), arguments(argument)):

@@ -1,19 +1,163 @@
-"""Warnings about machines whose files do not tell how to assemble them."""
+"""Errors and warnings about the home configuration and about other assembly modes of a machine."""
 
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from crane.closure import Closure
 from crane.closure.active_joint_selection import translational_coordinates
 from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly_modes
-from crane.common.errors import CraneWarning
+from crane.closure.constraint_structure import OpenLoopError
+from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
+from crane.closure.home_search import HomeSearchResult
+from crane.common.errors import CraneWarning, MechanismError
+from crane.common.package_search import NEAREST_ASSEMBLY, asked
 from crane.common.samples import Array
 from crane.description import MachineSpec
+from crane.description.findings import report_error
 from crane.formats.robot_files import is_robot_file, is_sdf_file, is_simulator_file
 from crane.machine import Machine
+from crane.machine.drive_selection import select_free_joints
+from crane.machine.misfit import misfit
+
+_MAX_LISTED = 4
+
+
+def check_home(
+    spec: MachineSpec, closure: Closure, initial_guess: Array, is_modified: bool = False
+) -> None:
+    """Refuse a home that is another one than the file says, and warn of one that was sought.
+
+    A home is another one where the link of a joint that the file names is turned by more than 0.5
+    rad from what it says, or slid by more than half of the machine's size. Of a machine whose
+    numbers were changed it is another one if besides a loop is assembled the other way round: what
+    its file says is of the machine as it was. The argument NEAREST_ASSEMBLY accepts it anyway.
+
+    Args:
+        spec: The machine as read.
+        closure: Its loops, closed at home.
+        initial_guess: (nq,) what they were closed from.
+        is_modified: Whether its numbers are others than those of its file.
+
+    Raises:
+        MechanismError: It is another one.
+    """
+    search = closure.home_search
+    if search is not None:
+        is_rejected = search.is_far and (not is_modified or bool(search.reversed))
+        if is_rejected and not asked(NEAREST_ASSEMBLY):
+            problem = _different_home_text(spec, closure, search, initial_guess)
+            report_error(
+                MechanismError(
+                    f"{spec.source_locations.get('home', spec.path.name)}: {problem}", "home"
+                )
+            )
+        else:
+            warnings.warn(_home_search_text(spec, closure, search), CraneWarning, stacklevel=3)
+    if message := _rounding_text(spec, closure):
+        warnings.warn(message, CraneWarning, stacklevel=3)
+
+
+def add_remedy(
+    spec: MachineSpec, model: pin.Model, initial_guess: Array, error: OpenLoopError
+) -> OpenLoopError:
+    """The error about a loop that does not close, with a number that would let it close.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        initial_guess: (nq,) home as the file says it.
+        error: As it was raised.
+    """
+    geometry_misfit = misfit(spec, model, initial_guess)
+    if geometry_misfit is None or not geometry_misfit.remedies:
+        return error
+    return OpenLoopError(
+        f"{error}: it would close with {geometry_misfit.listed}", error.subject, error.reason
+    )
+
+
+def _different_home_text(
+    spec: MachineSpec, closure: Closure, search: HomeSearchResult, initial_guess: Array
+) -> str:
+    joint, deviation = search.off_said
+    name = closure.equations.coordinates.names[joint]
+    deviation_text = (
+        f"{deviation * closure.units[joint]:.3g} "
+        f"{'m' if translational_coordinates(closure.model)[joint] else 'rad'}"
+    )
+    loops = _list_names([f"'{loop}'" for loop in search.reversed])
+    reversed_loops_text = f", loop {loops} the other way round" if loops else ""
+    geometry_misfit = misfit(spec, closure.model, initial_guess)
+    cause_text = (
+        f"{geometry_misfit}; correct home or the frames"
+        if geometry_misfit
+        else "correct home or the frames"
+    )
+    argument_hint = (
+        f"--arg {NEAREST_ASSEMBLY}:=true (arguments={{'{NEAREST_ASSEMBLY}': True}} in Python)"
+    )
+    write_hint = (
+        "" if is_simulator_file(spec.path) else "keep it with crane check --write-home, or "
+    )
+    return (
+        f"the loops close only far from the home that is said: {name} is {deviation_text} "
+        f"off{reversed_loops_text}; {cause_text}; "
+        f"if what was found is meant, {write_hint}take it with {argument_hint}"
+    )
+
+
+def _home_search_text(spec: MachineSpec, closure: Closure, search: HomeSearchResult) -> str:
+    names = closure.equations.coordinates.names
+    location = spec.source_locations.get("home", spec.path.name)
+    joint, deviation = search.largest_deviation
+    unit = "m" if translational_coordinates(closure.model)[joint] else "rad"
+    free = select_free_joints(spec, closure.active_names)
+    driven_columns = [i for i in closure.active if names[int(i)] not in free]
+    moved_text = _list_names([names[int(i)] for i in driven_columns if i in search.moved_columns])
+    movement_text = f"moving {moved_text}, too" if moved_text else "the driven joints held"
+    selection_text = (
+        f"the nearest of {search.configuration_count} postures"
+        if search.configuration_count > 1
+        else "the only posture"
+    )
+    command = "convert, then crane check" if is_simulator_file(spec.path) else "check"
+    return (
+        f"{location}: home was sought, because from what the file says of it {search.reason}; "
+        f"{movement_text}, {selection_text} that was found has {names[joint]} {deviation:.3g} "
+        f"{unit} off: look at it with "
+        f"crane sketch, and keep it with crane {command} --write-home"
+    )
+
+
+def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
+    redundancy_gap, equations = closure.structure.redundancy, closure.equations
+    if redundancy_gap.largest_gap <= CLOSED_TOLERANCE:
+        return ""
+    loop = equations.names[equations.loop_of_row[redundancy_gap.largest_row]]
+    location = spec.source_locations.get(f"loop {loop}", spec.path.name)
+    is_translation = bool(equations.is_translation[redundancy_gap.largest_row])
+    unit = "m" if is_translation else "rad"
+    largest_gap = redundancy_gap.largest_gap * equations.residual_units[redundancy_gap.largest_row]
+    gap = f"{largest_gap:.2g} {unit}"
+    share_text = (
+        f" ({redundancy_gap.largest_gap:.1g} of the machine's size)" if is_translation else ""
+    )
+    return (
+        f"{location}: loop '{loop}' closes but for digits: its surplus equations stay open by "
+        f"up to "
+        f"{gap}{share_text}, while the others are closed; write axes, angles and pins with more "
+        f"digits"
+    )
+
+
+def _list_names(names: Sequence[str]) -> str:
+    remaining = len(names) - _MAX_LISTED
+    return ", ".join(names[:_MAX_LISTED]) + (f" and {remaining} more" if remaining > 0 else "")
+
 
 _MAX_LISTED, _MAX_COORDINATES = 4, 6  # loops and coordinates in a line
 _QUICK_STARTS, _THOROUGH_STARTS = (

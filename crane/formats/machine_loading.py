@@ -31,8 +31,7 @@ from crane.description import (
 )
 from crane.description.floating_bases import add_floating_base, check_freedoms
 from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_file
-from crane.formats.assembly_warnings import warn_about_assembly_modes
-from crane.formats.home_warnings import add_remedy, check_home
+from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.machine.drive_selection import select_free_joints, select_motors
 from crane.machine.frame_element_checks import check_frame_elements
@@ -72,7 +71,7 @@ def load(
             `$(find ...)`, or folders in which these are, see `crane.common.package_search`.
         arguments: Values of the arguments of a xacro file; `model` of an SDF with several models;
             `urdf_constraint`, true where a URDF's `<constraint>` elements, as proposed upstream,
-            are to be read as loops, see `crane.formats.urdf.constraint_elements`;
+            are to be read as loops, see `crane.formats.urdf.loop_elements`;
             `nearest_assembly`, true to take an assembly that is far from the home that a file
             says.
         strict: Whether to refuse, as `check` does, what can be computed with in spite of its

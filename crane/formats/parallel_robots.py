@@ -12,7 +12,7 @@ from crane.formats.joint_series import joint_series
 from crane.formats.machine_file.home_section import read_home
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import MAX_FILE_SIZE, YamlSection
-from crane.formats.urdf.joint_graph import MOVABLE_TYPES
+from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
 from crane.formats.xml_file import XmlFile
 

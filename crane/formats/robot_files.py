@@ -1,17 +1,121 @@
-"""A file of a robot as URDF, whatever it is written in: xacro is expanded, SDF translated."""
+"""Files of robots as URDF, whatever they are written in: xacro is expanded, SDF is translated."""
 
+import json
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from crane.common.errors import CraneWarning
-from crane.common.package_search import use_load_options
+from lxml import etree
+
+from crane.common.errors import (
+    CraneError,
+    CraneWarning,
+    DescriptionError,
+    InputError,
+    suggest_names,
+)
+from crane.common.optional_libraries import installation_hint
+from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_options
 from crane.description.specification import ForceElement
-from crane.formats.xacro.xacro_expansion import expand_xacro, needs_xacro
-from crane.formats.xml_file import XmlFile
+from crane.formats import xacro_process
+from crane.formats.xml_file import SourceLocations, XmlFile
 from crane.machine import Machine
+
+_XACRO_NAMESPACE = "http://www.ros.org/wiki/xacro"
+_INSTALL_HINT = f"is written with xacro, {installation_hint('xacro')}"
+_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+_TIMEOUT = 10 * xacro_process.MAX_SECONDS  # [s], for systems that do not limit computing
+
+
+def needs_xacro(xml: XmlFile) -> bool:
+    """Whether a file has elements of xacro, or is called .xacro."""
+    if xml.file.suffix.lower() == ".xacro":
+        return True
+    return any(
+        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
+        for element in xml.root.iter()
+    )
+
+
+def expand_xacro(xml: XmlFile) -> XmlFile:
+    """A file with its macros expanded, whose elements know where they were written.
+
+    Includes by `$(find PACKAGE)`, `package://` and paths, arguments, conditions, properties and
+    YAML mean what they mean in xacro, since xacro reads them.
+
+    Raises:
+        DescriptionError: xacro is not installed, or refuses the file.
+        InputError: An argument was given that the file does not have.
+    """
+    answer = _run_xacro_process(xml.file)
+    if "missing" in answer:
+        raise DescriptionError(f"{xml.file.name}: {_INSTALL_HINT}")
+    if "wrong" in answer:
+        raise _expansion_error(xml.file, answer)
+    _check_arguments(xml.file, answer["arguments"])
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    root = etree.fromstring(answer["text"].encode("utf-8"), parser)
+    names = [Path(name).name for name in answer["files"]]
+    locations = SourceLocations(xml.file.name)
+    for element in root.iter(etree.Element):
+        number, _, line = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1").partition(
+            ":"
+        )
+        locations.set_location(element, f"{names[int(number)]}:{line}")
+    return XmlFile.from_root(xml.file, root, locations.locations)
+
+
+def _run_xacro_process(file: Path) -> dict[str, Any]:
+    """What the process says."""
+    options = load_options()
+    request = {
+        "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),
+        "arguments": dict(options.arguments),
+    }  # fmt: skip
+    program = [
+        sys.executable,
+        "-P",
+        xacro_process.__file__,
+    ]  # its folder has modules of other names
+    try:
+        completed = subprocess.run(
+            program, input=json.dumps(request).encode(), capture_output=True, timeout=_TIMEOUT
+        )
+        return dict(json.loads(completed.stdout))
+    except subprocess.TimeoutExpired:
+        pass
+    except ValueError:  # it was ended before it could answer
+        pass
+    return {
+        "wrong": f"expanding it takes more than {xacro_process.MAX_SECONDS} s",
+        "file": str(file),
+    }
+
+
+def _expansion_error(file: Path, answer: dict[str, Any]) -> CraneError:
+    location = Path(answer.get("file") or file).name
+    if "line" in answer:
+        location += f":{answer['line']}"
+    if name := answer.get("package"):
+        return DescriptionError(
+            f"{location}: package '{name}' is not found, say where it is: --packages FOLDER, "
+            "packages=[...] in Python"
+        )
+    return DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
+
+
+def _check_arguments(file: Path, known_arguments: list[str]) -> None:
+    for name in load_options().arguments:
+        if name not in (*known_arguments, *OWN_ARGUMENTS):
+            raise InputError(
+                f"{file.name} has no argument '{name}', {suggest_names(known_arguments, name)}"
+            )
+
 
 _SDF_SUFFIXES = (".sdf", ".world")
 _ROBOT_SUFFIXES, _AMBIGUOUS_SUFFIXES = (".urdf", ".xacro", *_SDF_SUFFIXES), (".xml", ".mjcf")

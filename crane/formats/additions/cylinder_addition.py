@@ -1,4 +1,4 @@
-"""A cylinder put between two eyes of a machine: barrel and rod, closed by a loop."""
+"""Add a hydraulic cylinder between two attachment points of a machine, closed by a loop."""
 
 import warnings
 from collections.abc import Sequence
@@ -10,19 +10,52 @@ import numpy as np
 from crane.common.atomic_output import fill_folder, portable_file_name
 from crane.common.errors import CraneWarning, InputError
 from crane.formats.additions.attachment_points import joints_between, parse_attachment_point
-from crane.formats.additions.cylinder_chain import add_barrel_and_rod
-from crane.formats.additions.cylinder_fit import (
+from crane.formats.additions.distance_curve import (
+    DistanceCurve,
+    distance_curve,
     fit_to_joint_range,
     warn_about_masses,
     warn_about_strokes,
 )
-from crane.formats.additions.distance_curve import DistanceCurve, distance_curve
-from crane.formats.additions.drive_replacement import replace_drive
-from crane.formats.additions.output_files import check_files_are_new, machine_file_path
-from crane.formats.additions.steel_cylinder import SteelCylinder
+from crane.formats.additions.loop_addition import check_files_are_new, machine_file_path
+from crane.formats.additions.steel_cylinder import SteelCylinder, add_barrel_and_rod
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.machine_loading import load
 from crane.machine import Machine
+
+
+def replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str | None) -> None:
+    """Name the cylinder as driven, in place of a joint, and drop what belonged to that joint."""
+    active, free = draft.data["active"], draft.data["free"]
+    if joint in active:
+        active[active.index(joint)] = name
+    else:
+        active.append(name)
+    draft.data["free"] = [other for other in free if other != joint]
+    removed = []
+    if draft.data["control"]:
+        draft.data["control"] = {}
+        removed.append("gains")
+    tasks = {key: task for key, task in draft.data["tasks"].items() if "tip" in task}
+    if len(tasks) < len(draft.data["tasks"]):
+        draft.data["tasks"] = tasks
+        removed.append("tasks of active joints")
+    cylinders = draft.data.get("hydraulics", {}).get("cylinders", {})
+    if joint in cylinders:
+        for section in draft.data["hydraulics"].values():
+            section.pop(joint, None)
+        removed.append(f"the hydraulics of {joint}")
+        if not cylinders:
+            del draft.data["hydraulics"]
+    if removed:
+        warnings.warn(
+            f"{machine.name}: {', '.join(removed)} belonged to the active joints as they were, "
+            f"left "
+            "out: write those of the new ones",
+            CraneWarning,
+            stacklevel=4,
+        )
+
 
 _NAME_SUFFIXES = (
     "", "_base", "_barrel", "_cross", "_rod", "_eye", "_pin", "_pin_y", "_pin_z", "_attachment",

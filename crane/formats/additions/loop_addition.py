@@ -1,4 +1,4 @@
-"""The loops that a description leaves open, put into a machine file."""
+"""Add the loops that a description leaves open to a machine file."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -6,16 +6,41 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from crane.common.atomic_output import fill_folder, portable_file_name
-from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError
+from crane.common.atomic_output import check_file_is_writable, fill_folder, portable_file_name
+from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError, OutputError
 from crane.common.package_search import use_load_options
 from crane.description import MachineSpec
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
-from crane.formats.additions.output_files import check_files_are_new, machine_file_path
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.machine_loading import load
 from crane.machine import Machine
+
+
+def machine_file_path(out: str | Path | None, default: str) -> Path:
+    """The machine file to write.
+
+    Raises:
+        InputError: It has another suffix.
+        OutputError: It cannot be written.
+    """
+    file = Path(default if out is None else out)
+    if file.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"{file}: a machine file is written, let its name end in .yaml")
+    check_file_is_writable(file)
+    return file
+
+
+def check_files_are_new(draft: MachineDraft, file: Path, force: bool) -> None:
+    """See that no file is replaced that should not be.
+
+    Raises:
+        OutputError: One is there already.
+    """
+    for relative_path in draft.file_paths(file.name):
+        target = file.parent / relative_path
+        if target.exists() and not force:
+            raise OutputError(f"{target}: exists already, choose another name or add --force")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Numbers that can be, and hardly are: other units than SI, inertias that do not fit the drawing.
+"""Warnings about values that are possible but unlikely: wrong units, inertias that do not fit.
 
-The radius of gyration of a body is at most half of its size. Published arms exceed that sevenfold,
-perhaps because only part of a body is drawn. What is said here is beyond that.
+The radius of gyration of a body is at most half of its size. Published robot models exceed that up
+to sevenfold, perhaps because only a part of the body is drawn, so the bounds are wider.
 """
 
 import math
@@ -15,9 +15,30 @@ from crane.common.errors import CraneWarning
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description import MachineSpec, inertia_problem
-from crane.formats.check.link_bounds import Bounds, bounds_by_link, read_numbers
-from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, read_shapes
+from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
+
+Bounds = tuple[Array, Array]
+
+
+def read_numbers(element: etree._Element | None, key: str, count: int) -> Array | None:
+    """Finite numbers of an attribute; None where they are not."""
+    text = None if element is None else element.get(key)
+    try:
+        found = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        return None
+    return found if found.shape == (count,) and np.isfinite(found).all() else None
+
+
+def bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
+    """By link the lowest and highest corner (3,) of what is drawn on it, in its frame [m]."""
+    corners: dict[str, list[Array]] = {}
+    for visual in visuals:
+        corners.setdefault(visual.link, []).append(visual.bounding_corners())
+    points = {link: np.concatenate(found) for link, found in corners.items()}
+    return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
+
 
 _REVOLUTION = 2 * math.pi
 _NO_LIMIT = 3600.0  # [rad] from which on limits stand for none, in whatever unit

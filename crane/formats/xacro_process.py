@@ -1,6 +1,6 @@
 """A process that expands a xacro file: whatever is in it can end this process, and nothing else.
 
-Run by crane.formats.xacro.xacro_expansion with what it needs as JSON on its input; it writes a
+Run by crane.formats.robot_files with what it needs as JSON on its input; it writes a
 line of JSON. xacro computes with Python's expressions, without bounds, so time and memory are
 limited.
 
