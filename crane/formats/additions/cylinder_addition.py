@@ -25,7 +25,7 @@ from crane.machine import Machine
 
 
 def replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str | None) -> None:
-    """Name the cylinder as driven, in place of a joint, and drop what belonged to that joint."""
+    """Make a cylinder a drive in place of a joint, and remove sections of that joint."""
     active, free = draft.data["active"], draft.data["free"]
     if joint in active:
         active[active.index(joint)] = name
@@ -50,8 +50,7 @@ def replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str |
     if removed:
         warnings.warn(
             f"{machine.name}: {', '.join(removed)} belonged to the active joints as they were, "
-            f"left "
-            "out: write those of the new ones",
+            "left out: write those of the new ones",
             CraneWarning,
             stacklevel=4,
         )
@@ -64,23 +63,22 @@ _NAME_SUFFIXES = (
 
 @dataclass(frozen=True)
 class AddedCylinder:
-    """What was added, and what it does.
+    """A cylinder that was added to a machine.
 
     Attributes:
         path: The machine file.
-        name: Of the cylinder and its active joint, the stroke.
+        name: Name of the cylinder and of its active joint, the stroke.
         joint: The joint that it drives.
-        shares_load: Whether it shares the load with what drove the joint before, else in its
-            place.
-        unit: Of the joint.
-        limits: Of the joint, or what was looked at where it has none.
-        driven_range: Part of them that the stroke reaches.
-        length_range: (2,) least and largest distance of the eyes over `limits` [m].
+        shares_load: Whether the previous drive of the joint remains and shares the load.
+        unit: Unit of the joint's coordinate.
+        limits: Limits of the joint, or the examined range of a joint without limits.
+        driven_range: Part of the limits that the stroke reaches.
+        length_range: (2,) least and largest distance of the attachment points over `limits` [m].
         stroke_range: (2,) of the cylinder at both ends of `driven_range` [m].
-        lever_arm_range: (2,) least and largest lever arm over `driven_range` [m], of a slide a
-            ratio.
-        masses: Of barrel and rod [kg].
-        notes: What was assumed.
+        lever_arm_range: (2,) least and largest lever arm over `driven_range` [m]; a ratio for a
+            prismatic joint.
+        masses: Masses of barrel and rod [kg].
+        notes: Assumptions that were made.
     """
 
     path: Path
@@ -97,15 +95,15 @@ class AddedCylinder:
     notes: tuple[str, ...]
 
     def __str__(self) -> str:
-        """A few lines."""
+        """Return a few lines about the cylinder."""
         verb_phrase = "shares the load on" if self.shares_load else "drives"
         lever_arm_name = "lever arm" if self.unit == "rad" else "ratio"
         lines = [
             f"{self.name} {verb_phrase} {self.joint} from {self.driven_range[0]:.4g} to "
             f"{self.driven_range[1]:.4g} {self.unit}, with {self.stroke_range[0]:.4g} to "
             f"{self.stroke_range[1]:.4g} m of its stroke, {lever_arm_name} "
-            f"{self.lever_arm_range[0]:.3g} to "
-            f"{self.lever_arm_range[1]:.3g}{' m' * (self.unit == 'rad')}",
+            f"{self.lever_arm_range[0]:.3g} to {self.lever_arm_range[1]:.3g}"
+            f"{' m' * (self.unit == 'rad')}",
             f"barrel {self.masses[0]:.4g} kg, rod {self.masses[1]:.4g} kg of steel, without oil",
             *self.notes,
             f"written to {self.path}",
@@ -125,31 +123,33 @@ def add_cylinder(
     out: str | Path | None = None,
     force: bool = False,
 ) -> AddedCylinder:
-    """Put a cylinder between two points of a machine, and write the closed machine.
+    """Add a cylinder between two points of a machine, and write the closed machine.
 
-    The stroke becomes an active joint in place of the joint that it determines. Where the joints
-    between the two bodies move in one plane and the eyes lie in it, the barrel turns about an axis
-    normal to it and the rod's eye is a revolute loop; else the barrel has a universal joint and
-    the rod's eye a spherical one, so that the rod does not spin.
+    The stroke becomes an active joint in place of the joint that it determines. If the joints
+    between the two bodies move in one plane that contains the attachment points, the barrel has a
+    revolute joint about the normal and the rod is closed by a revolute loop. Otherwise the barrel
+    has a universal joint and the rod is closed by a spherical loop, so that the rod does not spin.
 
     Args:
         machine: As for `load`.
-        between: Eyes of barrel and rod: LINK, or LINK:x,y,z with metres in the link's frame.
+        between: Attachment points of barrel and rod: LINK, or LINK:x,y,z with metres in the link's
+            frame.
         bore: Diameter of the piston [m].
         rod: Diameter of the rod [m].
         stroke: [m].
-        name: Of the cylinder: its stroke, chain and loop; its links have it in front.
-        dead_length: Pin to pin with the rod in [m]; stroke and four bores if not given.
-        out: The machine file to write, its URDFs go to a folder beside of the same name without
-            suffix; MACHINE_NAME.yaml in this folder if not given.
-        force: Whether files that are there are replaced.
+        name: Name of the cylinder: of its stroke, chain and loop, and prefix of its links.
+        dead_length: Length between the pins with the rod retracted [m]; stroke plus four bores if
+            not given.
+        out: The machine file to write; its URDFs go to a folder of the same name without suffix;
+            MACHINE_NAME.yaml in the working folder if not given.
+        force: Whether to replace existing files.
 
     Returns:
-        What was added; `path` is the machine file, for `load`.
+        The added cylinder; `path` is the machine file, for `load`.
 
     Raises:
-        InputError: The cylinder is none, its eyes are not there, or it does not fit between them.
-        OutputError: The files cannot be written, or are there already.
+        InputError: A dimension is invalid, a point is unknown, or the cylinder does not fit.
+        OutputError: The files cannot be written, or exist already.
     """
     cylinder = SteelCylinder.from_dimensions(bore, rod, stroke, dead_length)
     if isinstance(between, str) or len(between) != 2:
@@ -174,7 +174,7 @@ def add_cylinder(
         draft.write(output_folder, file.name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
-            closed = load(output_folder / file.name)  # what does not load is not left behind
+            closed = load(output_folder / file.name)  # a file that does not load is not kept
         warn_about_strokes(closed, name)
     warn_about_masses(loaded, cylinder, distances.joint)
     return _added_cylinder(
@@ -183,7 +183,7 @@ def add_cylinder(
 
 
 def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool) -> list[str]:
-    """What was chosen: the joint that is driven, the posture to begin from."""
+    """Return notes on the choice of the driven joint and of the home configuration."""
     notes = []
     if distances.alternative_joints and not shares_load:
         notes.append(
@@ -194,7 +194,7 @@ def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool)
     if start_index != distances.home_index:
         notes.append(
             f"home: {distances.joint} at {distances.values[start_index]:.4g}, where the "
-            f"cylinder fits"
+            "cylinder fits"
         )
     return notes
 
@@ -209,7 +209,7 @@ def _added_cylinder(
     shares_load: bool,
     notes: Sequence[str],
 ) -> AddedCylinder:
-    """The result, from the postures that the cylinder reaches."""
+    """Return the result, from the configurations that the cylinder reaches."""
     lever_arms = np.abs(reached_distances.lever_arms)
     strokes = np.clip(
         reached_distances.length[[0, -1]] - cylinder.retracted_length, 0, cylinder.stroke
@@ -238,6 +238,5 @@ def _check_names_are_free(machine: Machine, name: str) -> None:
         if name + suffix in used_names:
             raise InputError(
                 f"'{name}{suffix}' is a part of '{machine.name}' already, give the cylinder "
-                f"another "
-                "name with --name"
+                "another name with --name"
             )

@@ -18,10 +18,10 @@ from crane.machine import Machine
 
 
 def machine_file_path(out: str | Path | None, default: str) -> Path:
-    """The machine file to write.
+    """Return the machine file to write.
 
     Raises:
-        InputError: It has another suffix.
+        InputError: The path has another suffix.
         OutputError: It cannot be written.
     """
     file = Path(default if out is None else out)
@@ -32,10 +32,10 @@ def machine_file_path(out: str | Path | None, default: str) -> Path:
 
 
 def check_files_are_new(draft: MachineDraft, file: Path, force: bool) -> None:
-    """See that no file is replaced that should not be.
+    """Raise if a file exists that would be replaced without `force`.
 
     Raises:
-        OutputError: One is there already.
+        OutputError: A file exists already.
     """
     for relative_path in draft.file_paths(file.name):
         target = file.parent / relative_path
@@ -45,13 +45,13 @@ def check_files_are_new(draft: MachineDraft, file: Path, force: bool) -> None:
 
 @dataclass(frozen=True)
 class AddedLoops:
-    """Loops that were taken over.
+    """Loops that were added to a machine.
 
     Attributes:
         path: The machine file.
-        loops: As they were proposed.
+        loops: The loops as proposed.
         active: Joints that drive the closed machine.
-        mobility: Its degrees of freedom.
+        mobility: Degrees of freedom of the closed machine.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class AddedLoops:
     mobility: int
 
     def __str__(self) -> str:
-        """A few lines."""
+        """Return a few lines about the loops."""
         lines = [str(proposal) for proposal in self.loops]
         driven_text = ", ".join(self.active)
         lines.append(f"{self.mobility} degrees of freedom, driven by {driven_text or 'nothing'}")
@@ -75,16 +75,16 @@ def add_loops(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
 ) -> AddedLoops:
-    """Close the loops that `crane check` proposes, and write the closed machine.
+    """Add the loops that `crane check` proposes, and write the closed machine.
 
-    Active joints and home are those that the file names; what it leaves open is chosen as for any
-    machine and written down.
+    Active joints and home are those of the file; missing ones are chosen as for any machine and
+    written to the file.
 
     Args:
         machine: As for `load`.
-        out: The machine file to write, its URDFs go to a folder beside of the same name without
-            suffix; NAME_closed.yaml in this folder if not given.
-        force: Whether files that are there are replaced.
+        out: The machine file to write; its URDFs go to a folder of the same name without suffix;
+            NAME_closed.yaml in the working folder if not given.
+        force: Whether to replace existing files.
         packages: As for `load`.
         arguments: As for `load`.
 
@@ -92,9 +92,9 @@ def add_loops(
         The loops, the active joints, and the file that was written.
 
     Raises:
-        InputError: Nothing is left open.
+        InputError: The machine has no open loops.
         MechanismError: The machine does not close with them.
-        OutputError: The files cannot be written, or are there already.
+        OutputError: The files cannot be written, or exist already.
     """
     loaded, spec = _load_open_machine(machine, packages, arguments)
     proposed_loops = propose_loops(spec, loaded.model, loaded.home)
@@ -129,7 +129,7 @@ def _load_open_machine(
     packages: Sequence[str | Path],
     arguments: Mapping[str, object] | None,
 ) -> tuple[Machine, MachineSpec]:
-    """The open machine, whose loops are not worth a warning any more, and as it was read."""
+    """Load the open machine without warnings, and return it with its description."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         loaded = load(machine, packages=packages, arguments=arguments)

@@ -1,4 +1,4 @@
-"""A hydraulic cylinder of steel: its masses and what is drawn, from bore, rod and stroke."""
+"""Hydraulic cylinders of steel: masses and shapes from bore, rod and stroke, links and loop."""
 
 import math
 import warnings
@@ -28,28 +28,26 @@ from crane.formats.urdf_elements import add_joint, add_link, format_numbers
 from crane.machine import Machine
 
 STEEL_DENSITY = 7850.0  # [kg/m3]
-RELIEF_PRESSURE = (
-    35e6  # [Pa] of a mobile machine's relief valve: with the bore the effort of the joint
-)
-_WALL_SHARE = 0.1  # of the tube, as a share of the bore: 35 MPa stress its steel by 35 / 0.2 MPa
+RELIEF_PRESSURE = 35e6  # [Pa] usual in mobile machines; determines the effort of the joint
+_WALL_SHARE = 0.1  # of the bore: at 35 MPa the stress in the tube is 35 / 0.2 MPa
 
 
 @dataclass(frozen=True)
 class SteelCylinder:
-    """A tube with a cap at its eye and a gland at the other end, a rod with a piston.
+    """A tube with a cap at its eye and a gland at the other end, and a rod with a piston.
 
-    Cap, piston, gland and what of the rod stays outside are each `part_length` long, which is one
-    bore, or a fourth of what the retracted cylinder has beside its stroke where that is less. The
-    tube's wall is a tenth of the bore, all is steel of 7850 kg/m3, oil is left out.
+    Cap, piston, gland and the outer part of the rod have the length `part_length` each: one bore,
+    or a fourth of the retracted length without the stroke if that is less. The wall of the tube is
+    a tenth of the bore. All parts are steel of 7850 kg/m3; oil is neglected.
 
     Attributes:
-        bore: D, of the tube inside [m].
+        bore: D, inner diameter of the tube [m].
         rod: d, diameter of the rod [m].
         stroke: S [m].
-        retracted_length: L0, pin to pin with the rod in [m]; S + 4 D where it is not said.
+        retracted_length: L0, pin to pin with the rod retracted [m]; S + 4 D by default.
 
     Raises:
-        InputError: A length is not positive, or they do not fit into each other.
+        InputError: A length is not positive, or the parts do not fit into each other.
     """
 
     bore: float
@@ -66,15 +64,14 @@ class SteelCylinder:
         if self.retracted_length <= self.stroke:
             raise InputError(
                 f"the dead length of {self.retracted_length:g} m is pin to pin with the rod in, "
-                f"it has "
-                f"to be more than the stroke of {self.stroke:g} m"
+                f"it has to be more than the stroke of {self.stroke:g} m"
             )
 
     @classmethod
     def from_dimensions(
         cls, bore: float, rod: float, stroke: float, dead_length: float | None = None
     ) -> "SteelCylinder":
-        """A cylinder from numbers of a user."""
+        """Return a cylinder from dimensions of a user, which are checked."""
         dimensions = {"bore": bore, "rod": rod, "stroke": stroke}
         if dead_length is not None:
             dimensions["dead length"] = dead_length
@@ -95,7 +92,7 @@ class SteelCylinder:
 
     @property
     def part_length(self) -> float:
-        """Length of cap, piston, gland and the rod outside [m]."""
+        """Length of cap, piston, gland and the outer part of the rod [m]."""
         return min(self.bore, (self.retracted_length - self.stroke) / 4)
 
     @property
@@ -105,7 +102,7 @@ class SteelCylinder:
 
     @property
     def barrel_inertial(self) -> Inertial:
-        """Of tube, cap and gland; x from its eye to the rod's."""
+        """Inertial of tube, cap and gland; x points from the barrel's eye to the rod's."""
         barrel_end, part = self.retracted_length - self.part_length, self.part_length
         return _total_inertial(
             _tube_inertia(0, barrel_end, self.bore, (1 + 2 * _WALL_SHARE) * self.bore),
@@ -115,7 +112,7 @@ class SteelCylinder:
 
     @property
     def rod_inertial(self) -> Inertial:
-        """Of rod and piston; x as the barrel's, from the rod's eye."""
+        """Inertial of rod and piston in the rod's eye, with x as for the barrel."""
         back = 2 * self.part_length - self.retracted_length
         return _total_inertial(
             _tube_inertia(back, 0, 0, self.rod),
@@ -123,7 +120,7 @@ class SteelCylinder:
         )
 
     def add_visuals(self, barrel_link: etree._Element, rod_link: etree._Element) -> None:
-        """Put cylinders of the true diameters into two `<link>`s."""
+        """Add cylinders of the true diameters to two `<link>` elements."""
         _add_cylinder_visual(
             barrel_link,
             0,
@@ -134,7 +131,7 @@ class SteelCylinder:
 
 
 def _tube_inertia(start: float, end: float, inner: float, outer: float) -> pin.Inertia:
-    """Inertia of a tube along x between two places, with these diameters [m]."""
+    """Return the inertia of a tube along x with two diameters [m]."""
     length, squares = end - start, (inner**2 + outer**2) / 4
     mass = STEEL_DENSITY * math.pi / 4 * (outer**2 - inner**2) * length
     transverse_moment = mass * (3 * squares + length**2) / 12
@@ -168,10 +165,8 @@ def _add_cylinder_visual(link: etree._Element, start: float, end: float, diamete
     )
 
 
-_OFFSET_TOLERANCE = 1e-6  # share of a cylinder's length that is none
-_PARALLEL_TOLERANCE = (
-    1e-9  # sine of an angle that is none: what is less exact gets a universal joint
-)
+_OFFSET_TOLERANCE = 1e-6  # relative to the cylinder's length
+_PARALLEL_TOLERANCE = 1e-9  # sine of an angle; a larger deviation gets a universal joint
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -183,7 +178,11 @@ def add_barrel_and_rod(
     cylinder: SteelCylinder,
     q: Array,
 ) -> list[str]:
-    """Barrel and rod as a chain, the loop that closes it, and the home posture q (nq,)."""
+    """Add barrel and rod as a chain with its loop and the home configuration q (nq,).
+
+    Returns:
+        Notes on changes of the attachment points.
+    """
     notes = []
     axis_vector = vector_between(machine, points, q)
     normal = _plane_normal(machine, points, q, axis_vector)
@@ -203,7 +202,7 @@ def add_barrel_and_rod(
     rotation = np.column_stack(
         [axis_direction, pin_direction, np.cross(axis_direction, pin_direction)]
     )
-    barrel_placement, rod_placement = (eye.placement(machine, q) for eye in points)
+    barrel_placement, rod_placement = (point.placement(machine, q) for point in points)
     barrel_frame = pin.SE3(rotation, barrel_placement.translation)
     rod_frame = pin.SE3(rotation, barrel_placement.translation + axis_vector)
     base_in_link = pin.SE3(np.eye(3), np.array(points[0].point)) * barrel_placement.actInv(
@@ -234,7 +233,7 @@ def add_barrel_and_rod(
 def _plane_normal(
     machine: Machine, points: Sequence[AttachmentPoint], q: Array, axis_vector: Array
 ) -> Array | None:
-    """(3,) normal of the plane in which two bodies move against each other, None for space."""
+    """Return the normal (3,) of the plane of relative motion of two bodies, None if spatial."""
     data = machine.model.createData()
     configuration = machine.coordinates.configuration(q)
     jacobian = pin.computeJointJacobians(machine.model, data, configuration).reshape(6, -1)
@@ -261,7 +260,7 @@ def _plane_normal(
 def _add_rod_eye_frame(
     robot: etree._Element, name: str, link: str, eye_placement: pin.SE3
 ) -> None:
-    """A frame of a link for the rod's eye."""
+    """Add a frame for the rod's eye to a link."""
     xyz, rpy = xyz_rpy_from_se3(eye_placement)
     add_link(robot, Link(f"{name}_eye", ""))
     add_joint(robot, Joint(f"{name}_eye", "fixed", link, f"{name}_eye", "", xyz, rpy))
@@ -270,7 +269,7 @@ def _add_rod_eye_frame(
 def _cylinder_urdf(
     name: str, cylinder: SteelCylinder, base_placement: pin.SE3, is_planar: bool
 ) -> etree._Element:
-    """The URDF of barrel and rod; x points from the barrel's eye to the rod's, y is a pin."""
+    """Return the URDF of barrel and rod; x points from the barrel's eye to the rod's."""
     robot = etree.Element("robot", name=name)
     barrel, cross, rod = (f"{name}_{part}" for part in ("barrel", "cross", "rod"))
     xyz, rpy = xyz_rpy_from_se3(base_placement)
