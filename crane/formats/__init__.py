@@ -1,4 +1,4 @@
-"""Machines from files and into them: machine file, URDF, MJCF, parallel robots, meshes."""
+"""Readers and writers of machines: machine file, URDF, SDF, MJCF, parallel robots, meshes."""
 
 from crane.formats.home_writer import write_home
 from crane.formats.machine_file.machine_reader import read_machine_spec

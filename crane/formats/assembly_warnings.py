@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -29,21 +28,21 @@ _MAX_LISTED = 4
 def check_home(
     spec: MachineSpec, closure: Closure, initial_guess: Array, is_modified: bool = False
 ) -> None:
-    """Refuse a home that is another one than the file says, and warn of one that was sought.
+    """Raise if home differs too much from the initial guess of the file, and warn if it was searched.
 
-    A home is another one where the link of a joint that the file names is turned by more than 0.5
-    rad from what it says, or slid by more than half of the machine's size. Of a machine whose
-    numbers were changed it is another one if besides a loop is assembled the other way round: what
-    its file says is of the machine as it was. The argument NEAREST_ASSEMBLY accepts it anyway.
+    Home differs too much if the link of a joint that the file specifies is rotated by more than
+    0.5 rad or translated by more than half of the characteristic length. If parameters were
+    changed, the file describes the original machine, so a loop must also have changed its assembly
+    mode. The load argument NEAREST_ASSEMBLY accepts the home anyway.
 
     Args:
         spec: The machine as read.
         closure: Its loops, closed at home.
-        initial_guess: (nq,) what they were closed from.
-        is_modified: Whether its numbers are others than those of its file.
+        initial_guess: (nq,) configuration from which they were closed.
+        is_modified: Whether parameters differ from those of the file.
 
     Raises:
-        MechanismError: It is another one.
+        MechanismError: Home differs too much.
     """
     search = closure.home_search
     if search is not None:
@@ -64,13 +63,13 @@ def check_home(
 def add_remedy(
     spec: MachineSpec, model: pin.Model, initial_guess: Array, error: OpenLoopError
 ) -> OpenLoopError:
-    """The error about a loop that does not close, with a number that would let it close.
+    """Return the error about an open loop, with a parameter change that would close it if there is one.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        initial_guess: (nq,) home as the file says it.
-        error: As it was raised.
+        initial_guess: (nq,) home of the file.
+        error: The original error.
     """
     geometry_misfit = misfit(spec, model, initial_guess)
     if geometry_misfit is None or not geometry_misfit.remedies:
@@ -148,8 +147,7 @@ def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
     )
     return (
         f"{location}: loop '{loop}' closes but for digits: its surplus equations stay open by "
-        f"up to "
-        f"{gap}{share_text}, while the others are closed; write axes, angles and pins with more "
+        f"up to {gap}{share_text}, while the others are closed; write axes, angles and pins with more "
         f"digits"
     )
 
@@ -159,34 +157,30 @@ def _list_names(names: Sequence[str]) -> str:
     return ", ".join(names[:_MAX_LISTED]) + (f" and {remaining} more" if remaining > 0 else "")
 
 
-_MAX_LISTED, _MAX_COORDINATES = 4, 6  # loops and coordinates in a line
-_QUICK_STARTS, _THOROUGH_STARTS = (
-    6,
-    100,
-)  # starts of the search in one block: milliseconds, up to a second
+_MAX_LISTED, _MAX_COORDINATES = 4, 6  # loops and coordinates in a message
+# starts of the search in one block; they take milliseconds, and up to a second
+_QUICK_STARTS, _THOROUGH_STARTS = 6, 100
 
 
 def warn_about_assembly_modes(
     spec: MachineSpec, closure: Closure, initial_guess: Array, thorough: bool = False
 ) -> None:
-    """Warn of loops that are assembled one way though the file may mean another.
+    """Warn of loops that have another assembly mode that the file does not exclude.
 
     Args:
         spec: The machine as read.
         closure: Its loops, closed at home.
-        initial_guess: (nq,) what they were closed from, see `home_initial_guess`.
-        thorough: Whether to search long, and to tell all; else the first and how many there are.
+        initial_guess: (nq,) configuration from which they were closed, see `home_initial_guess`.
+        thorough: Whether to search long and report all; else the first and the number of others.
     """
     if not len(closure.passive):
         return
     is_from_simulator = is_simulator_file(spec.path)
     names = closure.equations.coordinates.names
-    specified_columns = [
-        i for i, name in enumerate(names) if is_from_simulator or name in spec.home
-    ]
+    is_specified = [is_from_simulator or name in spec.home for name in names]
     max_starts = _THOROUGH_STARTS if thorough else _QUICK_STARTS
     alternatives = find_alternative_assembly_modes(
-        closure, initial_guess, np.array(specified_columns, dtype=np.intp), max_starts
+        closure, initial_guess, np.flatnonzero(is_specified), max_starts
     )
     remainder = ""
     if len(alternatives) > 1 and not thorough:
@@ -199,7 +193,7 @@ def warn_about_assembly_modes(
 
 
 def alternative_configurations(machine: Machine) -> list[Array]:
-    """Other postures (nq,) that its file does not rule out, as `crane check` tells them."""
+    """Return the configurations (nq,) of other assembly modes, as `crane check` reports them."""
     closure = machine.closure
     if not len(closure.passive):
         return []
@@ -235,7 +229,7 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
         else deviation_text(alternative.home_deviation)
     )
     columns = [int(i) for i in alternative.changed_columns]
-    if len(columns) > _MAX_COORDINATES:  # those that tell the assemblies apart best
+    if len(columns) > _MAX_COORDINATES:  # with the largest differences
         differences = np.abs(closure.home - alternative.q)[columns]
         columns = [columns[i] for i in np.argsort(-differences, kind="stable")[:_MAX_LISTED]]
     home_values, alternative_values = (
@@ -244,29 +238,23 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
     )
     return (
         f"{location}: loop{'s' * (len(alternative.loops) > 1)} {loops} can be assembled another "
-        f"way at "
-        f"home, and the file does not say which is meant; {_home_element_text(spec)} write "
-        f"{alternative_values} for the "
-        f"other ({deviation_text(alternative.largest_deviation)}) or {home_values} to keep this "
+        f"way at home, and the file does not say which is meant; {_home_element_text(spec)} write "
+        f"{alternative_values} for the other ({deviation_text(alternative.largest_deviation)}) or {home_values} to keep this "
         f"one ({home_text} what it says)"
     ).replace("limits what it says", "limits")
 
 
 def _home_element_text(spec: MachineSpec) -> str:
-    """Where a file says how its machine is at home."""
-    if _is_yaml_file(spec.path):
+    """Return the name of the section or element of a file that contains home."""
+    if spec.path.suffix.lower() in (".yaml", ".yml"):
         return "under 'home:'"
     if is_sdf_file(spec.path):
         return "in <initial_position> of axes"
     return 'in <group_state name="home">' if is_robot_file(spec.path) else "in the key 'home'"
 
 
-def _is_yaml_file(path: Path) -> bool:
-    return path.suffix.lower() in (".yaml", ".yml")
-
-
 def _coordinates_text(spec: MachineSpec, names: Sequence[str], values: Array) -> str:
-    """Coordinates as a file has them."""
+    """Return coordinates in the syntax of the file."""
     pattern = (
         '<joint name="{}" value="{:.4g}"/>'
         if spec.path.suffix in (".urdf", ".xacro")

@@ -29,11 +29,11 @@ from crane.machine import Machine
 _XACRO_NAMESPACE = "http://www.ros.org/wiki/xacro"
 _INSTALL_HINT = f"is written with xacro, {installation_hint('xacro')}"
 _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
-_TIMEOUT = 10 * xacro_process.MAX_SECONDS  # [s], for systems that do not limit computing
+_TIMEOUT = 10 * xacro_process.MAX_SECONDS  # [s], for systems without CPU limits
 
 
 def needs_xacro(xml: XmlFile) -> bool:
-    """Whether a file has elements of xacro, or is called .xacro."""
+    """Whether a file has elements of xacro, or the suffix .xacro."""
     if xml.file.suffix.lower() == ".xacro":
         return True
     return any(
@@ -43,14 +43,14 @@ def needs_xacro(xml: XmlFile) -> bool:
 
 
 def expand_xacro(xml: XmlFile) -> XmlFile:
-    """A file with its macros expanded, whose elements know where they were written.
+    """Return a file with its macros expanded and the source locations of its elements.
 
-    Includes by `$(find PACKAGE)`, `package://` and paths, arguments, conditions, properties and
-    YAML mean what they mean in xacro, since xacro reads them.
+    xacro itself processes includes by `$(find PACKAGE)`, `package://` and paths, arguments,
+    conditions, properties and YAML.
 
     Raises:
         DescriptionError: xacro is not installed, or refuses the file.
-        InputError: An argument was given that the file does not have.
+        InputError: The file does not have one of the given arguments.
     """
     answer = _run_xacro_process(xml.file)
     if "missing" in answer:
@@ -71,30 +71,21 @@ def expand_xacro(xml: XmlFile) -> XmlFile:
 
 
 def _run_xacro_process(file: Path) -> dict[str, Any]:
-    """What the process says."""
+    """Return the answer of the process."""
     options = load_options()
     request = {
         "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),
         "arguments": dict(options.arguments),
     }  # fmt: skip
-    program = [
-        sys.executable,
-        "-P",
-        xacro_process.__file__,
-    ]  # its folder has modules of other names
+    program = [sys.executable, "-P", xacro_process.__file__]  # without its folder in sys.path
     try:
         completed = subprocess.run(
             program, input=json.dumps(request).encode(), capture_output=True, timeout=_TIMEOUT
         )
         return dict(json.loads(completed.stdout))
-    except subprocess.TimeoutExpired:
-        pass
-    except ValueError:  # it was ended before it could answer
-        pass
-    return {
-        "wrong": f"expanding it takes more than {xacro_process.MAX_SECONDS} s",
-        "file": str(file),
-    }
+    except (subprocess.TimeoutExpired, ValueError):  # killed before it could answer
+        reason = f"expanding it takes more than {xacro_process.MAX_SECONDS} s"
+        return {"wrong": reason, "file": str(file)}
 
 
 def _expansion_error(file: Path, answer: dict[str, Any]) -> CraneError:
@@ -126,8 +117,8 @@ class RobotDocument:
     """A robot as URDF.
 
     Attributes:
-        xml: Its elements, each with the place where it was written.
-        springs: What URDF has no place for.
+        xml: Its elements with their source locations.
+        springs: Springs, which URDF does not have.
     """
 
     xml: XmlFile
@@ -135,10 +126,10 @@ class RobotDocument:
 
 
 def open_robot(file: Path) -> RobotDocument:
-    """The robot of a file.
+    """Return the robot of a file as URDF.
 
     Raises:
-        DescriptionError: It cannot be read, expanded or translated.
+        DescriptionError: The file cannot be read, expanded or translated.
     """
     xml = XmlFile(file)
     if needs_xacro(xml):
@@ -146,14 +137,14 @@ def open_robot(file: Path) -> RobotDocument:
     if file.suffix.lower() in _SDF_SUFFIXES and xml.root.tag not in ("sdf", "robot"):
         raise xml.error_at(xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>")
     if xml.root.tag == "sdf":
-        from crane.formats.sdf.sdf_translation import translate_to_urdf  # most files are none
+        from crane.formats.sdf.sdf_translation import translate_to_urdf  # few files are SDF
 
         return RobotDocument(*translate_to_urdf(xml))
     return RobotDocument(xml)
 
 
 def is_robot_file(file: Path) -> bool:
-    """Whether a file is XML that holds a robot and no MuJoCo model."""
+    """Whether a file is XML with a robot and not a MuJoCo model."""
     suffix = file.suffix.lower()
     if suffix in _AMBIGUOUS_SUFFIXES:
         return XmlFile(file).root.tag in ("robot", "sdf")
@@ -167,7 +158,7 @@ def is_sdf_file(file: Path) -> bool:
 
 
 def is_simulator_file(file: Path) -> bool:
-    """Whether a file is SDF or MJCF: it says all joints at home, and is not written into."""
+    """Whether a file is SDF or MJCF, which give all coordinates of home and are not changed."""
     if file.suffix.lower() in (".yaml", ".yml"):
         return False
     return is_sdf_file(file) or not is_robot_file(file)
@@ -175,7 +166,7 @@ def is_simulator_file(file: Path) -> bool:
 
 @contextmanager
 def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterator[list[XmlFile]]:
-    """The robots that a machine was made of, while its packages are known; of MJCF there are none.
+    """Yield the robots that a machine was made of, with its load options active; MJCF has none.
 
     Args:
         machine: The machine.
@@ -183,7 +174,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
     """
     chain_names = None if chains is None else set(chains)
     with use_load_options(machine.packages, machine.arguments):
-        with warnings.catch_warnings():  # which were told when it was loaded
+        with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [
                 open_robot(chain.urdf).xml
