@@ -28,7 +28,7 @@ _MAX_LISTED = 4
 def check_home(
     spec: MachineSpec, closure: Closure, initial_guess: Array, is_modified: bool = False
 ) -> None:
-    """Raise if home differs too much from the initial guess of the file, and warn if it was searched.
+    """Raise if home differs too much from that of the file, and warn if it was searched.
 
     Home differs too much if the link of a joint that the file specifies is rotated by more than
     0.5 rad or translated by more than half of the characteristic length. If parameters were
@@ -63,7 +63,7 @@ def check_home(
 def add_remedy(
     spec: MachineSpec, model: pin.Model, initial_guess: Array, error: OpenLoopError
 ) -> OpenLoopError:
-    """Return the error about an open loop, with a parameter change that would close it if there is one.
+    """Return the error about an open loop, with a parameter change that would close it, if any.
 
     Args:
         spec: The machine as read.
@@ -147,8 +147,8 @@ def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
     )
     return (
         f"{location}: loop '{loop}' closes but for digits: its surplus equations stay open by "
-        f"up to {gap}{share_text}, while the others are closed; write axes, angles and pins with more "
-        f"digits"
+        f"up to {gap}{share_text}, while the others are closed; write axes, angles and pins with "
+        "more digits"
     )
 
 
@@ -239,8 +239,8 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
     return (
         f"{location}: loop{'s' * (len(alternative.loops) > 1)} {loops} can be assembled another "
         f"way at home, and the file does not say which is meant; {_home_element_text(spec)} write "
-        f"{alternative_values} for the other ({deviation_text(alternative.largest_deviation)}) or {home_values} to keep this "
-        f"one ({home_text} what it says)"
+        f"{alternative_values} for the other ({deviation_text(alternative.largest_deviation)}) or "
+        f"{home_values} to keep this one ({home_text} what it says)"
     ).replace("limits what it says", "limits")
 
 

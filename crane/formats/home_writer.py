@@ -34,7 +34,7 @@ def write_home(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
 ) -> Path:
-    """Write the closed home configuration of a machine into its file, all joints in full precision.
+    """Write the closed home configuration of a machine into its file in full precision.
 
     This also accepts a home that is far from the home of the file, which `load` refuses. In a
     machine file and a robot.yaml home is the section `home:`, in a URDF `<group_state

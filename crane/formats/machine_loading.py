@@ -141,7 +141,7 @@ class MachineVariants:
         return variant
 
     def perturbed_machine(self, changes: Mapping[str, float]) -> Machine:
-        """Return the machine with parameters changed so little that its loops have the same structure.
+        """Return the machine with parameters changed so little that its loops stay the same.
 
         No warnings are issued; see `Closure.perturbed_machine`.
         """

@@ -39,7 +39,7 @@ def is_parallel_robot(file: Path) -> bool:
 
 
 def read_parallel_robot(path: Path) -> MachineSpec:
-    """Read a machine from its YAML file and the URDF of the same stem, or robot.urdf, in its folder.
+    """Read a machine from its YAML file and the URDF of the same stem, or robot.urdf, beside it.
 
     Raises:
         DescriptionError: A file is wrong; the message has file and line.
