@@ -165,9 +165,4 @@ def record_parsed_file(file: object) -> None:
 
 def is_strict() -> bool:
     """Whether formal errors are errors: in a check, and if the load options request it."""
-    return is_collecting() or load_options().strict
-
-
-def is_collecting() -> bool:
-    """Whether findings are collected, so that reading continues after errors."""
-    return _current_findings.get() is not None
+    return _current_findings.get() is not None or load_options().strict

@@ -103,7 +103,7 @@ def _different_home_text(
         "" if is_simulator_file(spec.path) else "keep it with crane check --write-home, or "
     )
     return (
-        f"the loops close only far from the home that is said: {name} is {deviation_text} "
+        f"the loops close only far from the home of the file: {name} is {deviation_text} "
         f"off{reversed_loops_text}; {cause_text}; "
         f"if what was found is meant, {write_hint}take it with {argument_hint}"
     )
@@ -119,16 +119,15 @@ def _home_search_text(spec: MachineSpec, closure: Closure, search: HomeSearchRes
     moved_text = _list_names([names[int(i)] for i in driven_columns if i in search.moved_columns])
     movement_text = f"moving {moved_text}, too" if moved_text else "the driven joints held"
     selection_text = (
-        f"the nearest of {search.configuration_count} postures"
+        f"the nearest of {search.configuration_count} configurations"
         if search.configuration_count > 1
-        else "the only posture"
+        else "the only configuration"
     )
     command = "convert, then crane check" if is_simulator_file(spec.path) else "check"
     return (
-        f"{location}: home was sought, because from what the file says of it {search.reason}; "
+        f"{location}: home was searched for, because from the home of the file {search.reason}; "
         f"{movement_text}, {selection_text} that was found has {names[joint]} {deviation:.3g} "
-        f"{unit} off: look at it with "
-        f"crane sketch, and keep it with crane {command} --write-home"
+        f"{unit} off: look at it with crane sketch, and keep it with crane {command} --write-home"
     )
 
 
@@ -146,8 +145,8 @@ def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
         f" ({redundancy_gap.largest_gap:.1g} of the machine's size)" if is_translation else ""
     )
     return (
-        f"{location}: loop '{loop}' closes but for digits: its surplus equations stay open by "
-        f"up to {gap}{share_text}, while the others are closed; write axes, angles and pins with "
+        f"{location}: loop '{loop}' closes only to file precision: its redundant equations "
+        f"stay open by up to {gap}{share_text}, while the others are closed; write axes, angles and pins with "
         "more digits"
     )
 

@@ -92,7 +92,8 @@ def load(
         summarize_warnings(),
         use_load_options(package_paths, values, bool(floating), strict) as options,
     ):
-        machine = _load_machine(name, changes, lock, active, free, floating)
+        spec = _read_spec(name, active, free, floating)
+        machine = _assemble_machine(spec, changes, lock, active, free, floating)
         return replace(
             machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
         )
@@ -172,18 +173,6 @@ class MachineVariants:
             check_argument_values(original.arguments),
         )
         return use_load_options(folders, parameters, bool(original.floating_base))
-
-
-def _load_machine(
-    name: str | Path,
-    changes: Mapping[str, float] | None,
-    lock: Mapping[str, float] | None,
-    active: Sequence[str] | None,
-    free: Sequence[str] | None,
-    floating: bool | tuple[str, ...],
-) -> Machine:
-    spec = _read_spec(name, active, free, floating)
-    return _assemble_machine(spec, changes, lock, active, free, floating)
 
 
 def _read_spec(

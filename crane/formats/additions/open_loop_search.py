@@ -179,7 +179,7 @@ class _OpenLoopSearch:
 
     def _nearby_pairs(self) -> Iterator[tuple[str, str]]:
         """Yield pairs of frames that are close or can be moved together by slides."""
-        frames = self._massless_frames()
+        frames = [link for link in self.spec.tree.links if self._is_frame(link)]
         points = np.array([self.placements[link].translation for link in frames]).reshape(-1, 3)
         slide_ranges = np.array([self._slide_range(link) for link in frames])
         for i, first in enumerate(frames[:-1]):
@@ -203,11 +203,8 @@ class _OpenLoopSearch:
         """Return links without child joints."""
         return [link for link in self.spec.tree.links if not self.joints_by_parent.get(link)]
 
-    def _massless_frames(self) -> list[str]:
-        """Return frames without mass, and slides without child joints."""
-        return [link for link in self.spec.tree.links if self._is_frame(link)]
-
     def _is_frame(self, link: str) -> bool:
+        """Whether a link is a frame without mass, or a slide without child joints."""
         if link in (self.spec.tip, self.spec.tree.root_link):
             return False
         if self.parent_joints[link].is_movable:

@@ -209,7 +209,11 @@ def add_barrel_and_rod(
         barrel_frame
     )
     eye_in_link = pin.SE3(np.eye(3), np.array(points[1].point)) * rod_placement.actInv(rod_frame)
-    _add_rod_eye_frame(draft.urdf_of_link(points[1].link), name, points[1].link, eye_in_link)
+    rod_robot, eye = draft.urdf_of_link(points[1].link), f"{name}_eye"
+    add_link(rod_robot, Link(eye, ""))
+    add_joint(
+        rod_robot, Joint(eye, "fixed", points[1].link, eye, "", *xyz_rpy_from_se3(eye_in_link))
+    )
     draft.add_chain(
         name, _cylinder_urdf(name, cylinder, base_in_link, is_planar), {"parent": points[0].link}
     )
@@ -255,15 +259,6 @@ def _plane_normal(
     deviations = [float(np.linalg.norm(np.cross(axis, normal))) for axis in revolute_axes]
     deviations += [abs(float(axis @ normal)) for axis in prismatic_axes]
     return None if max(deviations) > _PARALLEL_TOLERANCE else np.asarray(normal)
-
-
-def _add_rod_eye_frame(
-    robot: etree._Element, name: str, link: str, eye_placement: pin.SE3
-) -> None:
-    """Add a frame for the rod's eye to a link."""
-    xyz, rpy = xyz_rpy_from_se3(eye_placement)
-    add_link(robot, Link(f"{name}_eye", ""))
-    add_joint(robot, Joint(f"{name}_eye", "fixed", link, f"{name}_eye", "", xyz, rpy))
 
 
 def _cylinder_urdf(

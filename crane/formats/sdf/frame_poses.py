@@ -5,7 +5,6 @@ for a joint its child, for a frame the frame that it is attached to, for a model
 parent model. The pose of a model with a placement frame P is that of P: X_SM = X_SP (X_MP)^-1.
 """
 
-import numpy as np
 import pinocchio as pin
 
 from crane.formats.sdf.model_scope import MergedFrame, ModelScope, find_scope
@@ -101,10 +100,6 @@ class SdfFramePoses:
         if relative == _MODEL_FRAME:
             relative = item.base_frame
         return self.pose_in_scope(scope, relative or default, item) * placement
-
-    def rotation_in_scope(self, scope: ModelScope, name: str, referrer: SdfElement) -> np.ndarray:
-        """Return the rotation (3, 3) of a frame relative to its scope."""
-        return np.asarray(self.pose_in_scope(scope, name, referrer).rotation)
 
     def pose_in_top(self, scope: ModelScope, top: ModelScope) -> pin.SE3:
         """Return the pose of a scope's frame relative to that of an ancestor."""

@@ -221,7 +221,7 @@ class SdfJoints:
         if not frame_name:
             return xyz
         frame_name = axis.base_frame if frame_name == "__model__" else frame_name
-        rotation = self._frames.rotation_in_scope(scope, frame_name, axis)
+        rotation = self._frames.pose_in_scope(scope, frame_name, axis).rotation
         return np.asarray(placement_in_scope.rotation.T @ rotation @ xyz)
 
     def _add_edge_pair(

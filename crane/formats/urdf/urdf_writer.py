@@ -162,15 +162,12 @@ def _coupling_ends(
     top_joints = [model.parents[way[0]] for way in joint_paths if way]
     if len(set(top_joints)) > 1:
         return None
-    links = [_moved_link(machine, way[-1] if way else top_joints[0]) for way in joint_paths]
+    joints_of_ends = [path[-1] if path else top_joints[0] for path in joint_paths]
+    links = [
+        machine.tree.joints[model.names[joint]].child if joint else machine.tree.root_link
+        for joint in joints_of_ends
+    ]
     return links[0], links[1], ratios.pop() if ratios else 1.0
-
-
-def _moved_link(machine: Machine, joint: int) -> str:
-    """Return the link that a joint of the model moves, the root link for the world."""
-    return (
-        machine.tree.joints[machine.model.names[joint]].child if joint else machine.tree.root_link
-    )
 
 
 def robot_description(machine: Machine) -> str:

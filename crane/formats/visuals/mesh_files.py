@@ -72,7 +72,10 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
             found[file] = _parse_answer(cached)
     for _ in range(_MAX_ATTEMPTS):
         remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
-            map(_count_triangles, found.values())
+            len(part.faces)
+            for parts in found.values()
+            if not isinstance(parts, str)
+            for part in parts
         )
         answers = _run_mesh_process(list(entry_names), remaining_triangles) if entry_names else []
         for (file, name), answer in zip(list(entry_names.items()), answers, strict=False):
@@ -94,14 +97,6 @@ def _cache_entry_name(file: Path) -> str:
     program = Path(mesh_process.__file__).read_bytes()
     return file_cache.entry_name(
         repr((sys.version, builds, program, file.suffix, file.read_bytes())), "mesh"
-    )
-
-
-def _count_triangles(parts_or_problem: tuple[MeshPart, ...] | str) -> int:
-    return (
-        0
-        if isinstance(parts_or_problem, str)
-        else sum(len(part.faces) for part in parts_or_problem)
     )
 
 
