@@ -146,8 +146,8 @@ def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
     )
     return (
         f"{location}: loop '{loop}' closes only to file precision: its redundant equations "
-        f"stay open by up to {gap}{share_text}, while the others are closed; write axes, angles and pins with "
-        "more digits"
+        f"stay open by up to {gap}{share_text}, while the others are closed; write axes, angles "
+        "and pins with more digits"
     )
 
 
