@@ -223,7 +223,9 @@ def test_a_home_far_from_what_the_file_says_is_refused_unless_asked_for(tmp_path
             r"crane check --write-home, or take it with --arg nearest_assembly:=true",
             str(caught.value),
         )
-        with pytest.warns(CraneWarning, match=r"sought, because .* closes far off; the driven"):
+        with pytest.warns(
+            CraneWarning, match=r"searched for, because .* closes far off; the driven"
+        ):
             crane.load(path, arguments={"nearest_assembly": True})
         assert "home written" in typed("check", path, "--write-home").stdout
         assert assembly(path, 0.25) == (0, [])
