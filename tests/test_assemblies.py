@@ -217,13 +217,15 @@ def test_a_home_far_from_what_the_file_says_is_refused_unless_asked_for(tmp_path
         with pytest.raises(CraneError) as caught:
             crane.load(path)
         assert re.match(
-            r"bucket\.yaml:8: the loops close only far from the home that is said: \w+ is 0\.9 "
+            r"bucket\.yaml:8: the loops close only far from the home of the file: \w+ is 0\.9 "
             r"rad off; with home as said loop 'pin' is 539 mm open, and would close with no other "
             r"length alone; correct home or the frames; if what was found is meant, keep it with "
             r"crane check --write-home, or take it with --arg nearest_assembly:=true",
             str(caught.value),
         )
-        with pytest.warns(CraneWarning, match=r"sought, because .* closes far off; the driven"):
+        with pytest.warns(
+            CraneWarning, match=r"searched for, because .* closes far off; the driven"
+        ):
             crane.load(path, arguments={"nearest_assembly": True})
         assert "home written" in typed("check", path, "--write-home").stdout
         assert assembly(path, 0.25) == (0, [])

@@ -468,7 +468,7 @@ UNITS = [
     seen(
         "degrees",
         [
-            "four_bar.yaml:14: error: the loops close only far from the home that is said: rocker "
+            "four_bar.yaml:14: error: the loops close only far from the home of the file: rocker "
             "is 1.53 rad off; with home as said loop 'pin' is 367 mm open, and would close with "
             "no other length alone; correct home or the frames; if what was found is meant, keep "
             "it with crane check --write-home, or take it with --arg nearest_assembly:=true "

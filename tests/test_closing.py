@@ -83,7 +83,7 @@ def assert_nearest_and_told(kind, seed, tmp_path):
     if any(undecided(task, q, home) for q in others):
         assert any("can be assembled another way" in what for what in told), (kind, seed)
     if away[0] > 0.5 + NAMED and others:
-        assert any("far from the home that is said" in what for what in told), (kind, seed)
+        assert any("far from the home of the file" in what for what in told), (kind, seed)
     return len(others)
 
 

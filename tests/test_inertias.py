@@ -28,7 +28,7 @@ def told(path, **options):
         machine = crane.load(path, **options)
     texts = [str(one.message) for one in caught if issubclass(one.category, CraneWarning)]
     return machine, [
-        text for text in texts if "home was sought" not in text and "loop" not in text
+        text for text in texts if "home was searched for" not in text and "loop" not in text
     ]
 
 

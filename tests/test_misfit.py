@@ -100,7 +100,7 @@ def test_changes_may_move_home_and_not_turn_it_over(name, tmp_path):
                 machine = crane.load(path, changes={length: share * value})
         except CraneError:
             continue
-        far += any("home was sought" in str(one.message) for one in told)
+        far += any("home was searched for" in str(one.message) for one in told)
         assert sides(places(machine, linkage)) == drawn(linkage), (length, share)
     assert far
 
@@ -115,7 +115,7 @@ def test_the_line_names_the_gap_and_the_length(tmp_path):
     (line,) = [one.message for one in report.findings if one.is_error]
     assert report.status == 2
     assert line == (
-        "the loops close only far from the home that is said: lift is 2.88 rad off, loop 'lift' "
+        "the loops close only far from the home of the file: lift is 2.88 rad off, loop 'lift' "
         "the other way round; with home as said loop 'link' is 236 mm open, and would close with "
         "bell.x 1.573 m (now 1.337); correct home or the frames; if what was found is meant, keep "
         "it with crane check --write-home, or take it with --arg nearest_assembly:=true "
@@ -125,14 +125,14 @@ def test_the_line_names_the_gap_and_the_length(tmp_path):
     run = ("simulate", path, "--duration", 0.1, "--out", tmp_path / "run")
     for command in (run, ("capacity", path), ("info", path)):
         done = typed(*command)
-        assert done.returncode == 2 and "far from the home that is said" in done.stderr
+        assert done.returncode == 2 and "far from the home of the file" in done.stderr
         assert "Traceback" not in done.stderr
 
 
 def test_what_was_found_is_taken_only_where_that_is_said(tmp_path):
     linkage = LINKAGES["loader"]
     path = linkage.write(tmp_path, wrong={"bell.x": 0.85 * linkage.lengths()["bell.x"]})
-    with pytest.warns(CraneWarning, match="home was sought"):
+    with pytest.warns(CraneWarning, match="home was searched for"):
         found = crane.load(path, arguments={"nearest_assembly": True})
     with pytest.raises(CraneError, match="the argument nearest_assembly is 'maybe'"):
         crane.load(path, arguments={"nearest_assembly": "maybe"})

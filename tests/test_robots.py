@@ -53,7 +53,7 @@ def test_a_check_fits_on_a_screen(name):
     told = typed("check", ROBOTS / name / "robot.yaml")
     lines = told.stdout.splitlines()
     assert told.returncode == 1 and len(lines) <= 24
-    assert any("home was sought" in line for line in lines)
+    assert any("home was searched for" in line for line in lines)
     assert lines[-1] == f"next: crane check {ROBOTS / name / 'robot.yaml'} --write-home"
 
 

@@ -314,7 +314,7 @@ def test_a_reader_that_ends_costs_one_mesh(tmp_path, place, monkeypatch):
     ends += "            if 'end.stl' in file: os._exit(3)\n"
     triangle = "np.eye(3), np.arange(3).reshape(1, 3)"
     reads = f"            import numpy as np; arrays = [{triangle}]\n"
-    reads += "            head = {'parts': [{'vertices': 3, 'faces': 1, 'colour': None}]}\n"
+    reads += "            header = {'parts': [{'vertices': 3, 'faces': 1, 'colour': None}]}\n"
     source = source.replace("SECONDS = 2 << 30, 20", "SECONDS = 2 << 30, 1")
     program = tmp_path / "reader.py"
     program.write_text(source.replace(opened, ends + reads).replace(imported, "pass  #"))

@@ -10,7 +10,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError
-from crane.formats.xacro import xacro_expansion
+from crane.formats import robot_files
 
 xacro = pytest.importorskip("xacro")
 
@@ -191,7 +191,7 @@ def test_macros_without_end(tmp_path):
 
 
 def test_without_xacro(arm, monkeypatch):
-    monkeypatch.setattr(xacro_expansion, "_run_xacro_process", lambda _: {"missing": True})
+    monkeypatch.setattr(robot_files, "_run_xacro_process", lambda _: {"missing": True})
     with pytest.raises(CraneError) as caught:
         load(arm)
     assert str(caught.value) == (

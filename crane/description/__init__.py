@@ -1,11 +1,11 @@
-"""What a machine is described by, whatever file it comes from, and changes of it."""
+"""The description of a machine, independent of file formats, and changes of it."""
 
 from crane.description.inertia_feasibility import inertia_problem
 from crane.description.machine_lookup import bundled_machines, example_robots
+from crane.description.machine_parameters import parameters
 from crane.description.parameter_changes import (
     apply_parameter_changes,
     lock_joints,
-    parameters,
     set_active_joints,
 )
 from crane.description.sensors import Sensor

@@ -1,4 +1,4 @@
-"""What an identification estimates of a machine, and what is known of it before."""
+"""Settings of a machine for identification: model terms, priors, filters."""
 
 import math
 from collections.abc import Mapping
@@ -7,18 +7,18 @@ from dataclasses import dataclass, field
 from crane.common.errors import InputError
 
 TermValues = tuple[float, ...]
-_MIN_STD = 1e-12  # least deviation, which weights can still be made of
-_RELATIVE_STD_RANGE = 1e-7, 1e6  # of those that are relative
+_MIN_STD = 1e-12  # with a finite weight
+_RELATIVE_STD_RANGE = 1e-7, 1e6
 
 
 @dataclass(frozen=True)
 class ParameterPrior:
-    """What is known of a parameter before anything is measured.
+    """Prior knowledge of a parameter.
 
     Attributes:
-        std: Standard deviation, in the parameter's unit or as a share of the mean.
-        relative: Whether it is a share.
-        mean: In the parameter's unit; None: the value that the machine's description has.
+        std: Standard deviation, in the unit of the parameter or relative to the mean.
+        relative: Whether `std` is relative.
+        mean: In the unit of the parameter; None: the value of the machine's description.
     """
 
     std: float
@@ -35,10 +35,10 @@ class ParameterPrior:
 
     @classmethod
     def parse(cls, text_or_number: object) -> "ParameterPrior":
-        """From a number, or "50", "10 %", "609 +- 60", "609 +- 10 %".
+        """Return the prior of a number or a text: "50", "10 %", "609 +- 60", "609 +- 10 %".
 
         Raises:
-            InputError: It is none of these, or the deviation is next to nothing.
+            InputError: The text is malformed, or the standard deviation is too small.
         """
         text = str(text_or_number)
         mean, sign, std = text.rpartition("+-")
@@ -56,22 +56,22 @@ class ParameterPrior:
         return cls(value, is_relative, mean_value)
 
     def __str__(self) -> str:
-        """As it is read."""
+        """Return it in the notation that `parse` reads."""
         std = f"{100 * self.std:.12g} %" if self.relative else f"{self.std!r}"
         return std if self.mean is None else f"{self.mean!r} +- {std}"
 
 
 @dataclass(frozen=True)
 class EstimationSettings:
-    """What `identify` does with a machine unless it is told otherwise.
+    """Defaults of `identify` for a machine.
 
     Attributes:
-        terms: By name or pattern, such as "q*.presliding", the numbers of a term that the model
-            has besides or instead of the usual ones; None: it does not have it.
-        prior: What is known of parameters by name or pattern, such as "q1.viscous", or of all of a
-            body, by its link.
-        bandwidth: [Hz] of the low-pass; None: by the motion.
-        slow: Velocities by joint or pattern below which its rows are left out [m/s], [rad/s].
+        terms: Parameters of additional model terms by name or pattern, such as "q*.presliding";
+            None: the model does not have the term.
+        prior: Priors by name or pattern of parameters, such as "q1.viscous", or by link for all
+            inertial parameters of a body.
+        bandwidth: Cut-off frequency of the low-pass filter [Hz]; None: from the motion.
+        slow: Velocities [m/s], [rad/s] by joint or pattern below which rows are left out.
     """
 
     terms: Mapping[str, TermValues | None] = field(default_factory=dict)

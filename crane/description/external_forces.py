@@ -1,4 +1,4 @@
-"""Forces from outside: wrenches at frames of a machine, by time, place and velocity."""
+"""External forces: wrenches at frames of a machine, as functions of time and of the motion."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -17,15 +17,15 @@ WRENCH_COMPONENTS = tuple(f"{kind}_{axis}" for kind in ("force", "moment") for a
 
 
 class FrameMotion(NamedTuple):
-    """What a force from outside sees: floats, or formulas while it becomes machine code.
+    """Motion of the frame of an external force, as floats or as symbolic expressions.
 
     Attributes:
-        position: (3,) origin of its frame in the world [m].
-        rotation: (3, 3) its axes, columns in the world.
+        position: (3,) origin of the frame in the world [m].
+        rotation: (3, 3) axes of the frame, as columns in the world.
         velocity: (3,) of the origin, in the world [m/s].
-        angular_velocity: (3,) angular velocity, in the world [rad/s].
-        reference: (c,) its row of `references`.
-        states: (s,) its own, see `ExternalForce.state_count`.
+        angular_velocity: (3,) in the world [rad/s].
+        reference: (c,) the row of `references` at the instant.
+        states: (s,) states of the force, see `ExternalForce.states`.
     """
 
     position: list[Scalar]
@@ -37,78 +37,78 @@ class FrameMotion(NamedTuple):
 
 
 class ExternalForce(OneLineRepr):
-    """A wrench at a frame. What depends on more than time writes `wrench` in a class of its own.
+    """A wrench at a frame. A subclass overrides `wrench` if it depends on more than time.
 
-    Its formulas become machine code: `wrench` is called with numbers and, once, with formulas.
-    `crane.Wrench` is one by time, `crane.WrenchFunction` calls a function in Python.
+    `wrench` is called with numbers, and once with symbolic expressions to compile its formulas.
+    `crane.Wrench` is a function of time, `crane.WrenchFunction` calls a function in Python.
 
     Args:
         frame: A link of the machine.
-        name: What it is called in recordings; its frame's name if not given.
+        name: Name in recordings; that of the frame if not given.
 
     Attributes:
-        frame: The same.
-        name: Likewise.
+        frame: The link.
+        name: Name in recordings.
     """
 
-    is_traceable: ClassVar[bool] = True  # else `wrench` reads its answer behind the references
+    is_traceable: ClassVar[bool] = True  # else its value is appended to the references
 
     def __init__(self, frame: str, name: str = ""):
         self.frame, self.name = frame, name or frame
 
     def references(self, times: Array) -> Array:
-        """All that depends on time alone, (N, c) at times (N,) [s]."""
+        """Return all quantities that depend on time alone, (N, c) at times (N,) [s]."""
         return np.zeros((len(times), 0))
 
     def breaks(self) -> Array:
-        """Times (k,) [s] at which that jumps or turns sharply, in order."""
+        """Return the sorted times (k,) [s] at which `references` or their derivatives jump."""
         return np.zeros(0)
 
     def event_lengths(self, motion: FrameMotion) -> Sequence[Scalar]:
-        """Lengths [m] at whose signs the wrench bends sharply: steps end there; none yet."""
+        """Return lengths [m] whose sign changes end a step; none by default."""
         return ()
 
     @property
     def channels(self) -> list[tuple[str, str]]:
-        """Names and units of what `outputs` tells; nothing yet."""
+        """Names and units of `outputs`; none by default."""
         return []
 
     def outputs(self, motion: FrameMotion) -> Sequence[Scalar]:
-        """What is recorded besides the wrench, in the order of `channels`."""
+        """Return the values that are recorded besides the wrench, in the order of `channels`."""
         return ()
 
     @property
     def state_count(self) -> int:
-        """How many lengths [m] it remembers, which are 0 at the start; none yet."""
+        """Number of states [m], which are 0 initially; none by default."""
         return 0
 
     def state_rates(self, motion: FrameMotion) -> Sequence[Scalar]:
-        """How fast those change [m/s]."""
+        """Return the rates of the states [m/s]."""
         return ()
 
     def wrench(self, motion: FrameMotion) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
-        """Force (3,) [N] and moment (3,) [N m] about the frame's origin, in the world's axes."""
+        """Return force (3,) [N] and moment (3,) [N m] about the origin, in the world's axes."""
         raise NotImplementedError
 
 
 class Wrench(ExternalForce):
-    """A wrench by time: constant, or straight between given times and held before and after.
+    """A wrench as a function of time: constant, or piecewise linear between given times.
 
     Args:
         frame: See `ExternalForce`.
         force: (3,) or (N, 3) [N].
         moment: (3,) or (N, 3) about the frame's origin [N m].
-        times: (N,) rising [s]; none of what is constant. Two may be equal, where it jumps.
-        axes: "world", or "frame" of what turns with it.
+        times: (N,) increasing [s]; None if constant. Two equal times are a jump.
+        axes: "world", or "frame" for axes that rotate with the frame.
         name: See `ExternalForce`.
 
     Attributes:
-        times: (N,), one of what is constant.
+        times: (N,), one time if constant.
         values: (N, 6) force and moment.
         axes: As given.
 
     Raises:
-        InputError: Wrong shapes, no numbers, times that do not rise, or other axes.
+        InputError: Wrong shapes, values that are not finite, decreasing times, or other axes.
     """
 
     def __init__(
@@ -134,8 +134,7 @@ class Wrench(ExternalForce):
             if component.shape not in ((3,), (len(self.times), 3)):
                 raise InputError(
                     f"{label}: {name_} has the shape {component.shape}, give (3,), or with "
-                    f"times (N,) "
-                    "(N, 3)"
+                    "times (N,) (N, 3)"
                 )
             components.append(np.broadcast_to(component, (len(self.times), 3)))
         if not len(self.times) or (np.diff(self.times) < 0).any():
@@ -160,18 +159,20 @@ class Wrench(ExternalForce):
 
 
 class PhasedWrench(Wrench):
-    """A wrench over the phases of a task of levers in place of time, straight in between.
+    """A wrench as a function of the phases of a lever task instead of time, piecewise linear.
 
     Args:
         frame: See `ExternalForce`.
         force: See `Wrench`.
         moment: See `Wrench`.
-        phases: (N,) rising: 0 as the first phase begins, 1.5 when the second is half done.
+        phases: (N,) increasing: 0 at the start of the first phase, 1.5 in the middle of the
+            second.
         axes: See `Wrench`.
         name: See `ExternalForce`.
 
     Attributes:
-        clock: Tells the phase (N,) at times (N,) [s]; None until a run has one, see `with_clock`.
+        clock: Function from times (N,) [s] to phases (N,); None until a run sets it, see
+            `with_clock`.
     """
 
     clock: Callable[[Array], Array] | None = None
@@ -188,7 +189,7 @@ class PhasedWrench(Wrench):
         super().__init__(frame, force, moment, phases, axes, name)
 
     def with_clock(self, clock: Callable[[Array], Array]) -> "PhasedWrench":
-        """The same by the clock of a run."""
+        """Return the same wrench with the clock of a run."""
         result = copy(self)
         result.clock = clock
         return result
@@ -198,7 +199,7 @@ class PhasedWrench(Wrench):
         return super().references(times if self.clock is None else self.clock(times))
 
     def breaks(self) -> Array:
-        """See `ExternalForce`: when phases end is not known before."""
+        """See `ExternalForce`: none, because the ends of phases are not known in advance."""
         return np.zeros(0)
 
 
@@ -207,8 +208,9 @@ class WrenchFunction(ExternalForce):
 
     Args:
         frame: See `ExternalForce`.
-        function: (t, place (3,), turn (3, 3), velocity (3,), spin (3,)) -> (6,) force and moment
-            about the frame's origin in the world's axes [N], [N m]; see `FrameMotion`.
+        function: (t, position (3,), rotation (3, 3), velocity (3,), angular velocity (3,)) -> (6,)
+            force [N] and moment [N m] about the frame's origin in the world's axes; see
+            `FrameMotion`.
         name: See `ExternalForce`.
     """
 
@@ -233,9 +235,9 @@ class WrenchFunction(ExternalForce):
         """See `ExternalForce`.
 
         Raises:
-            InputError: The function does not give six numbers.
+            InputError: The function does not return six numbers.
         """
-        if len(motion.reference) > 1:  # asked already
+        if len(motion.reference) > 1:  # the function was called already
             return motion.reference[1:4], motion.reference[4:]
         time = float(motion.reference[0])  # type: ignore[arg-type]
         inputs = (np.array(part, dtype=np.float64) for part in motion[:4])

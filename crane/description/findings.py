@@ -1,8 +1,8 @@
-"""What is wrong with a description: all of it where it is checked, else the first.
+"""Errors of a description: all of them while it is checked, else the first.
 
-Readers raise at the first problem. Within `collect_findings` they go on instead: `error_recovery`
-writes an error down and ends only the part that has it, a link or an item of a section;
-`report_error` does not end even that.
+Readers raise at the first error. Within `collect_findings` they continue: `error_recovery` records
+an error and ends only the affected part, a link or an item of a section; `report_error` does not
+end even that.
 """
 
 from collections.abc import Iterator
@@ -14,19 +14,19 @@ from typing import Any
 from crane.common.errors import CraneError
 from crane.common.package_search import load_options
 
-MAX_FINDINGS = 200  # findings in one run: who has more has one cause for most of them
+MAX_FINDINGS = 200  # more of them have few causes
 
 
 class FollowUpError(CraneError):
-    """Follows from an error that was noted before: not worth a line of its own."""
+    """An error that follows from a recorded error and is not reported."""
 
 
 class TooManyFindingsError(CraneError):
-    """Enough has been found."""
+    """The maximum number of errors was reached."""
 
 
 class UnknownNames(tuple[Any, ...]):
-    """Names that could not be read: whatever is asked for is among them."""
+    """Names that could not be read: every name counts as one of them."""
 
     def __contains__(self, _: object) -> bool:
         return True
@@ -41,13 +41,13 @@ class UnknownNames(tuple[Any, ...]):
 
 
 class Findings:
-    """What a check has found so far.
+    """Errors recorded by a check.
 
     Attributes:
-        errors: In the order in which they were found.
+        errors: Errors in the order in which they occurred.
         parsed_files: URDFs that could be parsed.
         can_be_assembled: Whether the machine can be assembled in spite of the errors.
-        is_truncated: Whether there were more than are noted.
+        is_truncated: Whether there were more errors than recorded.
     """
 
     def __init__(self) -> None:
@@ -55,13 +55,13 @@ class Findings:
         self.parsed_files: list[Any] = []
         self.can_be_assembled = True
         self.is_truncated = False
-        self.harmless_depth = 0  # open blocks whose errors do not keep it from being assembled
+        self.harmless_depth = 0  # nested contexts with harmless errors
 
     def add(self, error: CraneError) -> None:
-        """Write an error down, once.
+        """Record an error, once.
 
         Raises:
-            TooManyError: These are enough.
+            TooManyFindingsError: The maximum number is reached.
         """
         if not self.harmless_depth:
             self.can_be_assembled = False
@@ -78,7 +78,7 @@ _current_findings: ContextVar[Findings | None] = ContextVar("findings", default=
 
 @contextmanager
 def collect_findings() -> Iterator[Findings]:
-    """Collect what goes wrong within, as far as it is raised within `error_recovery`."""
+    """Collect the errors that are raised within `error_recovery`."""
     findings = Findings()
     token = _current_findings.set(findings)
     try:
@@ -89,10 +89,10 @@ def collect_findings() -> Iterator[Findings]:
         _current_findings.reset(token)
 
 
-class error_recovery:  # noqa: N801  read as a word: `with recoverable():`
-    """A part of a description whose errors end only this part while findings are collected.
+class error_recovery:  # noqa: N801  used as `with error_recovery():`
+    """Context of a part of a description; while findings are collected, errors end only this part.
 
-    An error after others of the same part follows from them and is not noted.
+    An error after other errors of the same part follows from them and is not recorded.
 
     Args:
         harmless: Whether the machine can be assembled without this part.
@@ -131,14 +131,14 @@ class error_recovery:  # noqa: N801  read as a word: `with recoverable():`
 
 
 def report_error(error: CraneError, harmless: bool = False) -> None:
-    """Raise an error, or write it down where findings are collected.
+    """Raise an error, or record it while findings are collected.
 
     Args:
         error: The error.
         harmless: Whether the machine can be assembled in spite of it.
 
     Raises:
-        CraneError: The error, where findings are not collected.
+        CraneError: The error, if findings are not collected.
     """
     findings = _current_findings.get()
     if findings is None:
@@ -149,7 +149,7 @@ def report_error(error: CraneError, harmless: bool = False) -> None:
 
 @contextmanager
 def raise_errors() -> Iterator[None]:
-    """Whatever is raised within is raised, and not written down."""
+    """Raise errors within, even while findings are collected."""
     token = _current_findings.set(None)
     try:
         yield
@@ -164,10 +164,5 @@ def record_parsed_file(file: object) -> None:
 
 
 def is_strict() -> bool:
-    """Whether what only has an odd form is an error: in a check, and where the user says so."""
-    return is_collecting() or load_options().strict
-
-
-def is_collecting() -> bool:
-    """Whether findings are collected, so that reading goes on after errors."""
-    return _current_findings.get() is not None
+    """Whether formal errors are errors: in a check, and if the load options request it."""
+    return _current_findings.get() is not None or load_options().strict

@@ -1,13 +1,13 @@
-"""Bodies that float: which series of six freedoms at the root are one joint without singularity.
+"""Floating bases: series of six joints at the root that are one joint without singularity.
 
-A joint with six freedoms is read as a series of three slides and three turns (see
-`crane.formats.joint_series`), whose Cardan angles have a singularity at a pitch of 90 degrees.
-Where such a series carries a body from the ground, and no loop, coupling, spring or drive acts on
-it, its place need not be solved for: the series is one free-flyer then, with coordinates and
-velocities of its own.
+A joint with six degrees of freedom is read as a series of three translations and three rotations
+(see `crane.formats.joint_series`), whose Cardan angles are singular at a pitch of 90 degrees. If
+such a series connects a body to the ground, and no loop, coupling, spring or drive acts on it, its
+coordinates need not be solved for: then the series is one free-flyer joint with its own
+coordinates and velocities.
 
-Its coordinates are the place p [m] and the rotation vector r [rad] of the body, R = exp(r x), of a
-length of at most pi; its velocities the body's twist in the body's axes, V = (linear, angular):
+Its coordinates are the position p [m] and the rotation vector r [rad] of the body, R = exp(r x),
+of length at most pi; its velocity is the body's twist in the body's axes, V = (linear, angular):
 
     p' = R V_lin,   r' = (1 + r x / 2 + c (r x)^2) V_ang,   c = (1 - (t/2) cot(t/2)) / t^2, t = |r|
 
@@ -25,7 +25,7 @@ FLOATING_FREEDOMS = ("x", "y", "z", "rx", "ry", "rz")
 
 
 def floating_bases(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
-    """By name of each joint with six freedoms that floats the joints of its series, in order."""
+    """Return the joints of the series of each floating base, in order, by name of its joint."""
     return {
         name: series
         for name, series in floating_series(spec).items()
@@ -34,25 +34,25 @@ def floating_bases(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
 
 
 def floating_series(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
-    """The same, and what moves of series of which some freedoms are locked or not there."""
+    """Return the same, and the movable joints of series of which some are locked or missing."""
     series_by_joint: dict[str, list[Joint]] = {}
     for joint in spec.tree.joints.values():
         if joint.floating_joint and joint.is_movable:
             series_by_joint.setdefault(joint.floating_joint, []).append(joint)
-    found = {}
-    for name, series in series_by_joint.items():
-        if _is_unconstrained(spec, series):
-            found[name] = tuple(joint.name for joint in series)
-    return found
+    return {
+        name: tuple(joint.name for joint in series)
+        for name, series in series_by_joint.items()
+        if _is_unconstrained(spec, series)
+    }
 
 
 def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
-    """Whether a series carries a body from the ground that nothing else holds."""
+    """Whether a series connects a body to the ground and nothing else acts on it."""
     parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
     link = series[0].parent
     while link in parent_joints:
         if parent_joints[link].is_movable:
-            return False  # it rides on another body
+            return False  # another body carries it
         link = parent_joints[link].parent
     names = {joint.name for joint in series}
     force_element_joints = {part.joint for part in spec.force_elements if part.between is None}
@@ -70,7 +70,7 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
 
 
 def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> bool:
-    """Whether a body carries a link."""
+    """Whether a link is a body or is carried by it."""
     seen = set()
     while link != body and link in parent_joints and link not in seen:
         seen.add(link)
@@ -79,7 +79,7 @@ def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> b
 
 
 def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
-    """A machine whose home has Cardan angles, R_x R_y R_z, of bodies that turn out to float."""
+    """Return a machine with rotation vectors in place of the Cardan angles R_x R_y R_z of home."""
     from scipy.spatial.transform import Rotation
 
     home = dict(spec.home)
@@ -94,10 +94,10 @@ def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
 def convert_locked_rotations(
     spec: MachineSpec, lock: Mapping[str, float]
 ) -> tuple[MachineSpec, Mapping[str, float]]:
-    """Home and locks of series that no longer float once some of their joints are locked.
+    """Convert home and locks of floating bases that lose joints by locking.
 
-    Three turns locked together are a rotation vector, as the coordinates are; what is left of
-    them, and one or two that are locked alone, are Cardan angles.
+    Three rotations locked together are a rotation vector, as the coordinates are. Remaining
+    rotations, and one or two that are locked alone, become Cardan angles.
     """
     from scipy.spatial.transform import Rotation
 
@@ -115,9 +115,9 @@ def convert_locked_rotations(
 
 
 def add_floating_base(spec: MachineSpec, freedoms: bool | Sequence[str] = True) -> MachineSpec:
-    """A machine whose root floats instead of standing on the ground, by base_x to base_rz.
+    """Return a machine whose root floats by joints base_x to base_rz instead of being fixed.
 
-    A machine that floats already stays as it is.
+    A machine with a floating base is returned unchanged.
 
     Args:
         spec: The machine.
@@ -130,10 +130,10 @@ def add_floating_base(spec: MachineSpec, freedoms: bool | Sequence[str] = True) 
 
 
 def check_freedoms(names: object) -> tuple[str, ...]:
-    """Freedoms of a root in the order of `FLOATING_FREEDOMS`.
+    """Return degrees of freedom of a root in the order of `FLOATING_FREEDOMS`.
 
     Raises:
-        InputError: Names that are none of those.
+        InputError: A name is unknown.
     """
     if (
         isinstance(names, str)
@@ -147,7 +147,7 @@ def check_freedoms(names: object) -> tuple[str, ...]:
 
 
 def add_base_joints(tree: Tree, freedoms: Sequence[str]) -> Tree:
-    """A tree whose root has some of the `FLOATING_FREEDOMS`, by joints base_x to base_rz."""
+    """Return a tree whose root has some of `FLOATING_FREEDOMS`, by joints base_x to base_rz."""
     root = tree.root_link
     used_names = {*tree.links, *tree.joints}
     name = "base"
@@ -172,5 +172,5 @@ def add_base_joints(tree: Tree, freedoms: Sequence[str]) -> Tree:
                 axis=(axis[0], axis[1], axis[2]), floating_joint=name,
             )
         )  # fmt: skip
-    # the ground first: it is the root now
+    # the ground first, because it is the new root
     return Tree({links[0].name: links[0]}, {}).with_parts(*tree, *links[1:], *joints)

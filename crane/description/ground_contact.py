@@ -1,4 +1,4 @@
-"""The ground under a machine, and what presses and rubs on it."""
+"""The ground under a machine, and contact forces on points and wheels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ from crane.description.external_forces import ExternalForce, FrameMotion
 
 DEFAULT_STIFFNESS, DEFAULT_DAMPING, DEFAULT_FRICTION, DEFAULT_SMOOTHING = 1e7, 1.0, 0.6, 1e-2
 _RELAXATION_TIME = 1e-3  # [s]
-_MIN_LENGTH = 1e-12  # [m] that is no way
+_MIN_LENGTH = 1e-12  # [m] for the norm of zero
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A plane, or a surface whose height changes along x and is the same along y.
+    """A plane, or a surface whose height varies along x and is constant along y.
 
     Attributes:
-        height: z where x = y = 0 of a plane [m].
+        height: z of a plane at x = y = 0 [m].
         normal: (3,) of a plane, upwards.
-        profile: Points (x, z) in the order of x [m], straight between and level beyond; none of a
+        profile: Points (x, z) [m] by increasing x, linear in between and level outside; none for a
             plane.
     """
 
@@ -54,7 +54,7 @@ class Ground:
                 raise InputError("the ground has a profile and a plane, give one of the two")
 
     def distance_and_normal(self, position: Sequence[Scalar]) -> tuple[Scalar, list[Scalar]]:
-        """How far a place (3,) is above it along its normal [m], and that (3,)."""
+        """Return the height [m] of a position (3,) along the normal, and the normal."""
         if not self.profile:
             length = float(np.linalg.norm(self.normal))
             normal: list[Scalar] = [x / length for x in self.normal]
@@ -72,16 +72,16 @@ class Ground:
 
 
 class Contact(ExternalForce):
-    """A point of a body, or a wheel or ball around it, on the ground.
+    """Contact of a point of a body, or of a wheel or ball around it, with the ground.
 
-    With d the depth and n the normal, v_t the velocity along the ground where it touches,
+    With d the depth and n the normal, v_t the tangential velocity at the contact point,
 
         N = stiffness d max(0, 1 + damping d'),    F = N (n - friction v_t / sqrt(v_t^2 + s^2)),
 
-    unilateral and compliant as an end stop (Hunt and Crossley, 1975), with Coulomb friction in
-    both directions, smoothed over the velocity s: what rests on a slope creeps, at s tan(slope) /
-    sqrt(friction^2 - tan(slope)^2). What gives way along the ground with a lateral stiffness k, as
-    a tyre does, stands still there. How far it has given way, s, is its state, and friction is
+    unilateral and compliant as an end stop (Hunt and Crossley, 1975), with isotropic Coulomb
+    friction, smoothed over the velocity s: on a slope the contact creeps at s tan(slope) /
+    sqrt(friction^2 - tan(slope)^2). With a lateral stiffness k, as of a tyre, it does not creep.
+    Its lateral deflection s is then a state, and friction is
 
         F_t = -min(1, friction N / |k s + c s'|) (k s + c s'),
         s' = v_t - max(0, 1 - friction N / (k |s|)) s / tau,    tau = 1 ms,
@@ -90,21 +90,21 @@ class Contact(ExternalForce):
     Haessig and Friedland, 1991, without its jump).
 
     Args:
-        frame: The link whose origin the point, or the centre of the wheel, is.
-        ground: What it stands on.
+        frame: The link whose origin is the point, or the centre of the wheel.
+        ground: The ground.
         stiffness: Of ground and body [N/m].
         damping: [s/m].
         friction: Coefficient.
         smoothing: s [m/s].
         radius: Of the wheel or ball [m].
-        lateral_stiffness: k along the ground, in all directions [N/m]; 0 of none.
+        lateral_stiffness: k along the ground, in all directions [N/m]; 0 for none.
         lateral_damping: c [N s/m].
-        area: Of the foot that the point stands for [m2], 0 of none; what it presses with on the
-            ground is recorded.
+        area: Area of the foot that the point represents [m2], 0 for none; its ground pressure is
+            recorded.
         name: See `ExternalForce`.
 
     Raises:
-        InputError: A number that is none, or too small.
+        InputError: A value is not finite or too small.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class Contact(ExternalForce):
 
     @property
     def channels(self) -> list[tuple[str, str]]:
-        """See `ExternalForce`: N, and over the area."""
+        """See `ExternalForce`: N, and N over the area."""
         pressure = [(f"pressure_{self.name}", "Pa")] if self.area else []
         return [(f"support_{self.name}", "N"), *pressure]
 
@@ -159,7 +159,7 @@ class Contact(ExternalForce):
     def _normal_force_and_sliding(
         self, motion: FrameMotion
     ) -> tuple[Scalar, list[Scalar], list[Scalar], list[Scalar]]:
-        """N, the normal, where the ground is touched from the frame, and how fast that slides."""
+        """Return N, the normal, the contact point from the frame, and its sliding velocity."""
         height, normal = self.ground.distance_and_normal(motion.position)
         arm = scale_vector(-1.0 * height, normal)
         velocity = add_vectors(motion.velocity, cross(motion.angular_velocity, arm))
@@ -190,7 +190,7 @@ class Contact(ExternalForce):
 
     @property
     def state_count(self) -> int:
-        """See `ExternalForce`: s along the ground's two directions."""
+        """See `ExternalForce`: the deflections s along two directions of the ground."""
         return 2 if self.lateral_stiffness else 0
 
     def state_rates(self, motion: FrameMotion) -> Sequence[Scalar]:
@@ -207,7 +207,7 @@ class Contact(ExternalForce):
         normal: list[Scalar],
         sliding_velocity: list[Scalar],
     ) -> tuple[list[Scalar], list[Scalar]]:
-        """F_t (3,) and s' (2,)."""
+        """Return F_t (3,) and s' (2,)."""
         normalization = 1.0 / apply_function("sqrt", normal[0] * normal[0] + normal[2] * normal[2])
         first: list[Scalar] = [normalization * normal[2], 0.0, -1.0 * normalization * normal[0]]
         axes = first, cross(normal, first)

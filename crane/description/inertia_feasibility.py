@@ -1,4 +1,4 @@
-"""What makes a mass and an inertia impossible, and the possible inertia that is nearest."""
+"""Physical feasibility of a mass and an inertia, and the nearest feasible inertia."""
 
 from dataclasses import dataclass
 
@@ -6,25 +6,25 @@ import numpy as np
 
 from crane.common.samples import Array
 
-# Inertias are printed with a few digits: a violation below this share of the largest principal
-# moment is rounding.
+# Violations below these shares of the largest principal moment are rounding of a few digits.
 _ROUNDING_TOLERANCE = 1e-4
-_NEGATIVE_MOMENT_TOLERANCE = 0.05  # the same of a negative moment, as two digits round it
-_MIN_GYRATION_RADIUS = 1e-10  # [m] radius of gyration that no body is below
+_NEGATIVE_MOMENT_TOLERANCE = 0.05  # of a negative moment, as by rounding to two digits
+_MIN_GYRATION_RADIUS = 1e-10  # [m] of a body with inertia
 _TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
 class InertiaProblem:
-    """Why a mass and an inertia are no body's.
+    """Why a mass and an inertia are not physically feasible.
 
     Attributes:
-        problem: What they are.
-        advice: What to do about it.
-        is_formal: Whether it is one of form, planar, rounded or left out, with which it can be
-            computed: no principal moment is below zero by more than rounding.
-        is_negative: Whether one is by more than the last digits, so that some motion would have a
-            negative kinetic energy: then only the nearest possible inertia can be computed with.
+        problem: Description of the problem.
+        advice: How to correct it.
+        is_formal: Whether computation is possible in spite of it: a planar, rounded or missing
+            inertia, of which no principal moment is negative by more than rounding.
+        is_negative: Whether a principal moment is negative by more than the last digits, so that
+            some motion would have negative kinetic energy and only the nearest feasible inertia
+            can be used.
     """
 
     problem: str
@@ -37,10 +37,10 @@ class InertiaProblem:
 
 
 def inertia_problem(mass: float, tensor: np.ndarray) -> InertiaProblem | None:
-    """What makes a mass [kg] and an inertia about the COM (3, 3) [kg m2] impossible, if anything.
+    """Return the problem of a mass [kg] and a central inertia (3, 3) [kg m2], None if feasible.
 
-    The principal moments of a body are non-negative and none exceeds the sum of the others. A mass
-    of zero with an inertia is a rotor whose mass stands elsewhere.
+    The principal moments of a body are non-negative, and none exceeds the sum of the others. A
+    mass of zero with an inertia is a rotor whose mass belongs to another body.
     """
     if not (np.isfinite(mass) and np.isfinite(tensor).all()):
         problem = "a mass or an inertia beyond all numbers"
@@ -71,16 +71,16 @@ def _nearest_inertia_advice(tensor: Array) -> str:
 
 
 def nearest_inertia(tensor: Array) -> Array:
-    """The inertia (3, 3) [kg m2] of a possible body nearest to a tensor.
+    """Return the physically feasible inertia (3, 3) [kg m2] nearest to a tensor.
 
-    A body's second moments of mass about its COM, Sigma = tr(I) / 2 1 - I, have no negative
-    eigenvalue. The nearest such matrix in Frobenius' norm has zeros in place of the negative ones
-    (Higham 1988), so that with J_i the eigenvalues of Sigma along principal axes e_i
+    The second moments of mass about the centre of mass, Sigma = tr(I) / 2 1 - I, have no negative
+    eigenvalue. The nearest such matrix in the Frobenius norm has zeros in place of the negative
+    eigenvalues (Higham 1988). With the eigenvalues J_i of Sigma along principal axes e_i,
 
         I' = sum_i max(J_i, 0) (1 - e_i e_i^T)
 
-    Where only the largest principal moment is above the sum of the others, it stays, and both
-    others rise by half of what is missing: a flat body.
+    If only the largest principal moment exceeds the sum of the others, it stays, and the others
+    rise by half of the difference each: a flat body.
     """
     second_moments = np.trace(tensor) / 2 * np.eye(3) - tensor
     values, axes = np.linalg.eigh(second_moments)
@@ -89,7 +89,7 @@ def nearest_inertia(tensor: Array) -> Array:
 
 
 def format_inertia(tensor: Array) -> str:
-    """A tensor as a URDF has it, in five digits."""
+    """Return a tensor as attributes of a URDF, in five digits."""
     rounding = float(np.abs(tensor).max()) * 1e-9
     values = [x if abs(x) > rounding else 0.0 for x in tensor[np.triu_indices(3)].tolist()]
     return " ".join(f'{key}="{x:.5g}"' for key, x in zip(_TENSOR_ATTRIBUTES, values, strict=True))

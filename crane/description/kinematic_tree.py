@@ -1,4 +1,4 @@
-"""The tree of a machine: its links and joints in numbers, each with its place in a file."""
+"""The kinematic tree of a machine: links and joints with their values and source locations."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -9,11 +9,11 @@ import numpy as np
 Vector = tuple[float, float, float]
 Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
 
-NO_LIMIT = 1e9  # in a file: a limit of this size, in whatever unit, says that there is none
+NO_LIMIT = 1e9  # a limit of this magnitude in a file, in any unit, means none
 
 
 def parse_limit(value: float) -> float:
-    """A limit of a file, infinite where it says that there is none."""
+    """Return a limit of a file, infinite if it means none."""
     return math.copysign(math.inf, value) if abs(value) >= NO_LIMIT else value
 
 
@@ -24,10 +24,10 @@ class Inertial:
     Attributes:
         mass: [kg].
         com: Centre of mass in the link's frame [m].
-        rpy: Turns the axes of the link's frame into those of the tensor [rad].
+        rpy: Rotation from the axes of the link's frame to those of the tensor [rad].
         tensor: xx, xy, xz, yy, yz, zz about the centre of mass [kg m2].
-        finding_location: File and line, where a file has a tensor that is no body's for its form
-            alone, see `crane.description.inertia_feasibility`.
+        finding_location: File and line of a tensor with a formal error, see
+            `crane.description.inertia_feasibility`.
     """
 
     mass: float
@@ -38,7 +38,7 @@ class Inertial:
 
     @property
     def inertia_matrix(self) -> np.ndarray:
-        """The tensor (3, 3) along the axes that it is written in."""
+        """The tensor (3, 3) along its own axes."""
         xx, xy, xz, yy, yz, zz = self.tensor
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
@@ -48,12 +48,12 @@ class Link:
     """A frame, with or without mass.
 
     Attributes:
-        name: Its name.
+        name: Name.
         source_location: File and line.
         inertial: Mass and inertia, None for a frame.
-        composite_joint: What it is within, if it only stands between the joints of a series.
-        has_refused_inertial: Whether it has an inertial that was refused while findings are
-            collected.
+        composite_joint: Name of the composite joint if the link is between the joints of its
+            series.
+        has_refused_inertial: Whether its inertial was refused while findings are collected.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a joint may do; infinite where there is no limit.
+    """Limits of a joint; infinite if there is no limit.
 
     Attributes:
         lower: Of the coordinate [m], [rad]; NaN if refused while findings are collected.
@@ -88,22 +88,22 @@ class Limits:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint with one freedom, or none.
+    """A joint with one degree of freedom, or none.
 
     Attributes:
-        name: Its name.
+        name: Name.
         kind: "revolute", "prismatic" or "fixed".
-        parent: Link that it stands on.
-        child: Link that it moves, whose frame is that of the joint at coordinate zero.
+        parent: Parent link.
+        child: Child link, whose frame is that of the joint at coordinate zero.
         source_location: File and line.
-        xyz: Its origin in the parent's frame [m].
-        rpy: Turns the parent's frame into its own [rad].
-        axis: Unit vector in its own frame; without meaning if it is fixed.
-        limits: Its limits.
-        rotor_inertia: Of the rotor that drives it, seen at the joint: times the square of the
-            gear's ratio [kg m2], or [kg] of a slide.
-        is_cut: Whether it closes a ring, so that it has no ends, while findings are collected.
-        floating_joint: The joint with six freedoms that it is one of, see
+        xyz: Origin in the parent's frame [m].
+        rpy: Rotation from the parent's frame to the joint's [rad].
+        axis: Unit vector in the joint's frame; without meaning for a fixed joint.
+        limits: Limits.
+        rotor_inertia: Inertia of the rotor that drives it, reflected to the joint: times the
+            square of the gear ratio [kg m2], or [kg] for a prismatic joint.
+        is_cut: Whether it closed a cycle and has no ends, while findings are collected.
+        floating_joint: Name of the joint with six degrees of freedom that it belongs to, see
             `crane.description.floating_bases`.
     """
 
@@ -122,7 +122,7 @@ class Joint:
 
     @property
     def is_movable(self) -> bool:
-        """Whether it has a freedom."""
+        """Whether it has a degree of freedom."""
         return self.kind != "fixed"
 
 
@@ -144,22 +144,22 @@ class Tree:
 
     @property
     def moving_joints(self) -> tuple[Joint, ...]:
-        """The joints that move."""
+        """The movable joints."""
         return tuple(joint for joint in self.joints.values() if joint.is_movable)
 
     @property
     def root_link(self) -> str:
-        """The link that stands on no other."""
+        """The link without parent."""
         children = {joint.child for joint in self.joints.values()}
         return next(link for link in self.links if link not in children)
 
     @property
     def total_mass(self) -> float:
-        """Of all links [kg]."""
+        """Mass of all links [kg]."""
         return sum(link.inertial.mass for link in self.links.values() if link.inertial)
 
     def joints_by_parent(self) -> dict[str, list[Joint]]:
-        """The joints on each link that has some."""
+        """Return the joints on each link that has child joints."""
         found: dict[str, list[Joint]] = {}
         for joint in self.joints.values():
             if joint.parent and joint.child:
@@ -167,7 +167,7 @@ class Tree:
         return found
 
     def bodies_by_link(self) -> dict[str, str]:
-        """By link the one that all fixed to it and to each other are named after."""
+        """Return by link the first link of its body, to which it is fixed."""
         parent_joints = {joint.child: joint for joint in self.joints.values()}
         found: dict[str, str] = {}
         for link in self.links:
@@ -178,7 +178,7 @@ class Tree:
         return found
 
     def with_parts(self, *parts: Link | Joint) -> "Tree":
-        """The tree with other links and joints in place of those of the same names, or more."""
+        """Return the tree with links and joints added, or replaced if the names exist."""
         links, joints = dict(self.links), dict(self.joints)
         for part in parts:
             if isinstance(part, Link):
@@ -189,6 +189,6 @@ class Tree:
 
 
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:
-    """The tree with rotor inertias [kg m2], [kg] by joint."""
+    """Return the tree with rotor inertias [kg m2], [kg] by joint."""
     joints = (replace(tree.joints[name], rotor_inertia=x) for name, x in rotor_inertias.items())
     return tree.with_parts(*joints)

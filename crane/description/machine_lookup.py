@@ -1,4 +1,4 @@
-"""Where machines are found: bundled by name, example-robot-data by name, or a path."""
+"""Look up machines: bundled by name, example-robot-data by name, or by path."""
 
 import shlex
 import sys
@@ -10,9 +10,9 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import LoadOptions, load_options
 
-# between a machine and the numbers of it that are changed, see `Machine.load_expression`
+# between a machine and its parameter changes, see `Machine.load_expression`
 CHANGES_SEPARATOR = " with "
-FOLDER_FILES = ("robot.yaml", "model.sdf")  # of example-parallel-robots, of Gazebo
+FOLDER_FILES = ("robot.yaml", "model.sdf")  # of example-parallel-robots and Gazebo
 MACHINE_SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 
 
@@ -23,24 +23,24 @@ def _models_folder() -> Path:
 
 
 def bundled_machines() -> dict[str, Path]:
-    """Names and machine files of the machines that come with the package."""
+    """Return the machine files of the machines in the package by name."""
     return {path.stem: path for path in sorted(_models_folder().glob("*.yaml"))}
 
 
 def machine_summary(path: Path) -> str:
-    """What a bundled machine is: the first sentence of the comment that begins its file."""
+    """Return the first sentence of the comment at the beginning of a machine file."""
     lines = takewhile(lambda line: line.startswith("#"), path.read_text("utf-8").splitlines())
     return " ".join(line.strip("# ") for line in lines).partition(". ")[0]
 
 
 @cache
 def example_root() -> Path | None:
-    """Folder `robots` of example-robot-data, or None where that is not installed."""
+    """Return the folder `robots` of example-robot-data, None if it is not installed."""
     from importlib.metadata import PackageNotFoundError, files  # slow to import
 
     try:
         package_files = files("example-robot-data") or []
-    except PackageNotFoundError:  # as where conda installed it, which keeps no list of Python's
+    except PackageNotFoundError:  # conda installs it without Python metadata
         shared_folder = Path(sys.prefix, "share", "example-robot-data", "robots")
         return shared_folder if shared_folder.is_dir() else None
     for item in package_files:
@@ -54,7 +54,7 @@ def example_root() -> Path | None:
 
 @cache
 def example_robots() -> dict[str, Path]:
-    """Names and URDFs of the robots in example-robot-data."""
+    """Return the URDFs of example-robot-data by name."""
     root = example_root()
     if root is None:
         return {}
@@ -62,7 +62,7 @@ def example_robots() -> dict[str, Path]:
 
 
 def without_changes(load_expression: str) -> str:
-    """The machine or file in what `Machine.load_expression` says."""
+    """Return the machine name or file of a `Machine.load_expression`."""
     return load_expression.partition(CHANGES_SEPARATOR + "{")[0]
 
 
@@ -74,15 +74,15 @@ def command_line_arguments(
     lock: Mapping[str, float] | None = None,
     options: LoadOptions | None = None,
 ) -> str:
-    """A machine as commands take it: its name, and the options with which it loads as it did.
+    """Return the command line arguments that load a machine: name and options.
 
     Args:
         name: As for `load`.
-        active: Driven joints, where they are chosen.
-        free: Coordinates that nothing drives, where they are chosen.
-        changes: New values of numbers.
-        lock: Coordinates of joints that are held.
-        options: Packages, arguments, and whether the root floats; as files are read now if not
+        active: Active joints, if chosen.
+        free: Free joints, if chosen.
+        changes: New values of parameters.
+        lock: Coordinates of locked joints.
+        options: Packages, arguments, and whether the root floats; the current load options if not
             given.
     """
     options = load_options() if options is None else options
@@ -98,11 +98,11 @@ def command_line_arguments(
 
 
 def find_machine_file(name: str | Path) -> Path:
-    """The machine file or URDF that a name or path stands for.
+    """Return the machine file or URDF of a name or path.
 
     Args:
-        name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml,
-            .yml, .urdf, .xacro, .sdf, .world, .xml or .mjcf, or of a folder with a robot.yaml or a
+        name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml, .yml,
+            .urdf, .xacro, .sdf, .world, .xml or .mjcf, or of a folder with a robot.yaml or a
             model.sdf.
 
     Raises:
@@ -115,7 +115,7 @@ def find_machine_file(name: str | Path) -> Path:
     path, text = Path(name), str(name)
     try:
         is_file, is_folder = path.is_file(), path.is_dir()
-    except OSError as error:  # a name longer than any file's, a folder that may not be entered
+    except OSError as error:  # such as a name that is too long
         raise DescriptionError(
             f"{path}: cannot be read ({error.strerror}), check the path"
         ) from None

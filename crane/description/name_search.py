@@ -1,10 +1,10 @@
-"""What a machine's joints, frames, columns and parameters are called, and which are meant."""
+"""Search of the names of a machine: joints, frames, columns of recordings, parameters."""
 
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 
 from crane.common.errors import InputError
-from crane.description.parameter_changes import parameters
+from crane.description.machine_parameters import parameters
 from crane.description.parameter_units import parameter_unit
 from crane.description.sensors import (
     PRESSURE_PREFIX,
@@ -16,24 +16,21 @@ from crane.description.sensors import (
 )
 from crane.description.specification import MachineSpec
 
-_MAX_SUGGESTIONS, _MIN_SIMILARITY = (
-    5,
-    0.6,
-)  # names that are proposed at most, and their likeness at least
-
-NameTexts = dict[str, dict[str, str]]  # what is to be said of a thing by its kind and name
+NamesByKind = dict[str, dict[str, str]]  # kind -> name -> short description
+_MAX_SUGGESTIONS, _MIN_SIMILARITY = 5, 0.6
 
 
-def names_by_kind(spec: MachineSpec) -> NameTexts:
-    """Joints, frames (links and what is fixed on them), columns of recordings, parameters.
+def names_by_kind(spec: MachineSpec) -> NamesByKind:
+    """Return the names of joints, frames, columns of recordings and parameters of a machine.
 
     Returns:
-        Of each kind what is to be said by name: type, where it is, unit, value.
+        By kind and name a short description: type of the joint, joint or link that carries the
+        frame, unit of the column, value of the parameter with its unit.
     """
     tree = spec.tree
     cylinders = {} if spec.hydraulics is None else spec.hydraulics.cylinders
 
-    def is_available(name: str) -> bool:  # of valves and chambers those that are there
+    def is_available(name: str) -> bool:  # whether the circuit has that valve or chamber
         heads = PRESSURE_PREFIX, VALVE_SIGNAL_PREFIX, "spool_"
         head = next((head for head in heads if name.startswith(head)), "")
         rest = name.removeprefix(head)
@@ -63,11 +60,15 @@ def names_by_kind(spec: MachineSpec) -> NameTexts:
     }
 
 
-def search_names(names: NameTexts, pattern: str) -> NameTexts:
-    """Those that a pattern matches: all of a name by `*`, `?` and `[...]`, else a part of it.
+def search_names(names: NamesByKind, pattern: str) -> NamesByKind:
+    """Select the names that a pattern matches.
+
+    Args:
+        names: As `names_by_kind` returns them.
+        pattern: With `*`, `?` or `[...]` it has to match a whole name, else a part of a name.
 
     Raises:
-        InputError: None does; the message has the nearest.
+        InputError: No name matches; the message lists similar names.
     """
     lowercase_pattern = pattern.lower()
     glob = lowercase_pattern if set(lowercase_pattern) & set("*?[") else f"*{lowercase_pattern}*"
@@ -77,7 +78,7 @@ def search_names(names: NameTexts, pattern: str) -> NameTexts:
     }
     if any(found.values()):
         return found
-    name_of_word: dict[str, str] = {}  # whole names and their parts, and the first name of each
+    name_of_word: dict[str, str] = {}  # first name that contains a word
     for name in [name for values in names.values() for name in values]:
         for word in (name, *name.split("."), *name.replace("_", ".").split(".")):
             name_of_word.setdefault(word.lower(), name)

@@ -13,8 +13,8 @@ from crane.description.circuit_schema import (
 )
 from crane.description.key_types import NumberKey
 from crane.description.kinematic_tree import Tree
+from crane.description.machine_parameters import PINS_PREFIX
 from crane.description.machine_schema import END_STOP, FORCE, FRICTION, GAS_SPRING, ROPE
-from crane.description.parameter_changes import PINS_PREFIX
 from crane.description.sensors import (
     SENSOR_PREFIX,
     parse_sensor_parameter,

@@ -1,4 +1,4 @@
-"""Places and inertias of a description as Pinocchio has them, and back."""
+"""Conversion of placements and inertias of a description to Pinocchio and back."""
 
 import dataclasses
 import math
@@ -10,15 +10,15 @@ from crane.description.kinematic_tree import Inertial, Placement, Tree, Vector
 
 
 def to_vector(values: np.ndarray) -> Vector:
-    """Three numbers, zeros without a sign."""
+    """Return three floats, without negative zeros."""
     x, y, z = (float(value) + 0.0 for value in values)
     return x, y, z
 
 
 def rotation_from_rpy(rpy: Vector) -> np.ndarray:
-    """(3, 3) R_z(yaw) R_y(pitch) R_x(roll), by way of the quaternion that readers of URDF take.
+    """Return (3, 3) R_z(yaw) R_y(pitch) R_x(roll), computed from the quaternion as for URDF.
 
-    So it is to the last digit what Pinocchio makes of the same numbers in a URDF.
+    The result is equal to the last digit to that of Pinocchio for the same values in a URDF.
     """
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in rpy)
     x, y, z, w = (
@@ -33,33 +33,32 @@ def rotation_from_rpy(rpy: Vector) -> np.ndarray:
 
 
 def se3_from_xyz_rpy(xyz: Vector, rpy: Vector) -> pin.SE3:
-    """A placement."""
+    """Return a placement of Pinocchio."""
     return pin.SE3(rotation_from_rpy(rpy), np.array(xyz))
 
 
 def xyz_rpy_from_se3(se3_placement: pin.SE3) -> Placement:
-    """Numbers of a placement."""
+    """Return xyz and rpy of a placement."""
     return to_vector(se3_placement.translation), to_vector(
         pin.rpy.matrixToRpy(se3_placement.rotation)
     )
 
 
 def inertia_from_inertial(link_inertial: Inertial | None) -> pin.Inertia:
-    """The inertia of a link in its frame, zero without one."""
+    """Return the spatial inertia of a link in its frame, zero without one."""
     if link_inertial is None:
         return pin.Inertia.Zero()
     axes_rotation = rotation_from_rpy(link_inertial.rpy)
     spatial_inertia = pin.Inertia(
         link_inertial.mass, np.array(link_inertial.com), np.zeros((3, 3))
     )
-    spatial_inertia.inertia = (
-        axes_rotation @ link_inertial.inertia_matrix @ axes_rotation.T
-    )  # the constructor refuses what assembling refuses with the link's name
+    # not by the constructor, which refuses infeasible inertias without the link's name
+    spatial_inertia.inertia = axes_rotation @ link_inertial.inertia_matrix @ axes_rotation.T
     return spatial_inertia
 
 
 def inertial_from_inertia(spatial_inertia: pin.Inertia) -> Inertial | None:
-    """An inertia along the axes of the link's frame, None without mass."""
+    """Return an inertial along the axes of the link's frame, None without mass."""
     if not spatial_inertia.mass:
         return None
     tensor = tuple(float(x) + 0.0 for x in spatial_inertia.inertia[np.triu_indices(3)])
@@ -69,9 +68,9 @@ def inertial_from_inertia(spatial_inertia: pin.Inertia) -> Inertial | None:
 
 
 def add_rigid_load(tree: Tree, frame: str, load: pin.Inertia) -> Tree:
-    """A tree with a rigid load on a frame, as part of the link that the frame is fixed to.
+    """Return a tree with a rigid load on a frame, added to the link that the frame is fixed to.
 
-    So a point mass is no link of its own, which a URDF has to give an inertia.
+    So a point mass needs no link, for which URDF requires an inertia.
     """
     parent_joints = {joint.child: joint for joint in tree.joints.values()}
     link = frame

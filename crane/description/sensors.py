@@ -1,15 +1,12 @@
-"""Sensors: what the channels of a log say of a machine's quantities, and by how much they are off.
+"""Sensors: relation of the channels of a log to quantities of a machine.
 
-A quantity is called by the column of a recording that holds it, X the name of a joint:
+A quantity has the name of the column of a recording that contains it; X is the name of a joint:
 
-    X, X_velocity, X_force            a length or an angle, its rate, what drives it
-    pressure_X_a, pressure_X_b        in the chambers of its cylinder
-    pressure_supply, pressure_tank
-    voltage_X, spool_X                the signal of its valve, and its spool
-    voltage_X_b, spool_X_b            of a second spool, of a valve that has two
-    inclination_LINK                  of a link's x axis above the horizon, by an inclinometer
-    inclination_LINK_velocity         its rate, by a gyro
-    time
+    X, X_velocity, X_force            coordinate, its rate, drive force pressure_X_a, pressure_X_b
+    pressures in the chambers of its cylinder pressure_supply, pressure_tank voltage_X, spool_X
+    signal and spool position of its valve voltage_X_b, spool_X_b            the same of a second
+    spool inclination_LINK                  angle of a link's x axis above the horizon, by an
+    inclinometer inclination_LINK_velocity         its rate, by a gyroscope time
 """
 
 from collections.abc import Mapping
@@ -24,19 +21,10 @@ from crane.description.kinematic_tree import Tree
 
 T = TypeVar("T", float, Array)
 
-SENSOR_PREFIX = "sensor."  # what the names of its numbers begin with
-TIME, VELOCITY_SUFFIX, FORCE_SUFFIX, INCLINATION_PREFIX = (
-    "time",
-    "_velocity",
-    "_force",
-    "inclination_",
-)
-VALVE_SIGNAL_PREFIX, PRESSURE_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE = (
-    "voltage_",
-    "pressure_",
-    "pressure_supply",
-    "pressure_tank",
-)
+SENSOR_PREFIX = "sensor."  # of parameter names
+TIME, VELOCITY_SUFFIX, FORCE_SUFFIX = "time", "_velocity", "_force"
+INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, PRESSURE_PREFIX = "inclination_", "voltage_", "pressure_"
+SUPPLY_PRESSURE, TANK_PRESSURE = "pressure_supply", "pressure_tank"
 VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
 FORCE_UNITS = {"rad": "N m", "m": "N"}
 SENSOR_PARAMETERS = ("zero", "scale", "delay", "noise")
@@ -44,22 +32,21 @@ SENSOR_PARAMETERS = ("zero", "scale", "delay", "noise")
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a channel makes of what enters it, with white noise n.
+    """Model of a channel with white noise n.
 
         y(t) = scale x(t - delay) + zero + n
 
-    The quantity enters a sensor and its reading comes out. A signal `voltage_X` goes the other
-    way: it enters as it was logged, and what comes out is what the valve gets; how late that acts
-    is the valve's `delay`, not the sensor's.
+    x is the quantity and y the reading. For a signal `voltage_X`, x is the logged value and y the
+    input of the valve; its delay is the `delay` of the valve, not of the sensor.
 
     Attributes:
-        column: Where a log has the reading, see `crane.recordings.logs`; "" where it is called as
-            the quantity is.
-        unit: Of that column; "" for the SI unit of the quantity.
-        zero: What is added to the quantity, in its SI unit.
-        scale: What it is multiplied with, not 0.
-        delay: How late it is [s], at least 0.
-        noise: Standard deviation, in the SI unit of the quantity; 0 where the recording tells.
+        column: Column of the reading in a log, see `crane.recordings.logs`; "" for the name of the
+            quantity.
+        unit: Unit of the column; "" for the SI unit of the quantity.
+        zero: Offset in the SI unit of the quantity.
+        scale: Factor, not 0.
+        delay: [s], at least 0.
+        noise: Standard deviation in the SI unit of the quantity; 0: estimated from the recording.
     """
 
     column: str = ""
@@ -79,22 +66,22 @@ class Sensor:
 
     @property
     def is_ideal(self) -> bool:
-        """Whether readings are the quantity itself."""
+        """Whether readings equal the quantity."""
         return (self.zero, self.scale, self.delay) == (0.0, 1.0, 0.0)
 
     def apply(self, quantity: T) -> T:
-        """Of what enters: scale x + zero."""
+        """Return scale x + zero."""
         return self.scale * quantity + self.zero
 
     def invert(self, reading: T) -> T:
-        """What entered: (y - zero) / scale."""
+        """Return (y - zero) / scale."""
         return (reading - self.zero) / self.scale
 
     def correct_readings(self, quantity_name: str, time: Array, readings: Array) -> Array:
-        """What a channel (N,) of a log stands for; where it ends first, its end goes on.
+        """Return the quantity (N,) of readings (N,) of a log; a delay repeats the last value.
 
         Raises:
-            InputError: A signal is late, which its valve would have to be.
+            InputError: A signal has a delay, which belongs to its valve.
         """
         if quantity_name.startswith(VALVE_SIGNAL_PREFIX):
             if self.delay:
@@ -104,12 +91,12 @@ class Sensor:
         return self.invert(undelayed)
 
     def parameters(self) -> dict[str, float]:
-        """By the last word of their names."""
+        """Return its parameters by the last part of their names."""
         return {name: getattr(self, name) for name in SENSOR_PARAMETERS}
 
 
 def quantity_unit(tree: Tree, name: str) -> str | None:
-    """SI unit of a quantity of a machine, None if it has none of that name."""
+    """Return the SI unit of a quantity of a machine, None if it is unknown."""
     fixed_units = {TIME: "s", SUPPLY_PRESSURE: "Pa", TANK_PRESSURE: "Pa"}
     if name in fixed_units:
         return fixed_units[name]
@@ -138,7 +125,7 @@ def quantity_unit(tree: Tree, name: str) -> str | None:
 
 
 def quantity_names(tree: Tree) -> list[str]:
-    """Names of what sensors of a machine can measure."""
+    """Return the names of all quantities that sensors of a machine can measure."""
     joints = [joint.name for joint in tree.moving_joints]
     names = [TIME, SUPPLY_PRESSURE, TANK_PRESSURE]
     names += [x + end for x in joints for end in ("", VELOCITY_SUFFIX, FORCE_SUFFIX)]
@@ -150,10 +137,10 @@ def quantity_names(tree: Tree) -> list[str]:
 
 
 def parse_sensor_parameter(name: str) -> tuple[str, str]:
-    """Quantity and number of 'sensor.QUANTITY.zero'.
+    """Return quantity and parameter of 'sensor.QUANTITY.zero'.
 
     Raises:
-        InputError: A sensor has no such number.
+        InputError: Sensors do not have the parameter.
     """
     quantity, _, parameter = name.removeprefix(SENSOR_PREFIX).rpartition(".")
     if parameter not in SENSOR_PARAMETERS:
@@ -167,7 +154,7 @@ def parse_sensor_parameter(name: str) -> tuple[str, str]:
 
 
 def signal_delay_error(parameter_name: str, quantity: str) -> InputError:
-    """What to say of a delay that a signal is given by a name."""
+    """Return the error about a delay of a signal."""
     joint = quantity.removeprefix(VALVE_SIGNAL_PREFIX)
     return InputError(
         f"'{parameter_name}': a signal is not late, its valve is: give 'valve.{joint}.delay'"
@@ -177,10 +164,10 @@ def signal_delay_error(parameter_name: str, quantity: str) -> InputError:
 def with_sensor_parameters(
     sensors: Mapping[str, Sensor], values: Mapping[str, float]
 ) -> dict[str, Sensor]:
-    """Sensors with other numbers, by names such as 'sensor.q2.zero'.
+    """Return sensors with other parameters, by names such as 'sensor.q2.zero'.
 
     Raises:
-        InputError: A sensor has no such number, or cannot have that value.
+        InputError: Sensors do not have the parameter, or the value is not allowed.
     """
     found = dict(sensors)
     for name, value in values.items():
@@ -193,7 +180,7 @@ def with_sensor_parameters(
 
 
 def sensor_parameters(sensors: Mapping[str, Sensor]) -> dict[str, float]:
-    """Numbers of sensors by name."""
+    """Return the parameters of sensors by name."""
     return {
         f"{SENSOR_PREFIX}{quantity}.{what}": value
         for quantity, sensor in sensors.items()

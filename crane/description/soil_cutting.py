@@ -1,4 +1,4 @@
-"""Soil, and what it does to the edge of a blade that cuts it."""
+"""Soil, and the forces on the edge of a blade that cuts it."""
 
 import math
 from collections.abc import Sequence
@@ -22,30 +22,25 @@ from crane.common.samples import as_number
 from crane.description.external_forces import ExternalForce, FrameMotion
 from crane.description.ground_contact import DEFAULT_SMOOTHING, Ground
 
-MAX_FRICTION_ANGLE = 1.05  # friction [rad] that a soil may have
-MIN_RAKE, MIN_WEDGE_ANGLE = (
-    0.1,
-    0.35,
-)  # rake [rad] at least; left to where no wedge can slide, at least
-_REGULARIZATION = (
-    1e-12  # [N2], [1]: keeps quotients of what may vanish finite, and changes no digit else
-)
+MAX_FRICTION_ANGLE = 1.05  # [rad] of a soil
+MIN_RAKE, MIN_WEDGE_ANGLE = 0.1, 0.35  # [rad]
+_REGULARIZATION = 1e-12  # [N2], [1]: keeps quotients finite, without effect on other values
 
 
 @dataclass(frozen=True)
 class Soil:
-    """Soil that fails at a shear of cohesion + tan(friction) pressure (Mohr and Coulomb).
+    """Soil that fails at a shear stress of cohesion + tan(friction) pressure (Mohr and Coulomb).
 
     Attributes:
         unit_weight: gamma [N/m3].
         cohesion: c [Pa].
-        friction: phi [rad], 0 of clay that is cut without draining.
-        tool_friction: delta of the soil on the tool [rad], at most phi.
-        adhesion: c_a of the soil to the tool [Pa], at most c.
+        friction: phi [rad], 0 for undrained clay.
+        tool_friction: delta between soil and tool [rad], at most phi.
+        adhesion: c_a between soil and tool [Pa], at most c.
         surcharge: q on the surface [Pa].
 
     Raises:
-        InputError: A number that no soil has.
+        InputError: A value is not possible for soil.
     """
 
     unit_weight: float
@@ -69,18 +64,16 @@ class Soil:
                 f"{MAX_FRICTION_ANGLE} rad"
             )
         for limited, limiting in (("tool_friction", "friction"), ("adhesion", "cohesion")):
-            if getattr(self, limited) > getattr(
-                self, limiting
-            ):  # it would fail in the soil before
+            # otherwise the soil would fail first
+            if getattr(self, limited) > getattr(self, limiting):
                 raise InputError(
                     f"the {limited} of the soil is {getattr(self, limited):g}, above its "
-                    f"{limiting} "
-                    f"{getattr(self, limiting):g}, give at most that"
+                    f"{limiting} {getattr(self, limiting):g}, give at most that"
                 )
 
     @property
     def max_rake(self) -> float:
-        """The rake that a steeper blade cuts with [rad], see `SoilCutting`."""
+        """Rake angle that replaces a steeper blade [rad], see `SoilCutting`."""
         largest_angle = math.pi - self.friction - self.tool_friction - MIN_WEDGE_ANGLE
         return min(0.5 * math.pi, largest_angle)
 
@@ -89,20 +82,20 @@ class Soil:
     ) -> tuple[list[Scalar], Scalar]:
         """Factors of the fundamental equation of earth moving (Reece 1964; McKyes 1985).
 
-        With the rake rho, a = rho + delta and the failure angle beta,
+        With the rake angle rho, a = rho + delta and the failure angle beta,
 
             D = cos a + sin a cot(beta + phi),
             N_gamma = (cot rho + cot beta) / (2 D),     N_c = (1 + cot beta cot(beta + phi)) / D,
             N_ca = (1 - cot rho cot(beta + phi)) / D,   N_q = (cot rho + cot beta) / D.
 
-        N_gamma is least at cot beta = -t + sqrt((t - cot rho) (t - cot phi)), t = cot(a + phi),
+        N_gamma is smallest at cot beta = -t + sqrt((t - cot rho) (t - cot phi)), t = cot(a + phi),
         whose root is sqrt(sin a sin(delta + phi) / (sin phi sin rho)) / sin(a + phi). Without
-        friction N_gamma is the same at all beta; what is left of the root then, 1 / sin rho, is
-        where N_c is least.
+        friction N_gamma does not depend on beta; the limit of the root, 1 / sin rho, minimizes
+        N_c.
 
         Args:
-            cosine_rake: Of the rake, which is between 0 and pi - delta - phi.
-            sine_rake: Of the rake.
+            cosine_rake: Of the rake angle, which is between 0 and pi - delta - phi.
+            sine_rake: Of the rake angle.
 
         Returns:
             N_gamma, N_c, N_ca, N_q, and cot beta.
@@ -132,7 +125,7 @@ class Soil:
 
     @property
     def bearing_factors(self) -> tuple[float, float]:
-        """Factors of what a strip bears, c N_c + q N_q (Prandtl 1921; Reissner 1924).
+        """Factors of the bearing capacity of a strip, c N_c + q N_q (Prandtl 1921; Reissner 1924).
 
         N_q = e^(pi tan phi) tan(pi/4 + phi/2)^2, N_c = (N_q - 1) cot phi, pi + 2 at phi = 0.
         """
@@ -142,7 +135,7 @@ class Soil:
 
 
 def _typical_soil(unit_weight: float, cohesion: float, degrees: float, adhesion: float) -> Soil:
-    """A soil of the table, with its tool friction."""
+    """Return a soil of the table, with its tool friction."""
     phi = math.radians(degrees)
     return Soil(unit_weight, cohesion, phi, 2.0 / 3.0 * phi, adhesion)
 
@@ -164,12 +157,12 @@ SOILS = {
 
 
 class SoilCutting(ExternalForce):
-    """A blade, flat and straight, that cuts soil with its edge: a bucket's lip or row of teeth.
+    """A flat and straight blade that cuts soil with its edge: a bucket's lip or row of teeth.
 
     u points from the edge up the blade, m out of its face into the soil that it cuts, n out of the
-    ground; d is how deep the edge is, D = min(d, length sin rho) how much of that the blade fills,
-    L = min(d / sin rho, length) how much of the blade is in the soil, all seen across the edge,
-    and v the velocity of the edge. Three forces act on the edge:
+    ground; d is the depth of the edge, D = min(d, length sin rho) the part of it that the blade
+    fills, L = min(d / sin rho, length) the part of the blade in the soil, all in the section
+    across the edge, and v is the velocity of the edge. Three forces act on the edge:
 
         R = P (sin(delta) u - cos(delta) m) + c_a width D / sin(rho) u,
         P = width (gamma D^2 N_gamma + c D N_c + c_a D N_ca + (q + gamma (d - D)) D N_q),
@@ -177,33 +170,32 @@ class SoilCutting(ExternalForce):
         T = - 2 width (L - g D / sin(rho)) tau v.u / sqrt((v.u)^2 + smoothing^2) u,
         tau = c_a + (1 - sin phi) tan(delta) (q + gamma (d - D / 2)),
 
-    what the wedge before the blade resists with (`Soil.cutting_factors`; P is not below 0), what
-    the edge bears (`Soil.bearing_factors`), and what rubs on both sides of the blade where it does
-    not cut, pressed by soil at rest (Jaky 1944). R acts by g = s(v.m) s(-v.R/|R|) and B by
-    s(-v.u), where s(x) is x^2 / (x^2 + smoothing^2) of x > 0, else 0: none of the three ever
-    drives the edge, and R and B vanish as it is withdrawn. So soil carries nothing at rest: what
-    leans on it creeps.
+    the resistance of the wedge before the blade (`Soil.cutting_factors`; P is not below 0), the
+    bearing force on the edge (`Soil.bearing_factors`), and the friction on both sides of the blade
+    where it does not cut, under the pressure of soil at rest (Jaky 1944). R acts by g = s(v.m)
+    s(-v.R/|R|) and B by s(-v.u), where s(x) is x^2 / (x^2 + smoothing^2) for x > 0, else 0: none
+    of the three ever drives the edge, and R and B vanish as it is withdrawn. So soil carries
+    nothing at rest: a machine that leans on it creeps.
 
-    A blade that is flatter than `MIN_RAKE` against the surface is taken as this one, with what it
-    fills; before one that is steeper than upright (or than leaves pi - delta - phi by
-    `MIN_WEDGE_ANGLE`, where no wedge could slide) a heap of soil stays, which cuts in its place,
-    as steep as that. The surface is not changed. Soil beside the blade and its inertia are left
-    out.
+    A rake angle below `MIN_RAKE` is replaced by that, with the filled depth of the blade. Before a
+    blade that is steeper than upright (or than pi - delta - phi less `MIN_WEDGE_ANGLE`, where no
+    wedge can slide) a heap of soil remains, which cuts in its place at that angle. The surface
+    does not change. Soil beside the blade and its inertia are neglected.
 
     Args:
         frame: The link whose origin is the middle of the edge.
-        soil: What it cuts.
+        soil: The soil.
         width: Of the edge [m].
         length: Of the blade, up from the edge [m].
         blade: u (3,) in the frame's axes; of any length.
-        cutting: (3,) whither it cuts in the frame's axes; m is what of it is across u.
-        ground: Its surface.
-        thickness: Of the edge [m], 0 of a sharp one.
+        cutting: (3,) cutting direction in the frame's axes; m is its component normal to u.
+        ground: Surface of the soil.
+        thickness: Of the edge [m], 0 for a sharp one.
         smoothing: [m/s].
         name: See `ExternalForce`.
 
     Raises:
-        InputError: A number that is none, or too small, or directions along each other.
+        InputError: A value is not finite or too small, or the directions are parallel.
     """
 
     def __init__(
@@ -239,13 +231,13 @@ class SoilCutting(ExternalForce):
         self.cutting: list[float] = (face_normal / np.linalg.norm(face_normal)).tolist()
 
     def event_lengths(self, motion: FrameMotion) -> list[Scalar]:
-        """See `ExternalForce`: the gap, and how far the blade is out of the soil."""
+        """See `ExternalForce`: the gap, and the height of the blade above the soil."""
         height = self.ground.distance_and_normal(motion.position)[0]
         return [height, height + self.length * self._rake_and_directions(motion)[0]]
 
     @property
     def channels(self) -> list[tuple[str, str]]:
-        """See `ExternalForce`: d, and the size of the force."""
+        """See `ExternalForce`: d, and the magnitude of the force."""
         return [(f"depth_{self.name}", "m"), (f"resistance_{self.name}", "N")]
 
     def outputs(self, motion: FrameMotion) -> Sequence[Scalar]:
@@ -257,7 +249,7 @@ class SoilCutting(ExternalForce):
     def _rake_and_directions(
         self, motion: FrameMotion
     ) -> tuple[Scalar, Scalar, list[Scalar], list[Scalar]]:
-        """Sine and cosine of the rake, u and m in the world."""
+        """Return sine and cosine of the rake angle, u and m in the world."""
         normal = self.ground.distance_and_normal(motion.position)[1]
         blade_direction, face_normal = (
             matvec(motion.rotation, self.blade),
@@ -276,7 +268,7 @@ class SoilCutting(ExternalForce):
         sine, cosine, blade_direction, face_normal = self._rake_and_directions(motion)
         filled = minimum(depth, self.length * maximum(sine, 0.0))
 
-        # the face that cuts: the blade's, or within the bounds of the rake
+        # the cutting face: the blade, or a face within the bounds of the rake angle
         min_cosine, max_cosine = math.cos(soil.max_rake), math.cos(MIN_RAKE)
         cosine_cut = minimum(maximum(cosine, min_cosine), max_cosine)
         sine_cut = apply_function("sqrt", 1.0 - cosine_cut * cosine_cut)
@@ -342,13 +334,13 @@ class SoilCutting(ExternalForce):
         return force, [0.0] * 3
 
     def _direction_gate(self, speed: Scalar, squared_scale: Scalar) -> Scalar:
-        """The gate s of a speed, given times the root of a unit."""
+        """Return the gate s of a speed, which has the unit of the root of the scale."""
         forward_speed = maximum(speed, 0.0)
         return forward_speed * forward_speed / (speed * speed + self.smoothing**2 * squared_scale)
 
 
 def _unit_direction(values: ArrayLike, label: str) -> np.ndarray:
-    """(3,) of length 1."""
+    """Return a unit vector (3,)."""
     try:
         direction = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):

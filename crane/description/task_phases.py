@@ -1,4 +1,4 @@
-"""Phases of a task of levers, each of which ends when its joints have come somewhere."""
+"""Phases of a lever task, each of which ends when its joints reach positions."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ from crane.common.errors import suggest_names
 
 @dataclass(frozen=True)
 class Phase:
-    """Levers that are held until joints have come to their positions.
+    """Levers that are held until joints reach positions.
 
     Attributes:
-        name: What it is called where it does not end.
-        levers: By joint, -1 to 1, a share of the valve's flow.
-        until: By joint the position at which its lever goes back to neutral [m], [rad]. The phase
-            ends when all joints have come to theirs.
-        within: Time that it may take [s].
+        name: Name in messages about a phase that does not end.
+        levers: By joint, -1 to 1, relative to the valve's flow.
+        until: By joint the position [m], [rad] at which its lever returns to neutral. The phase
+            ends when all joints have reached their positions.
+        within: Largest duration [s].
     """
 
     name: str
@@ -24,7 +24,7 @@ class Phase:
     within: float
 
     def without_joints(self, joints: Iterable[str]) -> "Phase":
-        """The same without some joints."""
+        """Return the phase without some joints."""
         removed = set(joints)
         levers, until = (
             {joint: x for joint, x in part.items() if joint not in removed}
@@ -38,12 +38,15 @@ class Phase:
         limits: Mapping[str, tuple[float, float]],
         start_positions: Mapping[str, float],
     ) -> Iterator[tuple[str, str, str]]:
-        """What cannot be: whether of "levers", "until" or "within", the joint, and what to say.
+        """Yield the errors of a phase.
 
         Args:
-            valves: Joints that have one.
-            limits: Lower and upper of joints, as far as they are known.
-            start_positions: Where joints come from, as far as that is known.
+            valves: Joints that have a valve.
+            limits: Lower and upper limit by joint, as far as known.
+            start_positions: Position before the phase by joint, as far as known.
+
+        Yields:
+            Key of the error ("levers", "until" or "within"), joint, message.
         """
         if not self.levers:
             yield "levers", "", f"phase '{self.name}' moves no lever, give it one"

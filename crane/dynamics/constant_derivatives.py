@@ -6,7 +6,7 @@ import numpy as np
 
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
-from crane.description.parameter_changes import unknown_parameter_text
+from crane.description.machine_parameters import unknown_parameter_text
 from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 

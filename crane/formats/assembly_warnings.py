@@ -1,48 +1,185 @@
-"""Warnings about machines whose files do not tell how to assemble them."""
+"""Errors and warnings about the home configuration and about other assembly modes of a machine."""
 
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from crane.closure import Closure
 from crane.closure.active_joint_selection import translational_coordinates
 from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly_modes
-from crane.common.errors import CraneWarning
+from crane.closure.constraint_structure import OpenLoopError
+from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
+from crane.closure.home_search import HomeSearchResult
+from crane.common.errors import CraneWarning, MechanismError
+from crane.common.package_search import NEAREST_ASSEMBLY, asked
 from crane.common.samples import Array
 from crane.description import MachineSpec
+from crane.description.findings import report_error
 from crane.formats.robot_files import is_robot_file, is_sdf_file, is_simulator_file
 from crane.machine import Machine
+from crane.machine.drive_selection import select_free_joints
+from crane.machine.misfit import misfit
 
-_MAX_LISTED, _MAX_COORDINATES = 4, 6  # loops and coordinates in a line
-_QUICK_STARTS, _THOROUGH_STARTS = (
-    6,
-    100,
-)  # starts of the search in one block: milliseconds, up to a second
+_MAX_LISTED = 4
+
+
+def check_home(
+    spec: MachineSpec, closure: Closure, initial_guess: Array, is_modified: bool = False
+) -> None:
+    """Raise if home differs too much from that of the file, and warn if it was searched.
+
+    Home differs too much if the link of a joint that the file specifies is rotated by more than
+    0.5 rad or translated by more than half of the characteristic length. If parameters were
+    changed, the file describes the original machine, so a loop must also have changed its assembly
+    mode. The load argument NEAREST_ASSEMBLY accepts the home anyway.
+
+    Args:
+        spec: The machine as read.
+        closure: Its loops, closed at home.
+        initial_guess: (nq,) configuration from which they were closed.
+        is_modified: Whether parameters differ from those of the file.
+
+    Raises:
+        MechanismError: Home differs too much.
+    """
+    search = closure.home_search
+    if search is not None:
+        is_rejected = search.is_far and (not is_modified or bool(search.reversed))
+        if is_rejected and not asked(NEAREST_ASSEMBLY):
+            problem = _different_home_text(spec, closure, search, initial_guess)
+            report_error(
+                MechanismError(
+                    f"{spec.source_locations.get('home', spec.path.name)}: {problem}", "home"
+                )
+            )
+        else:
+            warnings.warn(_home_search_text(spec, closure, search), CraneWarning, stacklevel=3)
+    if message := _rounding_text(spec, closure):
+        warnings.warn(message, CraneWarning, stacklevel=3)
+
+
+def add_remedy(
+    spec: MachineSpec, model: pin.Model, initial_guess: Array, error: OpenLoopError
+) -> OpenLoopError:
+    """Return the error about an open loop, with a parameter change that would close it, if any.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        initial_guess: (nq,) home of the file.
+        error: The original error.
+    """
+    geometry_misfit = misfit(spec, model, initial_guess)
+    if geometry_misfit is None or not geometry_misfit.remedies:
+        return error
+    return OpenLoopError(
+        f"{error}: it would close with {geometry_misfit.listed}", error.subject, error.reason
+    )
+
+
+def _different_home_text(
+    spec: MachineSpec, closure: Closure, search: HomeSearchResult, initial_guess: Array
+) -> str:
+    joint, deviation = search.off_said
+    name = closure.equations.coordinates.names[joint]
+    deviation_text = (
+        f"{deviation * closure.units[joint]:.3g} "
+        f"{'m' if translational_coordinates(closure.model)[joint] else 'rad'}"
+    )
+    loops = _list_names([f"'{loop}'" for loop in search.reversed])
+    reversed_loops_text = f", loop {loops} the other way round" if loops else ""
+    geometry_misfit = misfit(spec, closure.model, initial_guess)
+    cause_text = (
+        f"{geometry_misfit}; correct home or the frames"
+        if geometry_misfit
+        else "correct home or the frames"
+    )
+    argument_hint = (
+        f"--arg {NEAREST_ASSEMBLY}:=true (arguments={{'{NEAREST_ASSEMBLY}': True}} in Python)"
+    )
+    write_hint = (
+        "" if is_simulator_file(spec.path) else "keep it with crane check --write-home, or "
+    )
+    return (
+        f"the loops close only far from the home of the file: {name} is {deviation_text} "
+        f"off{reversed_loops_text}; {cause_text}; "
+        f"if what was found is meant, {write_hint}take it with {argument_hint}"
+    )
+
+
+def _home_search_text(spec: MachineSpec, closure: Closure, search: HomeSearchResult) -> str:
+    names = closure.equations.coordinates.names
+    location = spec.source_locations.get("home", spec.path.name)
+    joint, deviation = search.largest_deviation
+    unit = "m" if translational_coordinates(closure.model)[joint] else "rad"
+    free = select_free_joints(spec, closure.active_names)
+    driven_columns = [i for i in closure.active if names[int(i)] not in free]
+    moved_text = _list_names([names[int(i)] for i in driven_columns if i in search.moved_columns])
+    movement_text = f"moving {moved_text}, too" if moved_text else "the driven joints held"
+    selection_text = (
+        f"the nearest of {search.configuration_count} configurations"
+        if search.configuration_count > 1
+        else "the only configuration"
+    )
+    command = "convert, then crane check" if is_simulator_file(spec.path) else "check"
+    return (
+        f"{location}: home was searched for, because from the home of the file {search.reason}; "
+        f"{movement_text}, {selection_text} that was found has {names[joint]} {deviation:.3g} "
+        f"{unit} off: look at it with crane sketch, and keep it with crane {command} --write-home"
+    )
+
+
+def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
+    redundancy_gap, equations = closure.structure.redundancy, closure.equations
+    if redundancy_gap.largest_gap <= CLOSED_TOLERANCE:
+        return ""
+    loop = equations.names[equations.loop_of_row[redundancy_gap.largest_row]]
+    location = spec.source_locations.get(f"loop {loop}", spec.path.name)
+    is_translation = bool(equations.is_translation[redundancy_gap.largest_row])
+    unit = "m" if is_translation else "rad"
+    largest_gap = redundancy_gap.largest_gap * equations.residual_units[redundancy_gap.largest_row]
+    gap = f"{largest_gap:.2g} {unit}"
+    share_text = (
+        f" ({redundancy_gap.largest_gap:.1g} of the machine's size)" if is_translation else ""
+    )
+    return (
+        f"{location}: loop '{loop}' closes only to file precision: its redundant equations "
+        f"stay open by up to {gap}{share_text}, while the others are closed; write axes, angles "
+        "and pins with more digits"
+    )
+
+
+def _list_names(names: Sequence[str]) -> str:
+    remaining = len(names) - _MAX_LISTED
+    return ", ".join(names[:_MAX_LISTED]) + (f" and {remaining} more" if remaining > 0 else "")
+
+
+_MAX_LISTED, _MAX_COORDINATES = 4, 6  # loops and coordinates in a message
+# starts of the search in one block; they take milliseconds, and up to a second
+_QUICK_STARTS, _THOROUGH_STARTS = 6, 100
 
 
 def warn_about_assembly_modes(
     spec: MachineSpec, closure: Closure, initial_guess: Array, thorough: bool = False
 ) -> None:
-    """Warn of loops that are assembled one way though the file may mean another.
+    """Warn of loops that have another assembly mode that the file does not exclude.
 
     Args:
         spec: The machine as read.
         closure: Its loops, closed at home.
-        initial_guess: (nq,) what they were closed from, see `home_initial_guess`.
-        thorough: Whether to search long, and to tell all; else the first and how many there are.
+        initial_guess: (nq,) configuration from which they were closed, see `home_initial_guess`.
+        thorough: Whether to search long and report all; else the first and the number of others.
     """
     if not len(closure.passive):
         return
     is_from_simulator = is_simulator_file(spec.path)
     names = closure.equations.coordinates.names
-    specified_columns = [
-        i for i, name in enumerate(names) if is_from_simulator or name in spec.home
-    ]
+    is_specified = [is_from_simulator or name in spec.home for name in names]
     max_starts = _THOROUGH_STARTS if thorough else _QUICK_STARTS
     alternatives = find_alternative_assembly_modes(
-        closure, initial_guess, np.array(specified_columns, dtype=np.intp), max_starts
+        closure, initial_guess, np.flatnonzero(is_specified), max_starts
     )
     remainder = ""
     if len(alternatives) > 1 and not thorough:
@@ -55,7 +192,7 @@ def warn_about_assembly_modes(
 
 
 def alternative_configurations(machine: Machine) -> list[Array]:
-    """Other postures (nq,) that its file does not rule out, as `crane check` tells them."""
+    """Return the configurations (nq,) of other assembly modes, as `crane check` reports them."""
     closure = machine.closure
     if not len(closure.passive):
         return []
@@ -91,7 +228,7 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
         else deviation_text(alternative.home_deviation)
     )
     columns = [int(i) for i in alternative.changed_columns]
-    if len(columns) > _MAX_COORDINATES:  # those that tell the assemblies apart best
+    if len(columns) > _MAX_COORDINATES:  # with the largest differences
         differences = np.abs(closure.home - alternative.q)[columns]
         columns = [columns[i] for i in np.argsort(-differences, kind="stable")[:_MAX_LISTED]]
     home_values, alternative_values = (
@@ -100,29 +237,23 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
     )
     return (
         f"{location}: loop{'s' * (len(alternative.loops) > 1)} {loops} can be assembled another "
-        f"way at "
-        f"home, and the file does not say which is meant; {_home_element_text(spec)} write "
-        f"{alternative_values} for the "
-        f"other ({deviation_text(alternative.largest_deviation)}) or {home_values} to keep this "
-        f"one ({home_text} what it says)"
+        f"way at home, and the file does not say which is meant; {_home_element_text(spec)} write "
+        f"{alternative_values} for the other ({deviation_text(alternative.largest_deviation)}) or "
+        f"{home_values} to keep this one ({home_text} what it says)"
     ).replace("limits what it says", "limits")
 
 
 def _home_element_text(spec: MachineSpec) -> str:
-    """Where a file says how its machine is at home."""
-    if _is_yaml_file(spec.path):
+    """Return the name of the section or element of a file that contains home."""
+    if spec.path.suffix.lower() in (".yaml", ".yml"):
         return "under 'home:'"
     if is_sdf_file(spec.path):
         return "in <initial_position> of axes"
     return 'in <group_state name="home">' if is_robot_file(spec.path) else "in the key 'home'"
 
 
-def _is_yaml_file(path: Path) -> bool:
-    return path.suffix.lower() in (".yaml", ".yml")
-
-
 def _coordinates_text(spec: MachineSpec, names: Sequence[str], values: Array) -> str:
-    """Coordinates as a file has them."""
+    """Return coordinates in the syntax of the file."""
     pattern = (
         '<joint name="{}" value="{:.4g}"/>'
         if spec.path.suffix in (".urdf", ".xacro")

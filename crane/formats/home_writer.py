@@ -1,4 +1,4 @@
-"""The home posture written into the file of a machine, whose other text stays as it is."""
+"""Write the home configuration into the file of a machine, whose other text stays unchanged."""
 
 import re
 import shutil
@@ -20,7 +20,7 @@ from crane.formats.machine_loading import load
 from crane.formats.robot_files import is_sdf_file, is_simulator_file
 from crane.machine import Machine
 
-TextEdit = tuple[int, int, str]  # from, to, what stands there then
+TextEdit = tuple[int, int, str]  # start, end, new text
 
 _SAME_HOME_TOLERANCE = 1e-9
 _TAG_PATTERN = re.compile(r"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
@@ -34,12 +34,12 @@ def write_home(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
 ) -> Path:
-    """Write the closed home posture of a machine into its file, all joints in full digits.
+    """Write the closed home configuration of a machine into its file in full precision.
 
-    That also takes over an assembly that is far from what the file says, which `load` refuses.
-    A machine file and a robot.yaml get it under `home:`, a URDF in `<group_state name="home">`.
-    Numbers that stand there are replaced, joints that are missing are added; comments stay. A file
-    that does not give the same home when it is loaded again gets its old text back.
+    This also accepts a home that is far from the home of the file, which `load` refuses. In a
+    machine file and a robot.yaml home is the section `home:`, in a URDF `<group_state
+    name="home">`. Existing values are replaced, missing joints are added; comments stay. If the
+    file does not give the same home when it is loaded again, its old text is restored.
 
     Args:
         name: As for `load`.
@@ -52,7 +52,7 @@ def write_home(
         The file.
 
     Raises:
-        OutputError: The file belongs to a package, is a MJCF, or cannot be written.
+        OutputError: The file belongs to a package, is SDF or MJCF, or cannot be written.
         CraneError: As `load`.
     """
     with warnings.catch_warnings():
@@ -88,13 +88,13 @@ def _replace_text(path: Path, text: str) -> None:
 
 
 def _file_arguments(machine: Machine) -> dict[str, str]:
-    """Those of its file, without the one that takes whatever home was found."""
+    """Return the load arguments without the one that accepts any home."""
     return {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
 
 
 def _check_is_writable(machine: Machine, path: Path) -> None:
-    sought = machine.closure.home_search
-    if sought is None or not sought.is_far:
+    search = machine.closure.home_search
+    if search is None or not search.is_far:
         machine = replace(machine, arguments=MappingProxyType(_file_arguments(machine)))
     copy_hint = f"write it into a copy: crane convert {machine.command_line_arguments} FOLDER"
     packaged_files = {
@@ -109,7 +109,7 @@ def _check_is_writable(machine: Machine, path: Path) -> None:
 
 
 def _check_written_home(path: Path, expected: Machine) -> None:
-    """Load the file that was written, and compare."""
+    """Load the file that was written, and compare its home."""
     try:
         machine = load(
             path,
@@ -135,11 +135,8 @@ def _apply_edits(text: str, edits: list[TextEdit]) -> str:
     return text
 
 
-# --- YAML ------------------------------------------------------------------------------------
-
-
 def _yaml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
-    """Edits of a machine file or robot.yaml."""
+    """Return the edits of a machine file or robot.yaml."""
     bom = text.startswith("\ufeff")
     line_break = "\r\n" if "\r\n" in text else "\n"
     top = yaml.compose(text[bom:], yaml.SafeLoader)
@@ -204,16 +201,13 @@ def _yaml_number(value: float) -> str:
     return str(yaml.safe_dump(value)).split("\n", 1)[0]
 
 
-# --- XML -------------------------------------------------------------------------------------
-
-
 def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
-    """Edits of a URDF."""
+    """Return the edits of a URDF."""
     data = text.encode("utf-8")
     line_break = "\r\n" if "\r\n" in text else "\n"
-    home_elements: list[tuple[int, int]] = []  # where a state's start tag begins, and its end tag
+    home_elements: list[tuple[int, int]] = []  # start of the start tag and of the end tag
     joints: dict[str, int] = {}
-    is_home_element: list[bool] = []  # whether an element on the way down is a state of home
+    is_home_element: list[bool] = []  # for each open element
     end = 0
     parser = expat.ParserCreate()
 
@@ -258,7 +252,7 @@ def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
 
 
 def _value_edit(text: str, position: int, value: float) -> TextEdit:
-    """The edit of the value in a `<joint>` tag."""
+    """Return the edit of the value in a `<joint>` tag."""
     tag = _TAG_PATTERN.match(text, position)
     old = None if tag is None else _VALUE_PATTERN.search(text, tag.start(), tag.end())
     assert old is not None, "it was read before"
@@ -266,7 +260,7 @@ def _value_edit(text: str, position: int, value: float) -> TextEdit:
 
 
 def _joint_elements(home: Mapping[str, float], line_break: str) -> str:
-    from xml.sax.saxutils import quoteattr  # which imports what the network needs
+    from xml.sax.saxutils import quoteattr  # slow to import
 
     tags = (
         f'    <joint name={quoteattr(x)} value="{value!r}"/>{line_break}'

@@ -1,18 +1,17 @@
-"""Joints with several freedoms as series of joints with one each.
+"""Composite joints as series of joints with one degree of freedom each.
 
-A joint J becomes joints J_x, J_y, ... with massless links J_1, J_2, ... between them. So every
-coordinate is one number with a rate of its own, and all that holds for machines of revolute and
-prismatic joints holds for these, too. The price is that of Cardan angles: where the second of
-three rotations is 90 degrees from its zero, the first and third turn about the same axis, and a
-closure through the joint is at the edge of its branch.
+A joint J becomes joints J_x, J_y, ... with massless links J_1, J_2, ... between them, so that all
+code for revolute and prismatic joints applies. The disadvantage is the singularity of Cardan
+angles: if the second of three rotations is at 90 degrees, the first and third have the same axis,
+and a closure through the joint is singular.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from crane.description.kinematic_tree import Joint, Link, Placement, Vector
+from crane.description.pinocchio_conversion import to_vector
 
 Freedom = tuple[str, str, Vector]  # suffix, kind, axis
 
@@ -24,15 +23,15 @@ _TRANSLATIONS: tuple[Freedom, ...] = (
     ("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z),
 )  # fmt: skip
 
-MULTI_FREEDOM_TYPES = ("floating", "planar", "spherical")  # types of URDF, and that of balls
+MULTI_FREEDOM_TYPES = ("floating", "planar", "spherical")  # types of URDF, and ball joints
 
 
 def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
-    """The freedoms of a joint with several.
+    """Return the degrees of freedom of a composite joint.
 
     Args:
         kind: One of `MULTI_FREEDOM_TYPES`.
-        axis: Normal of a planar joint's plane.
+        axis: Normal of the plane of a planar joint.
     """
     if kind == "spherical":
         return _ROTATIONS
@@ -43,10 +42,6 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
 
-    def to_vector(vector: np.ndarray) -> Vector:
-        x, y, z = (float(value) + 0.0 for value in vector)
-        return x, y, z
-
     return (
         ("x", "prismatic", to_vector(first)),
         ("y", "prismatic", to_vector(second)),
@@ -55,7 +50,7 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
 
 
 def series_joint_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
-    """Names of the joints that make up joint `name`."""
+    """Return the names of the joints of a composite joint."""
     return [f"{name}_{suffix}" for suffix, _, _ in freedoms]
 
 
@@ -66,12 +61,12 @@ def joint_series(
     end_links: tuple[str, str],
     source_location: str,
 ) -> list[Link | Joint]:
-    """The joints, and the links between them.
+    """Return the joints of a composite joint, and the links between them.
 
     Args:
-        name: Of the joint.
-        freedoms: Its freedoms, from the parent on.
-        placement: Of the first in the parent's frame.
+        name: Name of the composite joint.
+        freedoms: Its degrees of freedom, from the parent on.
+        placement: Placement of the first joint in the parent's frame.
         end_links: Parent and child link.
         source_location: File and line.
     """
@@ -80,17 +75,14 @@ def joint_series(
     found: list[Link | Joint] = [
         Link(link, source_location, composite_joint=name) for link in links[1:-1]
     ]
+    zero = (0.0, 0.0, 0.0)
     for i, (suffix, kind, axis) in enumerate(freedoms):
-        joint = Joint(
-            f"{name}_{suffix}",
-            kind,
-            links[i],
-            links[i + 1],
-            source_location,
-            axis=axis,
-            floating_joint=floating_joint,
-        )
+        xyz, rpy = (zero, zero) if i else placement
+        parent, child = links[i : i + 2]
         found.append(
-            joint if i else dataclasses.replace(joint, xyz=placement[0], rpy=placement[1])
-        )
+            Joint(
+                f"{name}_{suffix}", kind, parent, child, source_location, xyz, rpy, axis,
+                floating_joint=floating_joint,
+            )
+        )  # fmt: skip
     return found

@@ -1,4 +1,4 @@
-"""From a description to a machine."""
+"""Load machines: read a description, assemble it and close its loops."""
 
 import json
 import warnings
@@ -31,8 +31,7 @@ from crane.description import (
 )
 from crane.description.floating_bases import add_floating_base, check_freedoms
 from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_file
-from crane.formats.assembly_warnings import warn_about_assembly_modes
-from crane.formats.home_warnings import add_remedy, check_home
+from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.machine.drive_selection import select_free_joints, select_motors
 from crane.machine.machine import Machine
@@ -55,39 +54,40 @@ def load(
     arguments: Mapping[str, object] | None = None,
     strict: bool = False,
 ) -> Machine:
-    """Load a machine, perhaps with some of its numbers changed, or joints locked.
+    """Load a machine, optionally with changed parameters or locked joints.
 
     Args:
-        name: A bundled machine's name, a robot of example-robot-data by its file's name, or the
-            path of a machine file (.yaml), URDF (.urdf, .xacro, with `<loop>` elements if it has
-            loops), SDF (.sdf, .world) or MJCF (.xml).
+        name: Name of a bundled machine or of a robot of example-robot-data, or path of a machine
+            file (.yaml), URDF (.urdf, .xacro, with `<loop>` elements for loops), SDF (.sdf,
+            .world) or MJCF (.xml).
         changes: New values by the names of `crane.description.parameters`, such as
             {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
         lock: Coordinates [m], [rad] of joints to be fixed, by name.
-        active: Driven joints in the order of q_A, if not those of the file. Where there are more
-            than degrees of freedom, all of them are drives, see `Dynamics.drive_forces`.
-        free: Coordinates that nothing drives, if not those of the file. What the active joints
-            leave open is free anyway, with a warning.
-        floating: Whether the root floats instead of standing on the ground: a vehicle, a humanoid.
-            Its six freedoms, base_x to base_rz, are free, see `crane.description.floating_bases`;
-            of some freedoms their names, such as ("z", "ry") for one that heaves and pitches.
+        active: Active joints in the order of q_A, if not those of the file. If there are more than
+            degrees of freedom, all of them are drives, see `Dynamics.drive_forces`.
+        free: Free joints, which nothing drives, if not those of the file. Degrees of freedom
+            without an active joint are free anyway, with a warning.
+        floating: Whether the root floats instead of being fixed to the ground: a vehicle, a
+            humanoid. Its six joints, base_x to base_rz, are free, see
+            `crane.description.floating_bases`. For some of these freedoms give their names, such
+            as ("z", "ry") for heave and pitch.
         packages: Folders of the packages that files name by `package://`, `model://` and
-            `$(find ...)`, or folders in which these are, see `crane.common.package_search`.
+            `$(find ...)`, or folders that contain such packages, see
+            `crane.common.package_search`.
         arguments: Values of the arguments of a xacro file; `model` of an SDF with several models;
-            `urdf_constraint`, true where a URDF's `<constraint>` elements, as proposed upstream,
-            are to be read as loops, see `crane.formats.urdf.constraint_elements`;
-            `nearest_assembly`, true to take an assembly that is far from the home that a file
-            says.
-        strict: Whether to refuse, as `check` does, what can be computed with in spite of its
-            form: inertias that no body has, see `crane.machine.machine_checks`.
+            `urdf_constraint`, true to read the proposed `<constraint>` elements of a URDF as
+            loops, see `crane.formats.urdf.loop_elements`; `nearest_assembly`, true to accept a
+            home that is far from the home of the file.
+        strict: Whether to refuse, as `check` does, formal errors such as infeasible inertias, see
+            `crane.machine.machine_checks`.
 
     Returns:
-        The machine, its home posture closed.
+        The machine, closed at home.
 
     Raises:
         DescriptionError: A file is wrong; the message has file and line.
-        MechanismError: The parts do not make a machine that can be driven.
-        InputError: A change of a parameter that is not there, or to what cannot be.
+        MechanismError: The parts do not form a machine that can be driven.
+        InputError: A parameter is unknown or a value is not allowed.
     """
     package_paths, values = check_package_folders(packages), check_argument_values(arguments)
     floating = floating if isinstance(floating, bool) else check_freedoms(floating)
@@ -95,32 +95,30 @@ def load(
         summarize_warnings(),
         use_load_options(package_paths, values, bool(floating), strict) as options,
     ):
-        machine = _load_machine(name, changes, lock, active, free, floating)
+        spec = _read_spec(name, active, free, floating)
+        machine = _assemble_machine(spec, changes, lock, active, free, floating)
         return replace(
             machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
         )
 
 
 ClosureProvider = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
-_MAX_KNOWN_CLOSURES = (
-    3  # closures of variants: what is looked at beside one shares its loops or has its own
-)
-# What machines were made of before changes and locks, so that `MachineVariants` need not read it
-# again.
+_MAX_KNOWN_CLOSURES = 3  # of variants, kept for reuse
+# Descriptions of machines before changes and locks, so that `MachineVariants` can reuse them
 _SPEC_BEFORE_CHANGES: WeakKeyDictionary[Closure, MachineSpec] = WeakKeyDictionary()
 
 
 class MachineVariants:
-    """The machines that differ from one in their numbers alone.
+    """Variants of a machine that differ in parameters alone.
 
-    Its files are not read again, unless its loops were closed anew since it was loaded.
+    Files are not read again, unless the loops were closed anew since the machine was loaded.
 
     Args:
-        machine: As it was loaded; what was put onto it or replaced since is not in its files.
+        machine: The machine as loaded; parts added or replaced since are not in its files.
 
     Attributes:
-        spec: Its description, with its own changes.
-        parameters: Its numbers by name, see `crane.description.parameters`.
+        spec: Its description with its parameter changes.
+        values: Its parameters by name, see `crane.description.parameters`.
     """
 
     def __init__(self, machine: Machine):
@@ -133,13 +131,13 @@ class MachineVariants:
                 machine.floating_base,
             )
             self.spec = apply_parameter_changes(spec_before_changes, machine.parameter_changes)
-        # of a payload the description does not say that it is one
+        # the description has no payload mass after a change
         self.values = parameters(self.spec) | dict(machine.parameter_changes)
         self._spec_before_changes = spec_before_changes
         self._known_closures = [machine.closure] if machine.closure in _SPEC_BEFORE_CHANGES else []
 
     def machine(self, changes: Mapping[str, float]) -> Machine:
-        """The machine with some of its numbers changed, see `load`."""
+        """Return the machine with changed parameters, see `load`."""
         known_closures = self._known_closures
         variant = self._build_variant(changes, lambda *tree: _reuse_closure(known_closures, *tree))
         if all(variant.closure.structure is not closure.structure for closure in known_closures):
@@ -147,9 +145,9 @@ class MachineVariants:
         return variant
 
     def perturbed_machine(self, changes: Mapping[str, float]) -> Machine:
-        """The machine with numbers changed so little that its loops are the same.
+        """Return the machine with parameters changed so little that its loops stay the same.
 
-        A look at its numbers, of which nothing is told: see `Closure.perturbed_machine`.
+        No warnings are issued; see `Closure.perturbed_machine`.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
@@ -178,18 +176,6 @@ class MachineVariants:
             check_argument_values(original.arguments),
         )
         return use_load_options(folders, parameters, bool(original.floating_base))
-
-
-def _load_machine(
-    name: str | Path,
-    changes: Mapping[str, float] | None,
-    lock: Mapping[str, float] | None,
-    active: Sequence[str] | None,
-    free: Sequence[str] | None,
-    floating: bool | tuple[str, ...],
-) -> Machine:
-    spec = _read_spec(name, active, free, floating)
-    return _assemble_machine(spec, changes, lock, active, free, floating)
 
 
 def _read_spec(
@@ -279,7 +265,7 @@ def _reuse_closure(
     loops: Sequence[LoopSpec],
     couplings: Sequence[Coupling],
 ) -> Closure | None:
-    """One of some closures if the tree is at the same places as its own."""
+    """Return the first closure whose tree has the same geometry, with the masses of a model."""
     variants = (closure.with_other_masses(model, loops, couplings) for closure in closures)
     return next((closure for closure in variants if closure is not None), None)
 
@@ -304,10 +290,10 @@ def _check_joint_list(joints: object, label: str) -> Sequence[str] | None:
 
 
 def load_from_expression(expression: str) -> Machine:
-    """Load a machine by what `Machine.expression` says of it.
+    """Load a machine from the text of `Machine.load_expression`.
 
     Raises:
-        InputError: It says nothing that can be understood; otherwise as `load`.
+        InputError: The text is malformed; otherwise as `load`.
     """
     try:
         find_machine_file(expression)

@@ -1,4 +1,4 @@
-"""The convention of Gepetto's example-parallel-robots: robot.urdf with robot.yaml beside it."""
+"""Reader of Gepetto's example-parallel-robots: a robot.yaml beside a robot.urdf."""
 
 import dataclasses
 import re
@@ -20,7 +20,7 @@ from crane.formats.machine_file.structure_sections import read_home
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.formats.urdf.joint_graph import MOVABLE_TYPES
+from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
 from crane.formats.xml_file import XmlFile
 
@@ -46,21 +46,21 @@ _UNIVERSAL_PATTERN = re.compile(r"UJOINT_([XYZ])([XYZ])")
 
 
 def is_parallel_robot(file: Path) -> bool:
-    """Whether a YAML file is of this convention and no machine file."""
+    """Whether a YAML file follows this convention and is not a machine file."""
     try:
         text = read_plain_file(file, MAX_FILE_SIZE).decode("utf-8")
     except (OSError, UnicodeDecodeError):
-        return False  # which the reader of machine files says better
+        return False  # the reader of machine files reports it
     return (
         _CONVENTION_PATTERN.search(text) is not None and _MACHINE_FILE_PATTERN.search(text) is None
     )
 
 
 def read_parallel_robot(path: Path) -> MachineSpec:
-    """Read a machine from its yaml; the URDF of the same stem, or robot.urdf, stands beside it.
+    """Read a machine from its YAML file and the URDF of the same stem, or robot.urdf, beside it.
 
     Raises:
-        DescriptionError: With file, line, what is wrong, and the names that exist.
+        DescriptionError: A file is wrong; the message has file and line.
     """
     top = YamlSection.read(path, _ROBOT_FILE)
     file = next(
@@ -81,7 +81,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     if urdf.loops:
         raise DescriptionError(
             f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
-            f"closed_loop"
+            "closed_loop"
         )
     name = urdf.name
     chain = Chain(name, file, None, path.name, urdf.moving_joints)
@@ -96,7 +96,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
             raise top.error_at(
                 "name_mot",
                 f"the motor '{joint}' is {replaced_types[joint][0]}, drive a joint with one "
-                f"freedom",
+                "freedom",
             )
         tree.check_joint(joint, top.source_location("name_mot"))
     home, home_lines = read_home(top, tree)
@@ -124,7 +124,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
 
 
 def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
-    """Types that joints of the URDF are replaced by, and where that was written."""
+    """Return the new type of joints of the URDF, and its source location, by joint."""
     names = top.names("joint_name")
     if not names:
         return {}
@@ -149,7 +149,7 @@ def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
 def _replace_joint_types(
     xml: XmlFile, replaced_types: dict[str, tuple[str, str]], top: YamlSection
 ) -> None:
-    """Write the other types into a URDF."""
+    """Write other types of joints into a URDF."""
     joints = {joint.get("name", "").strip(): joint for joint in xml.root.iterfind("joint")}
     for name, (kind, _) in replaced_types.items():
         if name not in joints:
@@ -169,7 +169,7 @@ def _replace_joint_types(
 
 
 def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) -> UrdfModel:
-    """A universal joint as two about axes of the joint's frame, the first at the parent."""
+    """Return the URDF with a universal joint as two joints, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
         if isinstance(part, Joint) and part.name == name:
@@ -180,7 +180,7 @@ def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) ->
 
 
 def _universal_joint_parts(joint: Joint, axes: tuple[str, str], tree: Tree) -> list[Link | Joint]:
-    """What a joint becomes as a universal one, under names that the tree does not have."""
+    """Return the joints and links of a universal joint; their names must be unused."""
     freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
     place, end_links = (joint.xyz, joint.rpy), (joint.parent, joint.child)
     parts = joint_series(joint.name, freedoms, place, end_links, joint.source_location)
@@ -188,14 +188,13 @@ def _universal_joint_parts(joint: Joint, axes: tuple[str, str], tree: Tree) -> l
         if made.name in (tree.links if isinstance(made, Link) else tree.joints):
             raise DescriptionError(
                 f"{joint.source_location}: joint '{joint.name}' makes '{made.name}', which is "
-                f"there "
-                "already, rename one"
+                "there already, rename one"
             )
     return parts
 
 
 def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
-    """Loops between the frames of `closed_loop`: points that coincide, or frames."""
+    """Return the loops between the frames of `closed_loop`: spherical or fixed."""
     pairs = _read_pairs(top, "closed_loop") if "closed_loop" in top else []
     kinds = _read_texts(top, "type") if "type" in top else ["6d"] * len(pairs)
     if len(kinds) != len(pairs):

@@ -1,17 +1,112 @@
-"""A file of a robot as URDF, whatever it is written in: xacro is expanded, SDF translated."""
+"""Files of robots as URDF, whatever they are written in: xacro is expanded, SDF is translated."""
 
+import json
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from crane.common.errors import CraneWarning
-from crane.common.package_search import use_load_options
+from lxml import etree
+
+from crane.common.errors import (
+    CraneError,
+    CraneWarning,
+    DescriptionError,
+    InputError,
+    suggest_names,
+)
+from crane.common.optional_libraries import installation_hint
+from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_options
 from crane.description.specification import ForceElement
-from crane.formats.xacro.xacro_expansion import expand_xacro, needs_xacro
-from crane.formats.xml_file import XmlFile
+from crane.formats import xacro_process
+from crane.formats.xml_file import SourceLocations, XmlFile
 from crane.machine import Machine
+
+_XACRO_NAMESPACE = "http://www.ros.org/wiki/xacro"
+_INSTALL_HINT = f"is written with xacro, {installation_hint('xacro')}"
+_PACKAGE_ROOT = Path(__file__).resolve().parents[2]
+_TIMEOUT = 10 * xacro_process.MAX_SECONDS  # [s], for systems without CPU limits
+
+
+def needs_xacro(xml: XmlFile) -> bool:
+    """Whether a file has elements of xacro, or the suffix .xacro."""
+    if xml.file.suffix.lower() == ".xacro":
+        return True
+    return any(
+        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
+        for element in xml.root.iter()
+    )
+
+
+def expand_xacro(xml: XmlFile) -> XmlFile:
+    """Return a file with its macros expanded and the source locations of its elements.
+
+    xacro itself processes includes by `$(find PACKAGE)`, `package://` and paths, arguments,
+    conditions, properties and YAML.
+
+    Raises:
+        DescriptionError: xacro is not installed, or refuses the file.
+        InputError: The file does not have one of the given arguments.
+    """
+    answer = _run_xacro_process(xml.file)
+    if "missing" in answer:
+        raise DescriptionError(f"{xml.file.name}: {_INSTALL_HINT}")
+    if "wrong" in answer:
+        raise _expansion_error(xml.file, answer)
+    _check_arguments(xml.file, answer["arguments"])
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    root = etree.fromstring(answer["text"].encode("utf-8"), parser)
+    names = [Path(name).name for name in answer["files"]]
+    locations = SourceLocations(xml.file.name)
+    for element in root.iter(etree.Element):
+        number, _, line = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1").partition(
+            ":"
+        )
+        locations.set_location(element, f"{names[int(number)]}:{line}")
+    return XmlFile.from_root(xml.file, root, locations.locations)
+
+
+def _run_xacro_process(file: Path) -> dict[str, Any]:
+    """Return the answer of the process."""
+    options = load_options()
+    request = {
+        "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),
+        "arguments": dict(options.arguments),
+    }  # fmt: skip
+    program = [sys.executable, "-P", xacro_process.__file__]  # without its folder in sys.path
+    try:
+        completed = subprocess.run(
+            program, input=json.dumps(request).encode(), capture_output=True, timeout=_TIMEOUT
+        )
+        return dict(json.loads(completed.stdout))
+    except (subprocess.TimeoutExpired, ValueError):  # killed before it could answer
+        reason = f"expanding it takes more than {xacro_process.MAX_SECONDS} s"
+        return {"wrong": reason, "file": str(file)}
+
+
+def _expansion_error(file: Path, answer: dict[str, Any]) -> CraneError:
+    location = Path(answer.get("file") or file).name
+    if "line" in answer:
+        location += f":{answer['line']}"
+    if name := answer.get("package"):
+        return DescriptionError(
+            f"{location}: package '{name}' is not found, say where it is: --packages FOLDER, "
+            "packages=[...] in Python"
+        )
+    return DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
+
+
+def _check_arguments(file: Path, known_arguments: list[str]) -> None:
+    for name in load_options().arguments:
+        if name not in (*known_arguments, *OWN_ARGUMENTS):
+            raise InputError(
+                f"{file.name} has no argument '{name}', {suggest_names(known_arguments, name)}"
+            )
+
 
 _SDF_SUFFIXES = (".sdf", ".world")
 _ROBOT_SUFFIXES, _AMBIGUOUS_SUFFIXES = (".urdf", ".xacro", *_SDF_SUFFIXES), (".xml", ".mjcf")
@@ -22,8 +117,8 @@ class RobotDocument:
     """A robot as URDF.
 
     Attributes:
-        xml: Its elements, each with the place where it was written.
-        springs: What URDF has no place for.
+        xml: Its elements with their source locations.
+        springs: Springs, which URDF does not have.
     """
 
     xml: XmlFile
@@ -31,10 +126,10 @@ class RobotDocument:
 
 
 def open_robot(file: Path) -> RobotDocument:
-    """The robot of a file.
+    """Return the robot of a file as URDF.
 
     Raises:
-        DescriptionError: It cannot be read, expanded or translated.
+        DescriptionError: The file cannot be read, expanded or translated.
     """
     xml = XmlFile(file)
     if needs_xacro(xml):
@@ -42,14 +137,14 @@ def open_robot(file: Path) -> RobotDocument:
     if file.suffix.lower() in _SDF_SUFFIXES and xml.root.tag not in ("sdf", "robot"):
         raise xml.error_at(xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>")
     if xml.root.tag == "sdf":
-        from crane.formats.sdf.sdf_translation import translate_to_urdf  # most files are none
+        from crane.formats.sdf.sdf_translation import translate_to_urdf  # few files are SDF
 
         return RobotDocument(*translate_to_urdf(xml))
     return RobotDocument(xml)
 
 
 def is_robot_file(file: Path) -> bool:
-    """Whether a file is XML that holds a robot and no MuJoCo model."""
+    """Whether a file is XML with a robot and not a MuJoCo model."""
     suffix = file.suffix.lower()
     if suffix in _AMBIGUOUS_SUFFIXES:
         return XmlFile(file).root.tag in ("robot", "sdf")
@@ -63,7 +158,7 @@ def is_sdf_file(file: Path) -> bool:
 
 
 def is_simulator_file(file: Path) -> bool:
-    """Whether a file is SDF or MJCF: it says all joints at home, and is not written into."""
+    """Whether a file is SDF or MJCF, which give all coordinates of home and are not changed."""
     if file.suffix.lower() in (".yaml", ".yml"):
         return False
     return is_sdf_file(file) or not is_robot_file(file)
@@ -71,7 +166,7 @@ def is_simulator_file(file: Path) -> bool:
 
 @contextmanager
 def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterator[list[XmlFile]]:
-    """The robots that a machine was made of, while its packages are known; of MJCF there are none.
+    """Yield the robots that a machine was made of, with its load options active; MJCF has none.
 
     Args:
         machine: The machine.
@@ -79,7 +174,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
     """
     chain_names = None if chains is None else set(chains)
     with use_load_options(machine.packages, machine.arguments):
-        with warnings.catch_warnings():  # which were told when it was loaded
+        with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [
                 open_robot(chain.urdf).xml

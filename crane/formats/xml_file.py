@@ -1,4 +1,4 @@
-"""Strict reading of XML: nothing is expanded or fetched, every error has its line."""
+"""Strict reading of XML: no entities, no network access, source locations in all errors."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,31 +13,25 @@ from crane.description.findings import report_error
 from crane.description.kinematic_tree import Placement, Vector
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
-MAX_FILE_SIZE = 50_000_000  # bytes of a file
+MAX_FILE_SIZE = 50_000_000  # bytes
 _X = (1.0, 0.0, 0.0)
-_ROOT_ELEMENTS = {  # what a file holds by its suffix, if not a <robot>
+_ROOT_ELEMENTS = {  # by suffix, if not a <robot>
     ".sdf": "an <sdf>", ".world": "an <sdf>", ".mjcf": "a <mujoco>",
     ".xml": "a <robot>, an <sdf> or a <mujoco>",
 }  # fmt: skip
 _MAX_LINE_NUMBER = 1 << 16
-_MAX_VALUE_LENGTH = 60  # characters of a value in an error
-_REPEATABLE_ELEMENTS = {
-    "link",
-    "joint",
-    "loop",
-    "visual",
-    "collision",
-}  # elements that there may be more of
+_MAX_VALUE_LENGTH = 60  # characters shown
+_REPEATABLE_ELEMENTS = {"link", "joint", "loop", "visual", "collision"}
 
 
 class SourceLocations:
-    """Where elements were written that come from several files.
+    """Source locations of elements that come from several files.
 
     Args:
-        file: Name of the file for all that has no place of its own.
+        file: Name of the file, the location of elements without another.
 
     Attributes:
-        locations: Files and lines.
+        locations: All locations.
     """
 
     def __init__(self, file: str):
@@ -45,26 +39,24 @@ class SourceLocations:
         self._location_numbers = {file: 0}
 
     def set_location(self, element: etree._Element, location: str) -> None:
-        """Say where an element was written."""
+        """Set the location of an element."""
         number = self._location_numbers.setdefault(location, len(self.locations))
         if number == len(self.locations):
             self.locations.append(location)
-        element.sourceline = (
-            number if number < _MAX_LINE_NUMBER else 0
-        )  # all that the parser holds
+        element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
 
 
 class _RootDetector:
-    """What a parser finds up to the root element, in whatever encoding the file is."""
+    """Parser target that stops at the root element or document type, in any encoding."""
 
     class RootFound(Exception):  # noqa: N818
-        """The root element is there."""
+        """The root element was reached."""
 
     class DocumentTypeFound(Exception):  # noqa: N818
-        """There is one."""
+        """A document type was reached."""
 
     def doctype(self, *_: object) -> None:
-        """Called before anything of it is declared."""
+        """Called before the declarations of the document type."""
         raise self.DocumentTypeFound
 
     def start(self, *_: object) -> None:
@@ -79,7 +71,7 @@ class _RootDetector:
 
 
 def _refuse_document_type(file: Path, data: bytes) -> None:
-    """Raise for <!DOCTYPE>, whose entities may grow without bounds, or fetch."""
+    """Raise for <!DOCTYPE>, whose entities can expand without bounds or read other files."""
     try:
         etree.fromstring(data, etree.XMLParser(target=_RootDetector(), no_network=True))
     except _RootDetector.DocumentTypeFound:
@@ -87,7 +79,10 @@ def _refuse_document_type(file: Path, data: bytes) -> None:
         raise DescriptionError(
             f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
         ) from None
-    except (_RootDetector.RootFound, etree.XMLSyntaxError):  # told by whoever reads all
+    except (
+        _RootDetector.RootFound,
+        etree.XMLSyntaxError,
+    ):  # errors are reported by the actual parsing
         pass
 
 
@@ -100,9 +95,9 @@ class XmlFile:
     Attributes:
         file: The file.
         root: Its root element, without comments.
-        unnamed_kinds: Kinds of elements of which one has no name of its own.
-        locations: Where elements were written, if they come from several files: `sourceline` of an
-            element is a number in this list then.
+        unnamed_kinds: Tags of elements of which one has no unique name.
+        locations: Source locations if elements come from several files; `sourceline` of an element
+            is then an index in this list.
 
     Raises:
         DescriptionError: The file cannot be read, is not XML, or has a document type.
@@ -143,20 +138,20 @@ class XmlFile:
 
     @classmethod
     def from_root(cls, file: Path, root: etree._Element, locations: Sequence[str]) -> "XmlFile":
-        """What a file stands for: a root element made of it, and where each part was written."""
+        """Return an expanded file: its root element, and the source locations of its parts."""
         xml = cls.__new__(cls)
         xml.file, xml.root, xml.unnamed_kinds, xml.locations = file, root, set(), locations
         return xml
 
     def source_location(self, element: etree._Element) -> str:
-        """File and line of an element."""
+        """Return file and line of an element."""
         if self.locations:
             number = element.sourceline or 0
             return self.locations[number if number < len(self.locations) else 0]
         return f"{self.file.name}:{element.sourceline}"
 
     def error_at(self, element: etree._Element, problem: str) -> DescriptionError:
-        """An error that points at an element."""
+        """Return an error with the source location of an element."""
         return DescriptionError(f"{self.source_location(element)}: {problem}")
 
     def check_elements(
@@ -166,20 +161,20 @@ class XmlFile:
         attributes: Mapping[str, set[str]],
         closed_elements: set[str],
     ) -> None:
-        """Raise for tags and attributes that are slips of known ones, or in a wrong place.
+        """Raise for mistyped or misplaced tags and attributes.
 
-        Foreign ones (sensors, settings of simulators) are common and ignored, apart from
-        attributes of the elements `closed_elements`. Where findings are collected, slips are
-        mended, so that what stands there is read, too.
+        Foreign tags and attributes (sensors, settings of simulators) are common and ignored,
+        except attributes of `closed_elements`. While findings are collected, mistyped names are
+        corrected, so that the elements are read, too.
 
         Args:
-            element: Where to begin.
-            children: Tags that an element may contain.
-            attributes: Attributes that an element may have.
-            closed_elements: Elements that have no others.
+            element: The element to begin with.
+            children: Tags of child elements by tag.
+            attributes: Names of attributes by tag.
+            closed_elements: Tags of elements without foreign attributes.
 
         Raises:
-            DescriptionError: There is a slip.
+            DescriptionError: A name is mistyped or misplaced.
         """
         self._check_attributes(element, attributes.get(element.tag, set()), closed_elements)
         tags = children.get(element.tag, set())
@@ -188,7 +183,7 @@ class XmlFile:
                 continue
             if child.tag not in tags:
                 self._check_unknown_child(element, child, children)
-            if child.tag in tags:  # now
+            if child.tag in tags:  # possibly after a correction
                 self.check_elements(child, children, attributes, closed_elements)
 
     def _check_attributes(
@@ -209,7 +204,7 @@ class XmlFile:
     def _check_unknown_child(
         self, element: etree._Element, child: etree._Element, children: Mapping[str, set[str]]
     ) -> None:
-        """A child whose tag its parent does not have: a slip, in a wrong place, or foreign."""
+        """Report a child that is mistyped or misplaced; a foreign one is ignored."""
         tags = children.get(element.tag, set())
         similar = get_close_matches(child.tag.lower(), tags, 1, 0.75)
         if similar:
@@ -225,7 +220,7 @@ class XmlFile:
             )
 
     def single_child(self, element: etree._Element, tag: str, label: str) -> etree._Element | None:
-        """The child with a tag, if there is one.
+        """Return the child with a tag, None if there is none.
 
         Raises:
             DescriptionError: There are several.
@@ -238,17 +233,17 @@ class XmlFile:
     def number(
         self, element: etree._Element, name: str, label: str, default: float | None = None
     ) -> float:
-        """A finite number.
+        """Read a finite number.
 
         Args:
             element: The element.
-            name: Its attribute.
-            label: What it describes, for errors.
-            default: Value of a missing attribute; None if it must not be missing.
+            name: Name of the attribute.
+            label: Name of the element in errors.
+            default: Value of a missing attribute; None if it is required.
 
         Raises:
-            DescriptionError: Missing, not a number or not finite. Where findings are collected,
-                it is noted, and the number is NaN.
+            DescriptionError: Missing, not a number or not finite. While findings are collected, it
+                is recorded, and the number is NaN.
         """
         return self.vector(element, name, label, 1, None if default is None else (default,))[0]
 
@@ -260,7 +255,7 @@ class XmlFile:
         length: int,
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
-        """Finite numbers, as `number`."""
+        """Read finite numbers, see `number`."""
         try:
             return self._read_vector(element, name, label, length, default)
         except DescriptionError as error:
@@ -286,16 +281,16 @@ class XmlFile:
     def parse_numbers(
         self, element: etree._Element, text: str, label: str, length: int
     ) -> tuple[float, ...]:
-        """Finite numbers in a text.
+        """Parse finite numbers in a text.
 
         Args:
-            element: Where it stands.
+            element: The element that contains it.
             text: The text.
-            label: What it describes, for errors.
-            length: How many numbers there have to be.
+            label: Name of the value in errors.
+            length: Required count of numbers.
 
         Raises:
-            DescriptionError: There are others.
+            DescriptionError: The text is something else.
         """
         words = text.split()
         try:
@@ -314,7 +309,7 @@ class XmlFile:
         return values
 
     def direction(self, element: etree._Element, label: str, default: tuple[float, ...]) -> Vector:
-        """Unit vector of the child `<axis xyz="..."/>`; not read where the type uses none.
+        """Read the unit vector of the child `<axis xyz="..."/>`; ignored for types without axis.
 
         Raises:
             DescriptionError: It is zero or malformed.
@@ -329,7 +324,7 @@ class XmlFile:
         return unit
 
     def placement(self, element: etree._Element, label: str) -> Placement:
-        """Numbers xyz [m] and rpy [rad] of the child `<origin/>`, zeros without one.
+        """Read xyz [m] and rpy [rad] of the child `<origin/>`, zeros without one.
 
         Raises:
             DescriptionError: They are malformed.

@@ -25,7 +25,7 @@ from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec
-from crane.description.parameter_changes import parameter_value, tree_parameters
+from crane.description.machine_parameters import tree_parameters, value_at
 from crane.machine.drive_selection import specified_active_joints
 from crane.machine.machine_assembly import assemble_tree
 
@@ -167,7 +167,7 @@ def _numbers(
         return changed
 
     for name, part, way in tree_parameters(spec.tree, spec.chains):
-        if way[0] != "xyz" or part.name not in joints or not (now := parameter_value(part, way)):
+        if way[0] != "xyz" or part.name not in joints or not (now := value_at(part, way)):
             continue
         joint = spec.tree.joints[part.name]
         x, y, z = (value + size * (i == way[1]) for i, value in enumerate(joint.xyz))

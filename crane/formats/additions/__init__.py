@@ -1,4 +1,4 @@
-"""Parts and loops added to machines that were described without them."""
+"""Cylinders and loops added to machines that were described without them."""
 
 from crane.formats.additions.cylinder_addition import AddedCylinder, add_cylinder
 from crane.formats.additions.loop_addition import AddedLoops, add_loops

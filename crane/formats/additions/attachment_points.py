@@ -1,4 +1,4 @@
-"""Points of a machine between which something is put, and how far apart they are."""
+"""Attachment points of a machine, and the distance between two of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from crane.description.kinematic_tree import Joint, Vector
 from crane.description.pinocchio_conversion import to_vector
 from crane.machine import Machine
 
-_DIFFERENCE_STEP = 1e-5  # of the fastest coordinate, over which distances are differentiated
+_DIFFERENCE_STEP = 1e-5  # of the fastest coordinate, for central differences
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class AttachmentPoint:
     point: Vector
 
     def __str__(self) -> str:
-        """As it is written."""
+        """Return it in the notation that `parse_attachment_point` reads."""
         point = ",".join(f"{value:.6g}" for value in self.point)
         return f"{self.link}:{point}" if any(self.point) else self.link
 
     def placement(self, machine: Machine, q: Array) -> pin.SE3:
-        """Of the link's frame, moved to the point, in the world."""
+        """Return the pose of the link's frame, moved to the point, in the world."""
         data = machine.model.createData()
         pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
         link_placement = pin.updateFramePlacement(machine.model, data, machine.frame(self.link))
@@ -41,10 +41,10 @@ class AttachmentPoint:
 
 
 def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
-    """An eye as it is written: LINK, or LINK:x,y,z with metres in the link's frame.
+    """Parse LINK or LINK:x,y,z, metres in the link's frame.
 
     Raises:
-        InputError: There is no such link, or that is no point.
+        InputError: The link is unknown, or the text is malformed.
     """
     text = str(text)
     link, colon, coordinates = text.rpartition(":")
@@ -66,7 +66,7 @@ def parse_attachment_point(machine: Machine, text: str) -> AttachmentPoint:
 
 
 def joints_between(machine: Machine, first_link: str, second_link: str) -> list[Joint]:
-    """The moving joints of the tree between two links."""
+    """Return the movable joints of the tree between two links."""
     parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
     paths_to_root = []
     for link in (first_link, second_link):
@@ -80,33 +80,34 @@ def joints_between(machine: Machine, first_link: str, second_link: str) -> list[
     }
     return [
         joint
-        for way in paths_to_root
-        for joint in way
+        for path in paths_to_root
+        for joint in path
         if joint.is_movable and joint.name not in shared
     ]
 
 
 def vector_between(machine: Machine, points: Sequence[AttachmentPoint], q: Array) -> Array:
-    """(3,) or (N, 3) from the first eye to the second in the world [m].
+    """Return the vector (3,) or (N, 3) from the first point to the second in the world [m].
 
     Args:
-        machine: Whose they are.
-        points: Two of them.
-        q: (nq,) or (N, nq) postures.
+        machine: The machine.
+        points: Two attachment points.
+        q: (nq,) or (N, nq) configurations.
     """
     if q.ndim == 2:
         return np.array([vector_between(machine, points, one) for one in q])
-    first, second = (eye.placement(machine, q).translation for eye in points)
+    first, second = (point.placement(machine, q).translation for point in points)
     return np.asarray(second - first)
 
 
 def lever_arm(machine: Machine, points: Sequence[AttachmentPoint], q: Array, joint: str) -> float:
-    """Change of the distance of two eyes with an active joint: the lever arm [m], or a ratio.
+    """Return the derivative of the distance of two points by an active joint: the lever arm [m].
 
-    The derivative along gamma at a closed posture (nq,), by central differences.
+    For a prismatic joint it is a ratio. It is computed along gamma at a closed configuration
+    (nq,), by central differences.
 
     Raises:
-        ClosureError: The joint does not tell the posture there.
+        ClosureError: The configuration is singular.
     """
     gamma_column = machine.closure.gamma(q)[:, machine.active.index(joint)]
     step = _DIFFERENCE_STEP / float(np.abs(gamma_column).max())

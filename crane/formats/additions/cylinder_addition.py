@@ -1,4 +1,4 @@
-"""A cylinder put between two eyes of a machine: barrel and rod, closed by a loop."""
+"""Add a hydraulic cylinder between two attachment points of a machine, closed by a loop."""
 
 import warnings
 from collections.abc import Sequence
@@ -10,19 +10,51 @@ import numpy as np
 from crane.common.atomic_output import fill_folder, portable_file_name
 from crane.common.errors import CraneWarning, InputError
 from crane.formats.additions.attachment_points import joints_between, parse_attachment_point
-from crane.formats.additions.cylinder_chain import add_barrel_and_rod
-from crane.formats.additions.cylinder_fit import (
+from crane.formats.additions.distance_curve import (
+    DistanceCurve,
+    distance_curve,
     fit_to_joint_range,
     warn_about_masses,
     warn_about_strokes,
 )
-from crane.formats.additions.distance_curve import DistanceCurve, distance_curve
-from crane.formats.additions.drive_replacement import replace_drive
-from crane.formats.additions.output_files import check_files_are_new, machine_file_path
-from crane.formats.additions.steel_cylinder import SteelCylinder
+from crane.formats.additions.loop_addition import check_files_are_new, machine_file_path
+from crane.formats.additions.steel_cylinder import SteelCylinder, add_barrel_and_rod
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.machine_loading import load
 from crane.machine import Machine
+
+
+def replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str | None) -> None:
+    """Make a cylinder a drive in place of a joint, and remove sections of that joint."""
+    active, free = draft.data["active"], draft.data["free"]
+    if joint in active:
+        active[active.index(joint)] = name
+    else:
+        active.append(name)
+    draft.data["free"] = [other for other in free if other != joint]
+    removed = []
+    if draft.data["control"]:
+        draft.data["control"] = {}
+        removed.append("gains")
+    tasks = {key: task for key, task in draft.data["tasks"].items() if "tip" in task}
+    if len(tasks) < len(draft.data["tasks"]):
+        draft.data["tasks"] = tasks
+        removed.append("tasks of active joints")
+    cylinders = draft.data.get("hydraulics", {}).get("cylinders", {})
+    if joint in cylinders:
+        for section in draft.data["hydraulics"].values():
+            section.pop(joint, None)
+        removed.append(f"the hydraulics of {joint}")
+        if not cylinders:
+            del draft.data["hydraulics"]
+    if removed:
+        warnings.warn(
+            f"{machine.name}: {', '.join(removed)} belonged to the active joints as they were, "
+            "left out: write those of the new ones",
+            CraneWarning,
+            stacklevel=4,
+        )
+
 
 _NAME_SUFFIXES = (
     "", "_base", "_barrel", "_cross", "_rod", "_eye", "_pin", "_pin_y", "_pin_z", "_attachment",
@@ -31,23 +63,22 @@ _NAME_SUFFIXES = (
 
 @dataclass(frozen=True)
 class AddedCylinder:
-    """What was added, and what it does.
+    """A cylinder that was added to a machine.
 
     Attributes:
         path: The machine file.
-        name: Of the cylinder and its active joint, the stroke.
+        name: Name of the cylinder and of its active joint, the stroke.
         joint: The joint that it drives.
-        shares_load: Whether it shares the load with what drove the joint before, else in its
-            place.
-        unit: Of the joint.
-        limits: Of the joint, or what was looked at where it has none.
-        driven_range: Part of them that the stroke reaches.
-        length_range: (2,) least and largest distance of the eyes over `limits` [m].
+        shares_load: Whether the previous drive of the joint remains and shares the load.
+        unit: Unit of the joint's coordinate.
+        limits: Limits of the joint, or the examined range of a joint without limits.
+        driven_range: Part of the limits that the stroke reaches.
+        length_range: (2,) least and largest distance of the attachment points over `limits` [m].
         stroke_range: (2,) of the cylinder at both ends of `driven_range` [m].
-        lever_arm_range: (2,) least and largest lever arm over `driven_range` [m], of a slide a
-            ratio.
-        masses: Of barrel and rod [kg].
-        notes: What was assumed.
+        lever_arm_range: (2,) least and largest lever arm over `driven_range` [m]; a ratio for a
+            prismatic joint.
+        masses: Masses of barrel and rod [kg].
+        notes: Assumptions that were made.
     """
 
     path: Path
@@ -64,15 +95,15 @@ class AddedCylinder:
     notes: tuple[str, ...]
 
     def __str__(self) -> str:
-        """A few lines."""
+        """Return a few lines about the cylinder."""
         verb_phrase = "shares the load on" if self.shares_load else "drives"
         lever_arm_name = "lever arm" if self.unit == "rad" else "ratio"
         lines = [
             f"{self.name} {verb_phrase} {self.joint} from {self.driven_range[0]:.4g} to "
             f"{self.driven_range[1]:.4g} {self.unit}, with {self.stroke_range[0]:.4g} to "
             f"{self.stroke_range[1]:.4g} m of its stroke, {lever_arm_name} "
-            f"{self.lever_arm_range[0]:.3g} to "
-            f"{self.lever_arm_range[1]:.3g}{' m' * (self.unit == 'rad')}",
+            f"{self.lever_arm_range[0]:.3g} to {self.lever_arm_range[1]:.3g}"
+            f"{' m' * (self.unit == 'rad')}",
             f"barrel {self.masses[0]:.4g} kg, rod {self.masses[1]:.4g} kg of steel, without oil",
             *self.notes,
             f"written to {self.path}",
@@ -92,31 +123,33 @@ def add_cylinder(
     out: str | Path | None = None,
     force: bool = False,
 ) -> AddedCylinder:
-    """Put a cylinder between two points of a machine, and write the closed machine.
+    """Add a cylinder between two points of a machine, and write the closed machine.
 
-    The stroke becomes an active joint in place of the joint that it determines. Where the joints
-    between the two bodies move in one plane and the eyes lie in it, the barrel turns about an axis
-    normal to it and the rod's eye is a revolute loop; else the barrel has a universal joint and
-    the rod's eye a spherical one, so that the rod does not spin.
+    The stroke becomes an active joint in place of the joint that it determines. If the joints
+    between the two bodies move in one plane that contains the attachment points, the barrel has a
+    revolute joint about the normal and the rod is closed by a revolute loop. Otherwise the barrel
+    has a universal joint and the rod is closed by a spherical loop, so that the rod does not spin.
 
     Args:
         machine: As for `load`.
-        between: Eyes of barrel and rod: LINK, or LINK:x,y,z with metres in the link's frame.
+        between: Attachment points of barrel and rod: LINK, or LINK:x,y,z with metres in the link's
+            frame.
         bore: Diameter of the piston [m].
         rod: Diameter of the rod [m].
         stroke: [m].
-        name: Of the cylinder: its stroke, chain and loop; its links have it in front.
-        dead_length: Pin to pin with the rod in [m]; stroke and four bores if not given.
-        out: The machine file to write, its URDFs go to a folder beside of the same name without
-            suffix; MACHINE_NAME.yaml in this folder if not given.
-        force: Whether files that are there are replaced.
+        name: Name of the cylinder: of its stroke, chain and loop, and prefix of its links.
+        dead_length: Length between the pins with the rod retracted [m]; stroke plus four bores if
+            not given.
+        out: The machine file to write; its URDFs go to a folder of the same name without suffix;
+            MACHINE_NAME.yaml in the working folder if not given.
+        force: Whether to replace existing files.
 
     Returns:
-        What was added; `path` is the machine file, for `load`.
+        The added cylinder; `path` is the machine file, for `load`.
 
     Raises:
-        InputError: The cylinder is none, its eyes are not there, or it does not fit between them.
-        OutputError: The files cannot be written, or are there already.
+        InputError: A dimension is invalid, a point is unknown, or the cylinder does not fit.
+        OutputError: The files cannot be written, or exist already.
     """
     cylinder = SteelCylinder.from_dimensions(bore, rod, stroke, dead_length)
     if isinstance(between, str) or len(between) != 2:
@@ -141,7 +174,7 @@ def add_cylinder(
         draft.write(output_folder, file.name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
-            closed = load(output_folder / file.name)  # what does not load is not left behind
+            closed = load(output_folder / file.name)  # a file that does not load is not kept
         warn_about_strokes(closed, name)
     warn_about_masses(loaded, cylinder, distances.joint)
     return _added_cylinder(
@@ -150,7 +183,7 @@ def add_cylinder(
 
 
 def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool) -> list[str]:
-    """What was chosen: the joint that is driven, the posture to begin from."""
+    """Return notes on the choice of the driven joint and of the home configuration."""
     notes = []
     if distances.alternative_joints and not shares_load:
         notes.append(
@@ -161,7 +194,7 @@ def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool)
     if start_index != distances.home_index:
         notes.append(
             f"home: {distances.joint} at {distances.values[start_index]:.4g}, where the "
-            f"cylinder fits"
+            "cylinder fits"
         )
     return notes
 
@@ -176,7 +209,7 @@ def _added_cylinder(
     shares_load: bool,
     notes: Sequence[str],
 ) -> AddedCylinder:
-    """The result, from the postures that the cylinder reaches."""
+    """Return the result, from the configurations that the cylinder reaches."""
     lever_arms = np.abs(reached_distances.lever_arms)
     strokes = np.clip(
         reached_distances.length[[0, -1]] - cylinder.retracted_length, 0, cylinder.stroke
@@ -205,6 +238,5 @@ def _check_names_are_free(machine: Machine, name: str) -> None:
         if name + suffix in used_names:
             raise InputError(
                 f"'{name}{suffix}' is a part of '{machine.name}' already, give the cylinder "
-                f"another "
-                "name with --name"
+                "another name with --name"
             )

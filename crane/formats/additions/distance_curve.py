@@ -1,13 +1,15 @@
-"""How long a cylinder has to be over the range of the joint that it drives."""
+"""The distance of two attachment points over the range of a joint, and cylinders that fit it."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from crane.closure.active_joint_selection import coordinate_units
-from crane.common.errors import CraneError, InputError
+from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.formats.additions.attachment_points import (
     AttachmentPoint,
@@ -15,34 +17,31 @@ from crane.formats.additions.attachment_points import (
     lever_arm,
     vector_between,
 )
+from crane.formats.additions.steel_cylinder import SteelCylinder
 from crane.machine import Machine
 
-_FINE_SAMPLES = 400  # postures over the range of the joint
-_COARSE_SAMPLES = 24  # the same while it is not known which joint
-_STANDSTILL_TOLERANCE = 1e-9  # change of the length, as a share of it, that is none
-_CLOSING_RESOLUTION = (
-    1e-7  # share of the range to which it is known where the machine still closes
-)
-_ROUNDING_TOLERANCE = 1e-15  # of a coordinate's size
-_MIN_LEVER_ARM_SHARE = (
-    0.02  # share of the best lever arm below which a posture is as good as a dead centre
-)
+_FINE_SAMPLES = 400  # over the range of the joint
+_COARSE_SAMPLES = 24  # over the range of each candidate
+_STANDSTILL_TOLERANCE = 1e-9  # relative change of length, or rate relative to the joint's
+_CLOSING_RESOLUTION = 1e-7  # of the last closed configuration, relative to the step
+_ROUNDING_TOLERANCE = 1e-15  # relative to a coordinate
+_MIN_LEVER_ARM_SHARE = 0.02  # of the largest lever arm; below it is close to a dead centre
 
-RangeSample = tuple[float, Array]  # a coordinate and the posture (nq,) there
+RangeSample = tuple[float, Array]  # coordinate and configuration (nq,)
 
 
 @dataclass(frozen=True)
 class DistanceCurve:
-    """The distance between two eyes over the range of one active joint, others at home.
+    """The distance of two attachment points over the range of one active joint, others at home.
 
     Attributes:
-        machine: Whose they are.
-        points: The two.
+        machine: The machine.
+        points: The two points.
         joint: The joint.
-        values: (N,) its coordinates where the machine closes [m], [rad].
-        configurations: (N, nq) postures.
-        length: (N,) between the eyes [m].
-        home_index: Index of the home posture.
+        values: (N,) coordinates of the joint at which the machine closes [m], [rad].
+        configurations: (N, nq) configurations.
+        length: (N,) distances of the points [m].
+        home_index: Index of the home configuration.
         alternative_joints: Joints that a cylinder could drive instead.
     """
 
@@ -57,7 +56,7 @@ class DistanceCurve:
 
     @property
     def lever_arms(self) -> Array:
-        """(N,) change of the length with the coordinate: the lever arm [m], or a ratio."""
+        """(N,) derivatives of the distance by the coordinate: lever arms [m], or ratios."""
         return np.array(
             [lever_arm(self.machine, self.points, q, self.joint) for q in self.configurations]
         )
@@ -65,16 +64,16 @@ class DistanceCurve:
     def driven_part(
         self, min_length: float, max_length: float
     ) -> "tuple[int, DistanceCurve] | None":
-        """Where a cylinder of that length drives the joint.
+        """Return the part of the range over which a cylinder drives the joint.
 
         Args:
-            min_length: Its length with the rod in [m].
-            max_length: With the rod out [m].
+            min_length: Length of the cylinder with the rod retracted [m].
+            max_length: Length with the rod extended [m].
 
         Returns:
-            The posture to start from: home, or the nearest to it with a length between and a
-            lever arm; and what is reached from there before the stroke ends or a dead centre
-            comes, its ends found between the postures. None where no posture has such a length.
+            Index of the start: home, or the nearest configuration at which the cylinder fits with
+            a lever arm; and the curve from there to the ends of the stroke or to dead centres,
+            whose positions are refined. None if the cylinder fits nowhere.
         """
         tolerance = 1e-9 * max_length
         fits = (self.length >= min_length - tolerance) & (self.length <= max_length + tolerance)
@@ -133,18 +132,18 @@ class DistanceCurve:
         samples: Sequence[RangeSample],
         home_index: int,
     ) -> "DistanceCurve":
-        """The span over some postures, that at home among them."""
+        """Return the curve over some configurations, that at `home_index` being the home."""
         values, q = (np.array(part) for part in zip(*samples, strict=True))
         length = np.linalg.norm(vector_between(machine, points, q), axis=1)
         return cls(machine, points, joint, values, q, length, home_index)
 
 
 def distance_curve(machine: Machine, points: Sequence[AttachmentPoint]) -> DistanceCurve:
-    """The span over the active joint that a cylinder between two eyes takes the place of.
+    """Return the curve over the active joint that a cylinder between two points replaces.
 
-    That is an active joint between the two bodies, or one that turns and moves them by way of a
-    linkage; of several the one whose scaled coordinate changes the length the most, as the
-    condition of the drive wants it (see `crane.closure.active_joint_selection`).
+    Candidates are active joints between the two bodies, and revolute joints that move them through
+    a linkage. Of several, the joint with the largest scaled change of the distance is chosen, as
+    for the condition of the drives (see `crane.closure.active_joint_selection`).
 
     Raises:
         InputError: No joint changes the distance.
@@ -205,7 +204,7 @@ def _scan_joint_range(
     upper = upper if np.isfinite(upper) else max(home, lower) + default_range
     values = np.linspace(lower, upper, count + 1)
     home_index = int(np.argmin(np.abs(values - home)))
-    values[home_index] = home  # between its neighbours: it is nearer to this value than to them
+    values[home_index] = home  # replaces the nearest value, so the values remain sorted
     targets = np.tile(machine.home[machine.closure.active], (len(values), 1))
     targets[:, index] = values
     try:
@@ -222,7 +221,7 @@ def _scan_joint_range(
 def _samples_outwards(
     machine: Machine, joint: str, sample: RangeSample, values: Sequence[float]
 ) -> list[RangeSample]:
-    """Postures behind one, at coordinates of a joint, and the last at which the machine closes."""
+    """Return configurations at successive coordinates, up to the last one that closes."""
     found: list[RangeSample] = []
     for value in values:
         configuration = _solve_at(machine, joint, value, sample[1])
@@ -242,9 +241,9 @@ def last_closed_sample(
     resolution: float,
     condition: Callable[[Array], bool] = lambda q: True,
 ) -> RangeSample:
-    """The last posture, between one and a coordinate beyond, that closes and where it holds.
+    """Return the last configuration towards a limit that closes and satisfies a condition.
 
-    By bisection, until it is known to `resolution`.
+    It is found by bisection to a resolution.
     """
     value, q = sample
     while abs(limit - value) > resolution:
@@ -258,10 +257,121 @@ def last_closed_sample(
 
 
 def _solve_at(machine: Machine, joint: str, value: float, guess: Array) -> Array | None:
-    """Posture with a joint at a coordinate, others at home; None where it does not close."""
+    """Return the configuration with a joint at a coordinate, None if it does not close."""
     target = machine.home[machine.closure.active]
     target[machine.active.index(joint)] = value
     try:
         return machine.closure.solve(target, guess)
     except CraneError:
         return None
+
+
+_RESOLUTION = 1e-6  # of the reachable part, relative to the stroke
+
+
+def fit_to_joint_range(
+    distances: DistanceCurve,
+    cylinder: SteelCylinder,
+    points: Sequence[AttachmentPoint],
+    machine: Machine,
+) -> tuple[int, DistanceCurve]:
+    """Fit a cylinder to the range of a joint, with a warning if it does not drive all of it.
+
+    Returns:
+        Index of the home configuration, and the curve over the part that is reached.
+
+    Raises:
+        InputError: The cylinder fits nowhere, or the machine is not in metres.
+    """
+    length_limits = cylinder.retracted_length, cylinder.retracted_length + cylinder.stroke
+    if distances.length.min() > LONGEST:
+        raise InputError(
+            f"'{points[0]}' and '{points[1]}' are {distances.length.min():.4g} m apart and "
+            f"more, farther "
+            f"than a machine is large: look at its units with crane check, lengths are metres"
+        )
+    length_text = f"{distances.length.min():.4g} to {distances.length.max():.4g} m"
+    unit = machine.unit(distances.joint)
+    range_text = f"{distances.values[0]:.4g} to {distances.values[-1]:.4g} {unit}"
+    fit = distances.driven_part(*length_limits)
+    if fit is None:
+        fits = (distances.length >= length_limits[0]) & (distances.length <= length_limits[1])
+        lever_arm_hint = "with a lever arm " if fits.any() else ""
+        raise InputError(
+            f"a cylinder of {length_limits[0]:.4g} to {length_limits[1]:.4g} m does not fit "
+            f"{lever_arm_hint}between "
+            f"'{points[0]}' and '{points[1]}', {length_text} apart with {distances.joint} at "
+            f"{range_text}: choose "
+            "another stroke, dead length or eyes"
+        )
+    start_index, reached_distances = fit
+    if any(reached_distances.values[k] != distances.values[k] for k in (0, -1)):
+        index = machine.active.index(distances.joint)
+        is_unlimited = bool(np.isinf([machine.lower[index], machine.upper[index]]).all())
+        a, b = reached_distances.values[[0, -1]]
+        dead_centres = [
+            f"{reached_distances.values[k]:.4g}"
+            for k in (0, -1)
+            if reached_distances.values[k] != distances.values[k]
+            and np.abs(reached_distances.length[k] - length_limits).min()
+            > _RESOLUTION * cylinder.stroke
+        ]
+        dead_centre_text = (
+            f", with a dead centre at {' and '.join(dead_centres)}" if dead_centres else ""
+        )
+        if dead_centres or not is_unlimited:  # the stroke limits a joint without limits
+            warnings.warn(
+                f"'{distances.joint}' moves from {range_text}, and a cylinder of "
+                f"{length_limits[0]:.4g} to "
+                f"{length_limits[1]:.4g} m drives it from {a:.4g} to {b:.4g}{dead_centre_text}: "
+                f"its eyes are {length_text} "
+                "apart over all of it, choose stroke, dead length or eyes by that",
+                CraneWarning,
+                stacklevel=4,
+            )
+    return start_index, reached_distances
+
+
+def warn_about_masses(machine: Machine, cylinder: SteelCylinder, joint: str) -> None:
+    """Warn if all bodies that a joint moves are lighter than its cylinder."""
+    model, cylinder_mass = (
+        machine.model,
+        cylinder.barrel_inertial.mass + cylinder.rod_inertial.mass,
+    )
+    rates = machine.closure.gamma(machine.home)[:, machine.active.index(joint)]
+    moved_bodies = [
+        i for i, x in enumerate(model.joints)
+        if (np.abs(rates[x.idx_v : x.idx_v + x.nv]) > _STANDSTILL_TOLERANCE).any() and i
+    ]  # fmt: skip
+    bodies = {body for i in moved_bodies for body in model.subtrees[i]}
+    mass = sum(model.inertias[body].mass for body in bodies)
+    if mass < cylinder_mass:
+        warnings.warn(
+            f"the cylinder weighs {cylinder_mass:.4g} kg, and all that '{joint}' moves "
+            f"{mass:.3g} kg: "
+            "forces are little more than its own weight, give the bodies the masses of the real "
+            "machine",
+            CraneWarning,
+            stacklevel=4,
+        )
+
+
+def warn_about_strokes(machine: Machine, name: str) -> None:
+    """Warn of strokes at which the linkage does not close."""
+    if name not in machine.active:  # it shares the load of another drive
+        return
+    index, home = machine.active.index(name), machine.home
+    tolerance, unreachable = _RESOLUTION * machine.upper[index], []
+    for end in (float(machine.lower[index]), float(machine.upper[index])):
+        start = float(home[machine.column(name)]), home
+        last_stroke, _ = last_closed_sample(machine, name, start, end, tolerance)
+        if abs(end - last_stroke) > tolerance:
+            unreachable.append(f"{min(last_stroke, end):.4g} to {max(last_stroke, end):.4g} m")
+    if unreachable:
+        warnings.warn(
+            f"the linkage does not close at {' and '.join(unreachable)} of the stroke of "
+            f"'{name}', "
+            "beyond its dead centre: choose another stroke, dead length or eyes",
+            CraneWarning,
+            stacklevel=4,
+        )

@@ -1,4 +1,4 @@
-"""The loops that a description leaves open, put into a machine file."""
+"""Add the loops that a description leaves open to a machine file."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -6,27 +6,52 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from crane.common.atomic_output import fill_folder, portable_file_name
-from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError
+from crane.common.atomic_output import check_file_is_writable, fill_folder, portable_file_name
+from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError, OutputError
 from crane.common.package_search import use_load_options
 from crane.description import MachineSpec
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
-from crane.formats.additions.output_files import check_files_are_new, machine_file_path
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.machine_loading import load
 from crane.machine import Machine
 
 
+def machine_file_path(out: str | Path | None, default: str) -> Path:
+    """Return the machine file to write.
+
+    Raises:
+        InputError: The path has another suffix.
+        OutputError: It cannot be written.
+    """
+    file = Path(default if out is None else out)
+    if file.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"{file}: a machine file is written, let its name end in .yaml")
+    check_file_is_writable(file)
+    return file
+
+
+def check_files_are_new(draft: MachineDraft, file: Path, force: bool) -> None:
+    """Raise if a file exists that would be replaced without `force`.
+
+    Raises:
+        OutputError: A file exists already.
+    """
+    for relative_path in draft.file_paths(file.name):
+        target = file.parent / relative_path
+        if target.exists() and not force:
+            raise OutputError(f"{target}: exists already, choose another name or add --force")
+
+
 @dataclass(frozen=True)
 class AddedLoops:
-    """Loops that were taken over.
+    """Loops that were added to a machine.
 
     Attributes:
         path: The machine file.
-        loops: As they were proposed.
+        loops: The loops as proposed.
         active: Joints that drive the closed machine.
-        mobility: Its degrees of freedom.
+        mobility: Degrees of freedom of the closed machine.
     """
 
     path: Path
@@ -35,7 +60,7 @@ class AddedLoops:
     mobility: int
 
     def __str__(self) -> str:
-        """A few lines."""
+        """Return a few lines about the loops."""
         lines = [str(proposal) for proposal in self.loops]
         driven_text = ", ".join(self.active)
         lines.append(f"{self.mobility} degrees of freedom, driven by {driven_text or 'nothing'}")
@@ -50,16 +75,16 @@ def add_loops(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
 ) -> AddedLoops:
-    """Close the loops that `crane check` proposes, and write the closed machine.
+    """Add the loops that `crane check` proposes, and write the closed machine.
 
-    Active joints and home are those that the file names; what it leaves open is chosen as for any
-    machine and written down.
+    Active joints and home are those of the file; missing ones are chosen as for any machine and
+    written to the file.
 
     Args:
         machine: As for `load`.
-        out: The machine file to write, its URDFs go to a folder beside of the same name without
-            suffix; NAME_closed.yaml in this folder if not given.
-        force: Whether files that are there are replaced.
+        out: The machine file to write; its URDFs go to a folder of the same name without suffix;
+            NAME_closed.yaml in the working folder if not given.
+        force: Whether to replace existing files.
         packages: As for `load`.
         arguments: As for `load`.
 
@@ -67,9 +92,9 @@ def add_loops(
         The loops, the active joints, and the file that was written.
 
     Raises:
-        InputError: Nothing is left open.
+        InputError: The machine has no open loops.
         MechanismError: The machine does not close with them.
-        OutputError: The files cannot be written, or are there already.
+        OutputError: The files cannot be written, or exist already.
     """
     loaded, spec = _load_open_machine(machine, packages, arguments)
     proposed_loops = propose_loops(spec, loaded.model, loaded.home)
@@ -104,7 +129,7 @@ def _load_open_machine(
     packages: Sequence[str | Path],
     arguments: Mapping[str, object] | None,
 ) -> tuple[Machine, MachineSpec]:
-    """The open machine, whose loops are not worth a warning any more, and as it was read."""
+    """Load the open machine without warnings, and return it with its description."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         loaded = load(machine, packages=packages, arguments=arguments)

@@ -1,8 +1,8 @@
-"""Loops that a description seems to leave open, with the gap that each has to close.
+"""Search for loops that a description leaves open.
 
-Three things tell one: frames that are named as the two ends of a loop (see
-`crane.formats.machine_file_path.open_loop_warning`), ends of bodies that meet at home, and a
-barrel and a rod that hang on two bodies and point at each other.
+There are three indications: frames that are named as the two ends of a loop (see
+`crane.formats.machine_file.open_loop_warning`), ends of bodies that coincide at home, and a barrel
+and a rod on two bodies that point at each other.
 """
 
 import re
@@ -20,16 +20,13 @@ from crane.description.kinematic_tree import Joint, Vector
 from crane.description.pinocchio_conversion import to_vector
 from crane.formats.machine_file.open_loop_warning import loop_end_pairs
 
-_MAX_GAP_SHARE = 0.05  # share of the machine's size within which two ends meet
-_MAX_GAP_SHARE_WITHOUT_PLANE = 0.01  # the same where no plane tells that they belong together
-_MIN_OFFSET_SHARE = (
-    1e-6  # share of the size away from a body's origin where a frame is a place of its own
-)
-_MAX_DUMMY_MASS = (
-    1e-6  # [kg] that CAD exporters give frames; of a light machine a share of its heaviest link
-)
-_PARALLEL_TOLERANCE = 1e-6  # sine of an angle that counts as none
-_MIN_LOOP_JOINTS = 3  # joints of the tree below which a loop would lock what it closes
+# largest gaps relative to the characteristic length, the second without a common normal
+_MAX_GAP_SHARE = 0.05
+_MAX_GAP_SHARE_WITHOUT_PLANE = 0.01
+_MIN_OFFSET_SHARE = 1e-6  # of a frame from its body's origin, relative to the same length
+_MAX_DUMMY_MASS = 1e-6  # [kg] that CAD exporters give frames; relative for light machines
+_PARALLEL_TOLERANCE = 1e-6  # sine of an angle
+_MIN_LOOP_JOINTS = 3  # with fewer joints of the tree a loop would lock them
 _BARREL_PATTERN = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
 _ROD_PATTERN = re.compile(r"piston_?rod|rod|piston|ram|plunger", re.IGNORECASE)
 
@@ -39,9 +36,9 @@ class LoopProposal:
     """A loop that may be missing.
 
     Attributes:
-        loop: It.
-        gap: Between its frames at home, without what their slides can cover [m].
-        is_named: Whether names say so, else places.
+        loop: The proposed loop.
+        gap: Distance of its frames at home, less the travel of slides at its ends [m].
+        is_named: Whether names indicate it, and not positions.
     """
 
     loop: LoopSpec
@@ -49,7 +46,7 @@ class LoopProposal:
     is_named: bool
 
     def __str__(self) -> str:
-        """An entry of `loops` in a machine file, with its gap as a comment."""
+        """Return an entry of `loops` in a machine file, with the gap as a comment."""
         loop = self.loop
         axis = ", ".join(f"{value:.9g}" for value in loop.axis)
         axis_text = "" if loop.type in ("fixed", "spherical") else f", axis: [{axis}]"
@@ -60,23 +57,23 @@ class LoopProposal:
 
 
 def propose_loops(spec: MachineSpec, model: pin.Model, q: Array) -> tuple[LoopProposal, ...]:
-    """Loops that nothing closes, those that are named first, then the narrowest.
+    """Return loops that are open, first those indicated by names, then by increasing gap.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        q: (nv,) its home, closed or as the file guesses it.
+        q: (nv,) its home, closed or the initial guess.
     """
     return tuple(_OpenLoopSearch(spec, model, q).find_proposals())
 
 
 class _OpenLoopSearch:
-    """Places and axes of a tree at home.
+    """Poses and axes of a tree at home.
 
     Args:
         spec: The machine as read.
         model: Its tree.
-        q: (nv,) posture.
+        q: (nv,) configuration.
     """
 
     def __init__(self, spec: MachineSpec, model: pin.Model, q: Array):
@@ -97,7 +94,7 @@ class _OpenLoopSearch:
         self.loop_frames = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
 
     def _trace_tree(self) -> tuple[dict[str, frozenset[str]], dict[str, str]]:
-        """By link the moving joints down to the root, and the link that its body begins with."""
+        """Return the movable joints to the root, and the first link of the body, by link."""
         root = self.spec.tree.root_link
         joints_to_root, body_of_link, pending = {root: frozenset[str]()}, {root: root}, [root]
         while pending:
@@ -110,7 +107,7 @@ class _OpenLoopSearch:
         return joints_to_root, body_of_link
 
     def find_proposals(self) -> list[LoopProposal]:
-        """All proposals; two bodies are joined once."""
+        """Return all proposals, at most one for each pair of bodies."""
         proposed: list[LoopProposal] = []
         closed_bodies = {self._bodies_of(pair) for pair in self.loop_frames}
         used_frames = {frame for pair in self.loop_frames for frame in pair}
@@ -131,7 +128,7 @@ class _OpenLoopSearch:
                 yield self._create_proposal(name, kind, (first, second), axis, is_named=True)
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
-        """A barrel and a rod, each on a pin of its own, whose loop slides from pin to pin."""
+        """Yield loops between a barrel and a rod, each on its own pin."""
         links = [link for link in self._leaf_links() if self._is_on_revolute_joint(link)]
         rods = {_ROD_PATTERN.sub("", link): link for link in links if _ROD_PATTERN.search(link)}
         for barrel in links:
@@ -161,7 +158,7 @@ class _OpenLoopSearch:
                 )
 
     def _meeting_proposals(self) -> Iterator[LoopProposal]:
-        """Ends of two bodies that meet at home, or by what the slides above them may do."""
+        """Yield loops between frames that coincide at home or by the travel of a slide."""
         for first, second in self._nearby_pairs():
             if self.joints_by_parent.get(first) and self.joints_by_parent.get(second):
                 continue
@@ -181,8 +178,8 @@ class _OpenLoopSearch:
                 yield self._create_proposal(second, kind, (first, second), axis, is_named=False)
 
     def _nearby_pairs(self) -> Iterator[tuple[str, str]]:
-        """Pairs of frames that are near enough, or may be by their slides."""
-        frames = self._massless_frames()
+        """Yield pairs of frames that are close or can be moved together by slides."""
+        frames = [link for link in self.spec.tree.links if self._is_frame(link)]
         points = np.array([self.placements[link].translation for link in frames]).reshape(-1, 3)
         slide_ranges = np.array([self._slide_range(link) for link in frames])
         for i, first in enumerate(frames[:-1]):
@@ -196,21 +193,18 @@ class _OpenLoopSearch:
             yield from ((first, frames[i + 1 + int(k)]) for k in np.flatnonzero(is_near))
 
     def _slide_range(self, link: str) -> float:
-        """How far a slide that ends in a link can move it [m]."""
+        """Return the travel [m] of a slide that ends in a link."""
         joint = self.parent_joints.get(self.bodies[link])
         if joint is None or joint.kind != "prismatic":
             return 0.0
         return joint.limits.upper - joint.limits.lower
 
     def _leaf_links(self) -> list[str]:
-        """Links that carry nothing: frames, and what the last joints move."""
+        """Return links without child joints."""
         return [link for link in self.spec.tree.links if not self.joints_by_parent.get(link)]
 
-    def _massless_frames(self) -> list[str]:
-        """Frames without mass, and what slides at an end."""
-        return [link for link in self.spec.tree.links if self._is_frame(link)]
-
     def _is_frame(self, link: str) -> bool:
+        """Whether a link is a frame without mass, or a slide without child joints."""
         if link in (self.spec.tip, self.spec.tree.root_link):
             return False
         if self.parent_joints[link].is_movable:
@@ -221,7 +215,7 @@ class _OpenLoopSearch:
         return inertial is None or inertial.mass <= _MAX_DUMMY_MASS * min(1.0, self.largest_mass)
 
     def _is_away_from_origin(self, link: str) -> bool:
-        """Whether a frame is not just the origin of its body."""
+        """Whether a frame is not at the origin of its body."""
         offset = self.placements[link].translation - self.placements[self.bodies[link]].translation
         return bool(np.abs(offset).max() > _MIN_OFFSET_SHARE * self.characteristic_length)
 
@@ -233,11 +227,11 @@ class _OpenLoopSearch:
         return frozenset(self.bodies[link] for link in pair)
 
     def _joints_between(self, first: str, second: str) -> list[Joint]:
-        """Moving joints of the tree between two links."""
+        """Return the movable joints of the tree between two links."""
         return [self.joints[name] for name in sorted(self.ways[first] ^ self.ways[second])]
 
     def _gap(self, first: str, second: str) -> float:
-        """Between two links, moved towards each other by a slide that ends in one of them."""
+        """Return the distance of two links, less the travel of a slide that ends in one."""
         vector = self.placements[second].translation - self.placements[first].translation
         gaps = [float(np.linalg.norm(vector))]
         for link, sign in ((first, 1.0), (second, -1.0)):
@@ -256,9 +250,9 @@ class _OpenLoopSearch:
         return np.asarray(self.placements[joint.child].rotation @ np.array(joint.axis))
 
     def _loop_type_and_axis(self, first: str, second: str) -> tuple[str, Vector]:
-        """A pin where the ring moves in a plane and both frames say the same of its normal.
+        """Return revolute and its axis if the loop is planar with a normal common to both frames.
 
-        Else a ball, which leaves a planar ring the same freedoms.
+        Otherwise return spherical, which leaves a planar loop the same degrees of freedom.
         """
         loop_joints = self._joints_between(first, second)
         revolute_axes = [
@@ -293,7 +287,7 @@ class _OpenLoopSearch:
     def _with_unique_name(
         self, proposal: LoopProposal, earlier: Sequence[LoopProposal]
     ) -> LoopProposal:
-        """The proposal under a name that no loop has."""
+        """Return the proposal under a name that no loop has."""
         names = {loop.name for loop in self.spec.loops} | {one.loop.name for one in earlier}
         name, number = proposal.loop.name, 2
         while name in names:
@@ -302,14 +296,14 @@ class _OpenLoopSearch:
 
 
 def _type_from_name(name: str) -> tuple[str, Vector] | None:
-    """The type that a name says: example-parallel-robots joins frames unless it writes 3D."""
+    """Return the loop type that a name of example-parallel-robots implies."""
     if not re.match(r"closed?_?loop", name, re.IGNORECASE):
         return None
     return "spherical" if "3d" in name.lower() else "fixed", (0.0, 0.0, 1.0)
 
 
 def _round_direction(axis: Array) -> Vector:
-    """A direction without the rounding of zeros and ones, its largest number positive."""
+    """Return a direction without rounding errors, its largest component positive."""
     axis = np.round(axis, 9)
     if axis[np.abs(axis).argmax()] < 0:
         axis = -axis

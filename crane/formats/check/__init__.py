@@ -1,4 +1,4 @@
-"""Everything that is wrong or unusual about a description, at once."""
+"""Checks of a description: all errors and warnings at once."""
 
 from crane.formats.check.check_report import CheckReport, Finding, check
 

@@ -1,4 +1,4 @@
-"""The check of a machine: reading, assembling and closing it, and whether its numbers fit."""
+"""Check a machine: read, assemble and close it, and test whether its values are plausible."""
 
 import re
 import shlex
@@ -28,26 +28,26 @@ from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.robot_files import is_simulator_file
 from crane.machine.machine_checks import has_mass
 
-# "four_bar.yaml:12: what", or a file that has no line to point at
+# "four_bar.yaml:12: message", or a file name without a line
 _LOCATION_PATTERN = re.compile(
     r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml|\.sdf)|"
     r"(?<=\.xacro|\.world)): "
 )
-_MAX_FINDINGS = 500  # findings in a report
-_MAX_SHOWN_KINDS = 14  # kinds of findings on a screen
-_MAX_SHOWN_LOOPS = 8  # proposals on a screen
-_MAX_SHOWN_LINES = 6  # that have a finding of one kind
+_MAX_FINDINGS = 500  # in a report
+_MAX_SHOWN_KINDS = 14  # of findings in the printed report
+_MAX_SHOWN_LOOPS = 8  # proposed loops in the printed report
+_MAX_SHOWN_LINES = 6  # numbers of lines with findings of one kind
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong or unusual.
+    """One error or warning.
 
     Attributes:
         file: Name of the file, without its folder.
-        line: Its line; 0 where it is about the whole file.
-        is_error: Whether it keeps the machine from being loaded.
-        message: What it is, and what to do about it.
+        line: Line in the file; 0 if the finding is about the whole file.
+        is_error: Whether it prevents loading the machine.
+        message: The problem, and how to correct it.
     """
 
     file: str
@@ -62,15 +62,15 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a check found.
+    """Result of a check.
 
     Attributes:
-        findings: By file and line.
-        summary: One line on the machine, None where it cannot be loaded.
-        is_truncated: Whether there was more than is listed.
-        next_command: The command to type next.
+        findings: Errors and warnings, sorted by file and line.
+        summary: One line about the machine, None if it cannot be loaded.
+        is_truncated: Whether there are more findings than listed.
+        next_command: The suggested next command.
         proposals: Loops that the description seems to leave open.
-        notes: What is worth knowing, and neither wrong nor unusual.
+        notes: Information that is neither an error nor unusual.
     """
 
     findings: tuple[Finding, ...]
@@ -81,7 +81,7 @@ class CheckReport:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """All of it as the command prints it: what to mend, the machine, and what comes next."""
+        """Return the text that `crane check` prints."""
         texts = [*self.finding_lines, self.summary, *self.notes, self.counts * bool(self.findings)]
         return "\n".join(
             [*filter(None, texts), *self.proposed_loop_lines, f"next: {self.next_command}"]
@@ -89,7 +89,7 @@ class CheckReport:
 
     @property
     def proposed_loop_lines(self) -> list[str]:
-        """The proposed loops as they are pasted into a machine file."""
+        """The proposed loops as lines of a machine file."""
         if not self.proposals:
             return []
         lines = [f"  {proposal}" for proposal in self.proposals[:_MAX_SHOWN_LOOPS]]
@@ -99,7 +99,7 @@ class CheckReport:
 
     @property
     def finding_lines(self) -> list[str]:
-        """One screen: each kind of finding once, with the lines of those like it; errors first."""
+        """Each kind of finding once with the lines of similar ones, errors first."""
         groups: dict[tuple[str, bool, str], list[Finding]] = {}
         for finding in sorted(self.findings, key=lambda one: not one.is_error):
             groups.setdefault(
@@ -148,7 +148,7 @@ def check(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
 ) -> CheckReport:
-    """Read a machine as far as possible, and say all that is wrong or unusual about it.
+    """Read a machine as far as possible, and report all errors and warnings.
 
     The first error that `load` would raise is among the findings.
 
@@ -161,7 +161,7 @@ def check(
         arguments: As for `load`.
 
     Returns:
-        Findings with file and line, a summary, and what to do next; printed as `crane check` does.
+        Findings with file and line, a summary, and the next command.
 
     Raises:
         DescriptionError: There is no such file.
@@ -208,7 +208,7 @@ def _check_machine(
         open_loops = propose_loops(spec, closure.model, closure.home)
     notes = tuple(flow_shortages(spec)) if spec is not None and summary is not None else ()
     command_arguments = command_line_arguments(name, active, free)
-    if open_loops and summary is not None:  # driven as the closed machine will be
+    if open_loops and summary is not None:  # active joints are those of the closed machine
         command_arguments = command_line_arguments(
             name, options=replace(load_options(), floating_root=False)
         )
@@ -219,7 +219,7 @@ def _check_machine(
 
 
 def _format_group(findings: list[Finding]) -> str:
-    """Findings of one kind as one line."""
+    """Return findings of one kind as one line."""
     other_lines = [str(one.line) for one in findings[1:] if one.line]
     if len(findings) == 1:
         return str(findings[0])
@@ -235,7 +235,7 @@ def _next_command(
     summary: str | None,
     is_open: bool,
 ) -> str:
-    """What to type next, with a machine as `command_line_arguments` has it."""
+    """Return the suggested next command for a machine given as command line arguments."""
     if spec is None or closure is None or summary is None:
         return f"crane check {command_arguments} again, once the errors are mended"
     if is_open:
@@ -255,7 +255,7 @@ def _next_command(
 
 
 def _check_closure(spec: MachineSpec, findings: Findings) -> Closure | None:
-    """The closure of what was read, None where what is wrong with it forbids one."""
+    """Return the closure of a machine, None if errors prevent it."""
     if not findings.can_be_assembled:
         return None
     with error_recovery():

@@ -1,4 +1,4 @@
-"""What of a hydraulic circuit can be and is hardly meant: its connections, and what pumps give."""
+"""Warnings about connections and supplies of a hydraulic circuit that are probably unintended."""
 
 import math
 import warnings
@@ -16,13 +16,13 @@ from crane.hydraulics.components import Hydraulics, Valve
 from crane.hydraulics.load_sensing_stability import least_sensing_ratio, unstable_frequency_range
 from crane.hydraulics.supply_and_engine import MAIN_PUMP, TANK_NODE
 
-_MAX_DEMAND_RATIO = 1.01  # times a pump's flow from which on its valves take more than it has
-_MAX_PRESSURE_RISE = 0.1  # share of a pump's pressure by which a line may rise over it
-_LITRES_PER_MINUTE = 6e4  # per minute in a m3/s
+_MAX_DEMAND_RATIO = 1.01  # of the flow of its valves to the flow of a pump
+_MAX_PRESSURE_RISE = 0.1  # of a line, relative to the pressure of its pump
+_LITRES_PER_MINUTE = 6e4  # in 1 m3/s
 
 
 def warn_about_circuit(spec: MachineSpec) -> None:
-    """Warn of connections and regulators of a circuit that make no sense."""
+    """Warn of implausible connections and pump controls of a circuit."""
     if spec.hydraulics is None:
         return
     for key, text in (*_node_problems(spec.hydraulics), *_pump_problems(spec.hydraulics)):
@@ -33,9 +33,9 @@ def warn_about_circuit(spec: MachineSpec) -> None:
 
 
 def flow_shortages(spec: MachineSpec) -> list[str]:
-    """Pumps whose valves take more together than they give, a line each: most machines have some.
+    """Return a line for each pump whose valves take more flow together than it delivers.
 
-    Only valves that keep a flow are counted, those with a margin.
+    Only valves that control a flow count, those with a margin. Most machines have such pumps.
     """
     messages = []
     for name, supply in spec.hydraulics.pumps.items() if spec.hydraulics else ():
@@ -44,8 +44,7 @@ def flow_shortages(spec: MachineSpec) -> list[str]:
         if supply.flow > 0 and demand > _MAX_DEMAND_RATIO * supply.flow:
             messages.append(
                 f"hydraulics: the valves of '{name}' take {demand * _LITRES_PER_MINUTE:.3g} "
-                f"l/min together, "
-                f"it gives {supply.flow * _LITRES_PER_MINUTE:.3g} l/min"
+                f"l/min together, it gives {supply.flow * _LITRES_PER_MINUTE:.3g} l/min"
             )
     return messages
 
@@ -64,7 +63,7 @@ def _node_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
     kinds |= {name: "accumulator" for name in hydraulics.accumulators}
     for name, kind in kinds.items():
         if name not in connected or (name in return_nodes and name not in drained_nodes):
-            continue  # which has been said
+            continue  # has an error already
         if name not in fed_nodes:
             is_fed_from_tank = any(
                 x.kind == "check" and (x.source, x.target) == (TANK_NODE, name)
@@ -135,7 +134,7 @@ def _pump_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
                 f"give 'sensing' "
                 f"{min_damping:g} or more (damping of the load-sensing line)",
             )
-        # what it gives until its displacement is back, in a line that no way leads out of
+        # volume that it delivers into a closed line until its displacement is reduced
         pressure_rise = supply.flow * supply.response * hydraulics.oil.bulk_modulus / supply.volume
         if pressure_rise > _MAX_PRESSURE_RISE * supply.pressure and not _is_relieved(
             hydraulics, name, valves
@@ -150,7 +149,7 @@ def _pump_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
 
 
 def _is_relieved(hydraulics: Hydraulics, name: str, valves: Sequence[Valve]) -> bool:
-    """Whether a pump's line has a way out beside its closed valves, slip apart: that is slow."""
+    """Whether a pump's line has an outlet other than closed valves and its slow slip."""
     adjacent_elements = [
         part for part in hydraulics.elements.values() if name in (part.source, part.target)
     ]

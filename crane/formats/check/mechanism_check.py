@@ -1,6 +1,7 @@
-"""Whether the parts make a machine: every loop that does not close or does nothing."""
+"""Check that the loops of a machine close, at home, in its tasks and over its strokes."""
 
 import warnings
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pinocchio as pin
@@ -10,13 +11,12 @@ from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import least_squares_step
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
-from crane.common.errors import CraneWarning, MechanismError
+from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
-from crane.description import MachineSpec
+from crane.description import MachineSpec, Task
 from crane.description.findings import Findings, report_error
-from crane.formats.assembly_warnings import warn_about_assembly_modes
-from crane.formats.check.strokes import warn_of_strokes, warn_of_tasks
-from crane.formats.home_warnings import add_remedy, check_home
+from crane.description.specification import TIP_COORDINATES
+from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
 from crane.machine.machine_checks import (
     check_frame_elements,
@@ -24,20 +24,20 @@ from crane.machine.machine_checks import (
     replace_infeasible_inertias,
 )
 
-_OPEN_TOLERANCE = 1e-6  # [rad], [machine's size] from which on a loop is said to be open
+_OPEN_TOLERANCE = 1e-6  # [rad], [characteristic length]
 
 
 def check_mechanism(spec: MachineSpec, findings: Findings) -> Closure | None:
-    """Assemble and close a machine, and note what is wrong with it.
+    """Assemble and close a machine, and record errors and warnings.
 
-    Loops that lock nothing are left out once noted, so that the rest is checked, too.
+    Loops without effect are left out once recorded, so that the rest is checked, too.
 
     Args:
         spec: The machine as read.
-        findings: What has been noted so far.
+        findings: Errors recorded so far.
 
     Returns:
-        The closure, None where there is none.
+        The closure, None if the machine cannot be closed.
     """
     model = assemble_tree(spec)
     initial_guess = home_initial_guess(spec, model)
@@ -63,15 +63,15 @@ def check_mechanism(spec: MachineSpec, findings: Findings) -> Closure | None:
     check_home(spec, closure, initial_guess)
     warn_about_assembly_modes(spec, closure, initial_guess, thorough=True)
     if findings.can_be_assembled:
-        warn_of_tasks(spec, closure)
-        warn_of_strokes(spec, closure)
+        check_tasks(spec, closure)
+        check_strokes(spec, closure)
     return closure
 
 
 def _report_with_gaps(
     spec: MachineSpec, model: pin.Model, initial_guess: Array, error: MechanismError
 ) -> None:
-    """Note an error; where loops stay open, how far each does."""
+    """Record an error; if loops stay open, record the gap of each."""
     gaps = {}
     if isinstance(error, OpenLoopError):
         gaps, error = (
@@ -92,7 +92,7 @@ def _report_with_gaps(
 
 
 def _loop_gaps(spec: MachineSpec, model: pin.Model, initial_guess: Array) -> dict[str, str]:
-    """How far apart and askew the frames of open loops are, as near as they come to closing."""
+    """Return the position and angle gaps of open loops at the least-squares configuration."""
     equations = LoopEquations(model, spec.loops, spec.couplings)
     active = [equations.coordinates.column(name) for name in spec.active or ()]
     all_columns = np.arange(model.nv)
@@ -127,7 +127,7 @@ def _format_length(metres: float) -> str:
 
 
 def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
-    """Warn of passive joints that are outside of their limits at home."""
+    """Warn of passive joints outside of their limits at home."""
     coordinates = closure.equations.coordinates
     is_within_limits = within_limits(closure.equations, closure.home)
     for column in closure.passive:
@@ -142,3 +142,145 @@ def _warn_about_limits(spec: MachineSpec, closure: Closure) -> None:
                 CraneWarning,
                 stacklevel=2,
             )
+
+
+_MAX_SAMPLES, _MAX_SAMPLED_JOINTS = 150, 6000  # of the strokes; samples times joints
+_MAX_FAILURES = 20  # a failing sample takes a hundred times as long as one that closes
+_MAX_STROKE = 100.0  # [characteristic length]; a longer one is probably in millimetres
+_MIN_FAILED_SHARE = 0.01  # of the samples, for a warning
+_LIMIT_TOLERANCE = 1e-6  # [rad], [characteristic length], as in simulations
+
+
+def check_tasks(spec: MachineSpec, closure: Closure) -> None:
+    """Warn of points of tasks that are outside of limits or where loops do not close.
+
+    Points are via points, starts, and the end positions of phases. Points of the tip are only
+    compared with the total length of the links.
+
+    Args:
+        spec: The machine as read.
+        closure: Its loops, closed at home.
+    """
+    location, reach = spec.source_locations.get("tasks", spec.path.name), _reach(spec)
+    for name, task in spec.tasks.items():
+        for via in task.via if task.space == "tip" else ():
+            distance = float(np.linalg.norm([via.point.get(x, 0.0) for x in TIP_COORDINATES]))
+            if distance > reach:
+                _warn(
+                    f"{location}: task '{name}' has its tip {distance:.4g} m from the root at t = "
+                    f"{via.time:g} s, and all links in line are {reach:.4g} m long, choose a "
+                    "point within reach"
+                )
+                break
+        for instant, positions in _task_positions(task):
+            if problem := _position_problem(closure, instant, positions):
+                _warn(f"{location}: task '{name}' {problem}")
+
+
+def _position_problem(closure: Closure, instant: str, positions: Mapping[str, float]) -> str:
+    """Describe the first position outside of limits, or why the loops do not close, else ""."""
+    coordinates, names = closure.equations.coordinates, closure.active_names
+    tolerance = _LIMIT_TOLERANCE * closure.units
+    q_a = closure.home[closure.active].copy()
+    for joint in positions.keys() & set(names):
+        column = coordinates.column(joint)
+        lower, upper = coordinates.lower[column], coordinates.upper[column]
+        value = q_a[names.index(joint)] = positions[joint]
+        if not lower - tolerance[column] <= value <= upper + tolerance[column]:
+            unit = "m" if coordinates.is_translation[column] else "rad"
+            return (
+                f"has '{joint}' at {value:g} {unit} {instant}, beyond its limits {lower:g} to "
+                f"{upper:g} {unit}, choose a position within them"
+            )
+    try:
+        closure.solve(q_a)
+    except ClosureError as error:
+        return f"{instant}: {error}; choose another position"
+    return ""
+
+
+def check_strokes(spec: MachineSpec, closure: Closure) -> None:
+    """Warn of loops that do not close in a part of the box spanned by the strokes.
+
+    The box has the active prismatic joints in loops as axes; all other active joints are at home.
+
+    Args:
+        spec: The machine as read.
+        closure: Its loops, closed at home.
+    """
+    coordinates, active = closure.equations.coordinates, closure.active
+    lower, upper = coordinates.lower[active], coordinates.upper[active]
+    is_moved = coordinates.is_translation[active] & (
+        upper - lower < _MAX_STROKE * closure.characteristic_length
+    )
+    is_moved &= (closure.equations.sign[:, active] != 0).any(axis=0)
+    if not is_moved.any():
+        return
+    failures: list[tuple[float, str]] = []
+    sample_count = max(1, min(_MAX_SAMPLES, _MAX_SAMPLED_JOINTS // len(closure.home)))
+    span, home = (upper - lower)[is_moved], closure.home[active]
+    tried_count = 0
+    for share in _unit_box_points(int(is_moved.sum()), sample_count):
+        tried_count += 1
+        q_a = home.copy()
+        q_a[is_moved] = lower[is_moved] + share * span
+        try:
+            closure.solve(q_a)
+        except ClosureError as error:
+            distances = np.abs((q_a - home)[is_moved] / np.where(span > 0, span, 1.0))
+            failures.append((float(distances.max()), str(error)))
+            if len(failures) == _MAX_FAILURES:
+                break
+    failed_share = len(failures) / tried_count
+    if failed_share >= _MIN_FAILED_SHARE:
+        names = ", ".join(np.array(closure.active_names)[is_moved])
+        _warn(
+            f"{spec.source_locations.get('active', spec.path.name)}: {100 * failed_share:.0f} % "
+            f"of the strokes within the limits of {names} lie beyond dead centres, the nearest "
+            f"of those tried: {min(failures)[1]}; narrow the limits, or see that the lengths are "
+            "right"
+        )
+
+
+def _reach(spec: MachineSpec) -> float:
+    """Return the length [m] of all links from the root to the tip in line, slides extended."""
+    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
+    link, length = spec.tip, 0.0
+    while link in parent_joints:
+        joint = parent_joints[link]
+        length += float(np.linalg.norm(joint.xyz))
+        if joint.kind == "prismatic":
+            length += max(abs(joint.limits.lower), abs(joint.limits.upper))
+        link = joint.parent
+    return length
+
+
+def _task_positions(task: Task) -> Iterator[tuple[str, Mapping[str, float]]]:
+    """Yield positions of active joints that a task reaches, with the instant in words."""
+    if task.start:
+        yield "at its start", task.start
+    positions: dict[str, float] = {}
+    for via in task.via if task.space == "active" else ():
+        positions |= via.point
+        yield f"at t = {via.time:g} s", dict(positions)
+    positions = dict(task.start)
+    for phase in task.phases:
+        positions |= phase.until
+        yield f"at the end of phase '{phase.name}'", dict(positions)
+
+
+def _unit_box_points(count: int, samples: int) -> Array:
+    """Return (samples, count) points of the unit box, a low-discrepancy sequence.
+
+    They are multiples of powers of 1 / phi with phi^(k + 1) = phi + 1 for k coordinates (Roberts
+    2018).
+    """
+    phi = 2.0
+    for _ in range(40):
+        phi = (1 + phi) ** (1 / (count + 1))
+    steps = phi ** -np.arange(1.0, count + 1)
+    return np.remainder(0.5 + np.outer(np.arange(1, samples + 1), steps), 1.0)
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, CraneWarning, stacklevel=3)

@@ -1,7 +1,7 @@
-"""Numbers that can be, and hardly are: other units than SI, inertias that do not fit the drawing.
+"""Warnings about values that are possible but unlikely: wrong units, inertias that do not fit.
 
-The radius of gyration of a body is at most half of its size. Published arms exceed that sevenfold,
-perhaps because only part of a body is drawn. What is said here is beyond that.
+The radius of gyration of a body is at most half of its size. Published robot models exceed that up
+to sevenfold, perhaps because only a part of the body is drawn, so the bounds are wider.
 """
 
 import math
@@ -15,37 +15,53 @@ from crane.common.errors import CraneWarning
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description import MachineSpec, inertia_problem
-from crane.formats.check.link_bounds import Bounds, bounds_by_link, read_numbers
-from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, read_shapes
+from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
 
+Bounds = tuple[Array, Array]
+
+
+def read_numbers(element: etree._Element | None, key: str, count: int) -> Array | None:
+    """Return the finite numbers of an attribute, None if it has others."""
+    text = None if element is None else element.get(key)
+    try:
+        found = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        return None
+    return found if found.shape == (count,) and np.isfinite(found).all() else None
+
+
+def bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
+    """Return lowest and highest corner (3,) [m] of the shapes of each link, in its frame."""
+    corners: dict[str, list[Array]] = {}
+    for visual in visuals:
+        corners.setdefault(visual.link, []).append(visual.bounding_corners())
+    points = {link: np.concatenate(found) for link, found in corners.items()}
+    return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
+
+
 _REVOLUTION = 2 * math.pi
-_NO_LIMIT = 3600.0  # [rad] from which on limits stand for none, in whatever unit
-_MAX_GYRATION_SHARE, _MIN_GYRATION_SHARE = (
-    4.0,
-    0.01,
-)  # radius of gyration by the size of what is drawn
-_MAX_GYRATION_BY_JOINTS, _MIN_GYRATION_BY_JOINTS = (
-    20.0,
-    0.003,
-)  # by the distance of the joints, which says less
-_MAX_COM_DISTANCE = 3.0  # of the centre of mass, by the same size
-_MAX_DENSITY = 1e5  # [kg/m3] in the box about a link; osmium has 2.3e4
-_DUMMY_LIMITS = 1e-2, 1e-4  # [m], [kg] below which a link only stands for a sensor or a frame
+_NO_LIMIT = 3600.0  # [rad] from which on a limit means none, in any unit
+# radius of gyration relative to the size of the shapes, and to the distance of the joints
+_MAX_GYRATION_SHARE, _MIN_GYRATION_SHARE = 4.0, 0.01
+_MAX_GYRATION_BY_JOINTS, _MIN_GYRATION_BY_JOINTS = 20.0, 0.003
+_MAX_COM_DISTANCE = 3.0  # of the centre of mass, relative to the size of the shapes
+_MAX_DENSITY = 1e5  # [kg/m3] in the bounding box of a link; osmium has 2.3e4
+_DUMMY_LIMITS = 1e-2, 1e-4  # [m], [kg] below which a link only represents a sensor or frame
 
 ElementProblems = list[tuple[etree._Element, str]]
 
 
 def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | None) -> None:
-    """Warn of what is hardly meant, in files that could be parsed and in the home posture."""
+    """Warn of implausible values in parsed files and in the home configuration."""
     for xml in {xml.file: xml for xml in files}.values():
         shapes = read_shapes(xml, ("visual", "collision"))
         _warn_about_shapes(shapes)
         _warn_about_angles(xml)
-        if _warn_about_lengths(xml):  # sizes in other units say nothing about inertias
+        if _warn_about_lengths(xml):  # inertias cannot be compared with sizes in other units
             continue
         joint_distances = _joint_distances(xml)
-        # visuals count; where there are none, what a link collides with
+        # of visuals, or of collisions for links without visuals
         bounds = bounds_by_link(shapes.shapes["collision"]) | bounds_by_link(
             shapes.shapes["visual"]
         )
@@ -61,7 +77,7 @@ def _warn(text: str) -> None:
 
 
 def _warn_first(xml: XmlFile, problems: ElementProblems, hint: str) -> bool:
-    """Warn of the first of several, with their number."""
+    """Warn of the first problem with their number, and return whether there are any."""
     if problems:
         element, problem = problems[0]
         count_text = f" ({len(problems)} such in this file)" if len(problems) > 1 else ""
@@ -96,7 +112,7 @@ def _warn_about_lengths(xml: XmlFile) -> bool:
 
 
 def _largest_limit(joint: etree._Element) -> float:
-    """The end of a joint's range that is farthest from zero; 0 where it has none."""
+    """Return the limit with the largest magnitude, 0 for a joint without limits."""
     limit = joint.find("limit")
     limits = (read_numbers(limit, key, 1) for key in ("lower", "upper"))
     return max((float(end[0]) for end in limits if end is not None), key=abs, default=0.0)
@@ -167,7 +183,7 @@ def _warn_about_body(
     xx, xy, xz, yy, yz, zz = (float(part[0]) for part in parts if part is not None)
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if inertia_problem(float(mass[0]), tensor):
-        return  # which has been said
+        return  # has an error or warning already
     com = read_numbers(origin, "xyz", 3)
     gyration_radius = math.sqrt(float(np.linalg.eigvalsh(tensor).max()) / float(mass[0]))
     joint_distance = max(joint_distance, 0.0 if com is None else float(np.linalg.norm(com)))
@@ -186,7 +202,7 @@ def _size_problems(
     com: Array | None,
     mass: float,
 ) -> Iterator[tuple[str, str]]:
-    """What about a body does not fit its size: the tag to correct, and how it reads."""
+    """Yield tags and texts of properties of a body that do not fit its size."""
     hint = "correct the inertia (kg m2, about the centre of mass) or the mass (kg)"
     if bounds is None:
         if (
@@ -229,7 +245,7 @@ def _size_problems(
 
 
 def _joint_distances(xml: XmlFile) -> dict[str, float]:
-    """By link the distance of the farthest joint on it [m]."""
+    """Return the distance [m] of the farthest joint on each link."""
     found: dict[str, float] = {}
     for joint in xml.root.iterfind("joint"):
         parent, xyz = joint.find("parent"), read_numbers(joint.find("origin"), "xyz", 3)

@@ -41,9 +41,8 @@ from crane.formats.machine_file.parameter_locations import (
     parameter_locations,
 )
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.urdf_elements import add_joint, add_link
 from crane.formats.urdf_output import (
-    add_joint,
-    add_link,
     compound_drive_factors,
     copy_shapes,
     format_document,

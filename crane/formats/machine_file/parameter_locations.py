@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from crane.description.kinematic_tree import Link
-from crane.description.parameter_changes import (
+from crane.description.machine_parameters import (
     CIRCUIT_FIELDS,
     PINS_PREFIX,
     SPOOL_B,
     components_by_prefix,
     elements_by_prefix,
-    parameter_value,
     tree_parameters,
+    value_at,
 )
 from crane.description.sensors import SENSOR_PREFIX
 from crane.formats.machine_file.yaml_text import KeyPath
@@ -62,7 +62,7 @@ def parameter_locations(machine: Machine) -> dict[str, UrdfLocation | MachineFil
     """
     locations: dict[str, UrdfLocation | MachineFileLocation] = {}
     for name, owner, field_path in tree_parameters(machine.tree, machine.chains):
-        value = parameter_value(owner, field_path)
+        value = value_at(owner, field_path)
         if field_path[0] == "rotor_inertia":
             locations[name] = MachineFileLocation(("rotor_inertia", owner.name), value)
             continue

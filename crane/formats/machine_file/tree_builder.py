@@ -114,7 +114,7 @@ class TreeBuilder:
         """Find out which links of a chain make one body."""
         joints_by_parent = (
             urdf.tree.joints_by_parent()
-        )  # which is a forest, see `crane.formats.urdf.joint_graph`
+        )  # which is a forest, see `crane.formats.urdf.link_joint_elements`
         pending = [urdf.root_link]
         while pending:
             link = pending.pop()

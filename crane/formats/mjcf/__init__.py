@@ -1,1 +1,1 @@
-"""MuJoCo's format."""
+"""MJCF, the format of MuJoCo."""

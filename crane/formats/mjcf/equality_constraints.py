@@ -11,22 +11,22 @@ import pinocchio as pin
 from crane.common.errors import DescriptionError
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.mjcf.joint_effects import fixed_tendon_factors
-from crane.formats.mjcf.mujoco_file import MujocoFile
+from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 
-_DISTANCE_TOLERANCE = 1e-9  # relative difference of two distances that counts as none
-_TORQUE_SCALE_INDEX = 10  # its place among the numbers of a weld
+_DISTANCE_TOLERANCE = 1e-9  # relative
+_TORQUE_SCALE_INDEX = 10  # of torquescale in the data of a weld
 _Z = (0.0, 0.0, 1.0)
 
 
 @dataclass
 class MjcfFrames:
-    """Frames that sites and equality constraints put on bodies.
+    """Frames on bodies, at sites and ends of equality constraints.
 
     Attributes:
-        used_names: Names of links.
-        placements: Body and placement of each frame.
-        source_locations: Where it was written.
-        link_of_site: Link of each site.
+        used_names: Names of all links.
+        placements: Index of the body and placement on it, by frame.
+        source_locations: File and line by frame.
+        link_of_site: Name of the link by site.
     """
 
     used_names: set[str]
@@ -35,7 +35,7 @@ class MjcfFrames:
     link_of_site: dict[int, str] = field(default_factory=dict)
 
     def add(self, name: str, body: int, placement: pin.SE3, source_location: str) -> str:
-        """A frame, under a name that no link has yet."""
+        """Add a frame under a name that no link has, and return the name."""
         while name in self.used_names:
             name += "_"
         self.used_names.add(name)
@@ -43,14 +43,14 @@ class MjcfFrames:
         return name
 
     def remove_axis_site(self, link: str | None) -> None:
-        """Forget a site that only shows the direction of a hinge, as a written file has it."""
+        """Remove a site that only defines the axis of a hinge, as written files have it."""
         if link is not None and link.endswith("_axis"):
             self.placements.pop(link, None)
 
 
 @dataclass(frozen=True)
 class _ConstraintEnd:
-    """One end of a constraint: body and placement on it, and the site if it is one."""
+    """One end of a constraint: index of the body, placement on it, and link if it is a site."""
 
     body: int
     placement: pin.SE3
@@ -60,18 +60,18 @@ class _ConstraintEnd:
 def read_equality_constraints(
     mjcf: MujocoFile, frames: MjcfFrames, series_joints: Mapping[int, list[str]]
 ) -> tuple[tuple[LoopSpec, ...], tuple[Coupling, ...]]:
-    """Loops and couplings of the equality constraints that are switched on.
+    """Read the active equality constraints as loops and couplings.
 
-    `connect` is a spherical loop, `weld` a fixed one, or a spherical one if its `torquescale` is
-    zero. Two `connect` of the same two bodies, at points with the same distance on both, are a
-    hinge about the line through them: they become one revolute loop, whose five equations say the
-    same as their six. What a program moves (mocap) is no part of a machine, so constraints to it
-    are left out, and those within one body.
+    A `connect` is a spherical loop. A `weld` is a fixed loop, or a spherical one if its
+    `torquescale` is zero. Two `connect` of the same two bodies at points with equal distances on
+    both are a hinge about the line through the points: they become one revolute loop, whose five
+    equations are equivalent to their six. Constraints to mocap bodies, which a program moves, and
+    within one body are left out.
 
     Args:
         mjcf: The file.
-        frames: To which the ends of the loops are added.
-        series_joints: Joints that each joint of MuJoCo became.
+        frames: Receives the frames at the ends of the loops.
+        series_joints: Names of the joints of the machine by joint of MuJoCo.
 
     Raises:
         DescriptionError: A constraint is not linear in joints, or of another type.
@@ -102,24 +102,14 @@ def read_equality_constraints(
             fixes_rotation = model.eq_data[index, _TORQUE_SCALE_INDEX] != 0
             loop_type = "fixed" if fixes_rotation else "spherical"
             loops.append(_create_loop(name, loop_type, first, second, frames, source_location))
-        elif kind == "JOINT":
-            sums = [[(i, 1.0)] if i >= 0 else [] for i in _constrained_objects(model, index)]
+        elif kind in ("JOINT", "TENDON"):
             couplings.append(
-                _create_coupling(mjcf, name, source_location, sums, index, series_joints)
-            )
-        elif kind == "TENDON":
-            sums = [
-                _tendon_terms(mjcf, i, name, source_location)
-                for i in _constrained_objects(model, index)
-            ]
-            couplings.append(
-                _create_coupling(mjcf, name, source_location, sums, index, series_joints)
+                _create_coupling(mjcf, name, source_location, kind, index, series_joints)
             )
         else:
             raise DescriptionError(
                 f"{source_location}: the constraint '{name}' is a {kind.lower()}, which no "
-                f"machine has, use "
-                "connect, weld, joint or tendon"
+                "machine has, use connect, weld, joint or tendon"
             )
     return tuple(_combine_connects(pending_connects, frames) + loops), tuple(couplings)
 
@@ -128,16 +118,12 @@ def _constrained_objects(model: Any, index: int) -> tuple[int, int]:
     return int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
 
 
-def _constrained_bodies(model: Any, kind: str, objects: tuple[int, int]) -> list[int]:
-    """The bodies that a connect or weld joins."""
-    return [int(model.site_bodyid[x]) if kind == "SITE" else x for x in objects]
-
-
 def _is_without_effect(mjcf: MujocoFile, index: int, name: str) -> bool:
-    """Whether a connect or weld binds nothing of the machine, which is noted."""
+    """Whether a connect or weld has no effect on the machine, which is then noted."""
     model = mjcf.model
-    kind = mjcf.enumeration_name("Obj", model.eq_objtype[index])
-    bodies = _constrained_bodies(model, kind, _constrained_objects(model, index))
+    bodies = list(_constrained_objects(model, index))
+    if mjcf.enumeration_name("Obj", model.eq_objtype[index]) == "SITE":
+        bodies = [int(model.site_bodyid[site]) for site in bodies]
     if any(model.body_mocapid[body] >= 0 for body in bodies):
         mjcf.note_unsupported("constraints to what a program moves (mocap)", name)
         return True
@@ -150,14 +136,14 @@ def _is_without_effect(mjcf: MujocoFile, index: int, name: str) -> bool:
 def _constraint_ends(
     mjcf: MujocoFile, frames: MjcfFrames, index: int, kind: str
 ) -> tuple[_ConstraintEnd, _ConstraintEnd]:
-    """Both ends of a connect or weld, as MuJoCo compares them."""
+    """Return both ends of a connect or weld."""
     model, data = mjcf.model, mjcf.model.eq_data[index]
     objects = _constrained_objects(model, index)
     if mjcf.enumeration_name("Obj", model.eq_objtype[index]) == "SITE":
         first, second = (
             _ConstraintEnd(
                 int(model.site_bodyid[site]),
-                pin.SE3(_rotation_matrix(model.site_quat[site]), model.site_pos[site].copy()),
+                pose(model.site_quat[site], model.site_pos[site]),
                 frames.link_of_site[site],
             )
             for site in objects
@@ -167,18 +153,13 @@ def _constraint_ends(
         placements = [pin.SE3(np.eye(3), data[i : i + 3].copy()) for i in (0, 3)]
     else:
         placements = [
-            pin.SE3(_rotation_matrix(data[6:10]), data[3:6].copy()),
+            pose(data[6:10], data[3:6]),
             pin.SE3(np.eye(3), data[:3].copy()),
         ]
     first, second = (
         _ConstraintEnd(body, place, None) for body, place in zip(objects, placements, strict=True)
     )
     return first, second
-
-
-def _rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    w, x, y, z = (float(value) for value in quaternion / np.linalg.norm(quaternion))
-    return np.asarray(pin.Quaternion(w, x, y, z).toRotationMatrix())
 
 
 def _create_loop(
@@ -199,7 +180,7 @@ def _create_loop(
 def _combine_connects(
     connects: list[tuple[str, str, _ConstraintEnd, _ConstraintEnd]], frames: MjcfFrames
 ) -> list[LoopSpec]:
-    """Spherical loops, and revolute ones where two say so."""
+    """Return spherical loops, and revolute loops where two connects define a hinge."""
     pairs: dict[tuple[int, int], list[int]] = {}
     for i, (_, _, one, two) in enumerate(connects):
         pairs.setdefault((one.body, two.body), []).append(i)
@@ -222,7 +203,7 @@ def _combine_two_connects(
     indices: list[int],
     frames: MjcfFrames,
 ) -> LoopSpec | None:
-    """The revolute loop of two connected points, if it is one."""
+    """Return the revolute loop of two connects, None if they define none."""
     (name, where, *first_ends), (other, _, *second_ends) = (connects[i] for i in indices)
     lines = [
         second.placement.translation - first.placement.translation
@@ -254,13 +235,13 @@ def _combine_two_connects(
 
 
 def _round_to_frame_axis(axis: np.ndarray) -> np.ndarray:
-    """An axis along a direction of its frame, where it is one to rounding."""
+    """Return an axis, exactly along an axis of the frame if it is that to rounding."""
     nearest = np.round(axis)
     return nearest + 0.0 if np.abs(axis - nearest).max() < 1e-12 else axis
 
 
 def _rotation_along(direction: np.ndarray) -> np.ndarray:
-    """A rotation whose third column points along a line."""
+    """Return a rotation (3, 3) whose third column has a direction."""
     third = direction / np.linalg.norm(direction)
     first = np.cross(np.eye(3)[np.argmin(np.abs(third))], third)
     first /= np.linalg.norm(first)
@@ -270,14 +251,14 @@ def _rotation_along(direction: np.ndarray) -> np.ndarray:
 def _tendon_terms(
     mjcf: MujocoFile, tendon: int, name: str, source_location: str
 ) -> list[tuple[int, float]]:
-    """Joints of a fixed tendon and their factors; none for the tendon that is not there."""
+    """Return joints and factors of a fixed tendon, none for an absent tendon (index -1)."""
     if tendon < 0:
         return []
     factors = fixed_tendon_factors(mjcf, tendon)
     if factors is None:
         raise DescriptionError(
             f"{source_location}: the constraint '{name}' is about a tendon in space, use a "
-            f"fixed one"
+            "fixed one"
         )
     return list(factors.items())
 
@@ -286,20 +267,25 @@ def _create_coupling(
     mjcf: MujocoFile,
     name: str,
     source_location: str,
-    joint_sums: list[list[tuple[int, float]]],
+    kind: str,
     index: int,
     series_joints: Mapping[int, list[str]],
 ) -> Coupling:
-    """The coupling y - y_0 = a_0 + a_1 (x - x_0), x and y sums of factor times joint."""
+    """Return the coupling y - y_0 = a_0 + a_1 (x - x_0), where x and y are joints or tendons."""
     model = mjcf.model
+    joint_sums = [
+        _tendon_terms(mjcf, i, name, source_location)
+        if kind == "TENDON"
+        else [(i, 1.0)] * (i >= 0)
+        for i in _constrained_objects(model, index)
+    ]
     constant_coefficient, linear_coefficient, *higher_coefficients = (
         float(x) for x in model.eq_data[index, :5]
     )
     if any(higher_coefficients) and joint_sums[1]:
         raise DescriptionError(
             f"{source_location}: the constraint '{name}' is not linear, leave the higher powers "
-            f"of its "
-            "polycoef away"
+            "of its polycoef away"
         )
     factors: dict[str, float] = {}
     offset = constant_coefficient

@@ -1,7 +1,7 @@
-"""A MJCF file whose meshes and pictures are not there, compiled without them.
+"""Compile a MJCF file whose meshes and textures are missing without them.
 
-They are drawn and touched, which a machine does not do. Where the mass of a body comes from one
-as well, it is missing: told where the body is a part of one that has some, else refused.
+A machine needs them only where MuJoCo computes the mass of a body from a mesh. A moving body that
+has other mass is then lighter, which is noted; one without any other mass is an error.
 """
 
 import math
@@ -12,15 +12,15 @@ _MISSING_FILE_PATTERN = re.compile(r"opening file '([^']*)'")
 _ELEMENT_PATTERN = re.compile(r"Element name '([^']*)'")
 _IMAGE_COLLECTIONS = ("materials", "textures", "skins")
 _DRAWN_COLLECTIONS = ("geoms", "sites", "tendons")  # with materials
-_AUTOMATIC_INERTIA = 2  # of inertiafromgeom: where a body has no <inertial>
+_AUTOMATIC_INERTIA = 2  # value of inertiafromgeom: for bodies without an <inertial>
 
 
 class MassMissingError(Exception):
-    """A body that moves has no mass but that of a mesh that is not there.
+    """A moving body has no mass except that of a missing mesh.
 
     Args:
-        body: Its name.
-        mesh: The mesh's file.
+        body: Name of the body.
+        mesh: File of the mesh.
     """
 
     def __init__(self, body: str, mesh: str):
@@ -29,7 +29,7 @@ class MassMissingError(Exception):
 
 
 def missing_file(text: str) -> str:
-    """The file that MuJoCo could not open, by its words; empty where that is not what they say."""
+    """Return the file that MuJoCo could not open according to its message, else ""."""
     found = _MISSING_FILE_PATTERN.search(text)
     return found[1] if found else ""
 
@@ -37,19 +37,19 @@ def missing_file(text: str) -> str:
 def compile_without_missing_files(
     mujoco: Any, path: str, first_missing: str
 ) -> tuple[Any, list[str], dict[str, str]]:
-    """The compiled model without the meshes that are not there, and pictures.
+    """Compile a file without its missing meshes, and without materials and textures.
 
     Args:
         mujoco: The package.
         path: The MJCF file.
-        first_missing: A file that is not there.
+        first_missing: A missing file.
 
     Returns:
-        Model, names of the files, and of bodies whose mass lacks that of one of them.
+        Model, names of the missing files, and by name of each body that lost mass one of them.
 
     Raises:
-        MassMissingError: A body that moves has no mass without one of them.
-        Exception: Whatever MuJoCo raises; a ValueError where nothing can be taken out.
+        MassMissingError: A moving body has no mass without one of the files.
+        Exception: The error of MuJoCo; a ValueError if nothing can be removed.
     """
     spec = mujoco.MjSpec.from_file(path)
     if not hasattr(spec, "delete"):
@@ -80,13 +80,16 @@ def compile_without_missing_files(
 def _remove_shapes(
     spec: Any, name: str, moving_bodies: set[str], lighter_bodies: dict[str, str]
 ) -> bool:
-    """Take out the meshes and height fields of a file with their shapes; whether there are any.
+    """Remove the meshes and height fields of a file with their geoms.
 
     Args:
-        spec: What is compiled.
-        name: Of the file.
-        moving_bodies: See `_moving_bodies`.
-        lighter_bodies: Gets the bodies that lose mass, with the file.
+        spec: The `MjSpec`.
+        name: Name of the file.
+        moving_bodies: As `_moving_bodies` returns them.
+        lighter_bodies: Receives the bodies that lose mass, with the file.
+
+    Returns:
+        Whether there were any.
     """
     meshes = [x for x in spec.meshes if x.file and name.endswith(x.file)]
     fields = [x for x in spec.hfields if x.file and name.endswith(x.file)]
@@ -102,7 +105,7 @@ def _remove_shapes(
 
 
 def _moving_bodies(spec: Any) -> set[str]:
-    """Bodies that can move; MuJoCo cannot be asked any more where it has failed to compile."""
+    """Return the names of bodies that can move, without a compiled model."""
     found = set[str]()
     for body in spec.bodies:  # parents before children
         if body.parent is not None and (len(body.joints) or body.parent.name in found):
@@ -111,7 +114,7 @@ def _moving_bodies(spec: Any) -> set[str]:
 
 
 def _contributes_mass(spec: Any, geom: Any, moving_bodies: set[str]) -> bool:
-    """Whether a shape gives mass to a body that can move."""
+    """Whether a geom contributes to the mass of a moving body."""
     settings, body = spec.compiler, geom.parent
     inertia_mode = int(settings.inertiafromgeom)
     if not inertia_mode or (inertia_mode == _AUTOMATIC_INERTIA and body.explicitinertial):

@@ -1,4 +1,4 @@
-"""MJCF files of MuJoCo: bodies, joints, equality constraints and actuators."""
+"""Read a machine from a MJCF file of MuJoCo."""
 
 import dataclasses
 from pathlib import Path
@@ -9,7 +9,6 @@ import pinocchio as pin
 from crane.common.errors import DescriptionError
 from crane.description.floating_bases import with_rotation_vectors
 from crane.description.kinematic_tree import (
-    Inertial,
     Joint,
     Limits,
     Link,
@@ -25,10 +24,13 @@ from crane.description.pinocchio_conversion import (
 from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.joint_series import joint_freedoms, joint_series
 from crane.formats.machine_file.tree_builder import TreeBuilder
-from crane.formats.mjcf.actuator_drives import read_drives
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
-from crane.formats.mjcf.joint_effects import isotropic_rotor_inertia, read_joint_effects
-from crane.formats.mjcf.mujoco_file import MujocoFile
+from crane.formats.mjcf.joint_effects import (
+    isotropic_rotor_inertia,
+    read_drives,
+    read_joint_effects,
+)
+from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 from crane.formats.mjcf.unsupported_features import note_unsupported_features
 from crane.formats.urdf.urdf_reader import UrdfModel
 
@@ -36,17 +38,18 @@ from crane.formats.urdf.urdf_reader import UrdfModel
 def read_mjcf(path: Path) -> MachineSpec:
     """Read a machine from a MJCF file.
 
-    Coordinates are MuJoCo's: of a hinge or slide its `qpos`, of a ball the Cardan angles from its
-    body's rest, of a free joint its body's place and Cardan angles in the world.
+    The coordinate of a hinge or slide is its `qpos`. A ball joint has the Cardan angles of its
+    body relative to the reference pose, a free joint position and Cardan angles in the world.
 
     Raises:
-        DescriptionError: With file, line, and what is wrong or is not a part of a machine.
+        DescriptionError: The file is wrong or has an element that no machine has; the message has
+            file and line.
     """
     return _MjcfReader(MujocoFile(path)).read_spec()
 
 
 class _MjcfReader:
-    """What has been read so far.
+    """Reads a compiled file.
 
     Args:
         mjcf: The file.
@@ -56,26 +59,24 @@ class _MjcfReader:
         self.mjcf, self.model = mjcf, mjcf.model
         self.links: dict[str, Link] = {}
         self.joints: dict[str, Joint] = {}
-        self.body_links: list[str] = []  # their links
-        self.parts: dict[int, list[str]] = {}  # joint of MuJoCo -> joints
+        self.body_links: list[str] = []  # name of the link by index of the body
+        self.series_joints: dict[int, list[str]] = {}  # names of joints by joint of MuJoCo
 
     def read_spec(self) -> MachineSpec:
-        """The machine."""
+        """Return the machine."""
         mjcf = self.mjcf
-        self.names = [mjcf.joint_name(i) for i in range(self.model.njnt)]
+        self.names = [mjcf.name("JOINT", i) for i in range(self.model.njnt)]
         for body in range(self.model.nbody):
             self._read_body(body)
         if not self.model.njnt:
             raise DescriptionError(f"{mjcf.file.name}: no joint moves in this file, add one")
         frames = self._read_frames()
-        loops, couplings = read_equality_constraints(mjcf, frames, self.parts)
+        loops, couplings = read_equality_constraints(mjcf, frames, self.series_joints)
         for link, (body, placement) in frames.placements.items():
-            self._add_link(link, frames.source_locations[link])
+            self.links[link] = Link(link, frames.source_locations[link])
             self._add_fixed_joint(link, self.body_links[body], placement)
-        effects, drives = (
-            read_joint_effects(mjcf, self.parts, frames.link_of_site),
-            read_drives(mjcf, self.parts),
-        )
+        effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site)
+        drives = read_drives(mjcf, self.series_joints)
         note_unsupported_features(mjcf)
         urdf = UrdfModel(
             mjcf.file,
@@ -94,7 +95,7 @@ class _MjcfReader:
             tree.check_loop(loop)
         active = self._listed_joints("active")
         for drive in drives if not active else ():
-            # one joint of each: what else it moves hangs on that, or is another coordinate
+            # one joint of each drive: its other joints depend on that, or are other coordinates
             active += [x for x in drive.factors if x not in active][:1]
         free = self._listed_joints("free")
         home, tip = self._read_home(), self._read_tip(tree)
@@ -121,24 +122,15 @@ class _MjcfReader:
         return with_rotation_vectors(spec)
 
     def _unique_link_name(self, name: str) -> str:
-        """A name for a link that no body and no other link has."""
-        used_names = {self.mjcf.body_name(i) for i in range(self.model.nbody)}
+        """Return a name that no body and no other link has."""
+        used_names = {self.mjcf.name("BODY", i) for i in range(self.model.nbody)}
         used_names |= self.links.keys()
         while name in used_names:
             name += "_"
         return name
 
-    def _add_link(
-        self,
-        name: str,
-        source_location: str,
-        inertial: Inertial | None = None,
-        composite_joint: str | None = None,
-    ) -> None:
-        self.links[name] = Link(name, source_location, inertial, composite_joint)
-
     def _add_fixed_joint(self, link: str, parent: str, placement: pin.SE3) -> None:
-        """Fix a link to another."""
+        """Add a joint that fixes a link to another."""
         name = f"{link}_fixed"
         while name in self.joints or name in self.names:
             name += "_"
@@ -148,25 +140,26 @@ class _MjcfReader:
         )
 
     def _read_body(self, body: int) -> None:
-        """A body with its joints."""
-        model, name = self.model, self.mjcf.body_name(body)
+        """Read a body with its joints."""
+        model, name = self.model, self.mjcf.name("BODY", body)
         source_location = self.mjcf.source_location(name, "body")
         self.body_links.append(name)
         if body == 0:
-            self._add_link(name, source_location)
+            self.links[name] = Link(name, source_location)
             return
-        rotation = _rotation_matrix(model.body_iquat[body])
+        inertia_pose = pose(model.body_iquat[body], model.body_ipos[body])
+        rotation = inertia_pose.rotation
         tensor = rotation @ np.diag(model.body_inertia[body]) @ rotation.T
         first = model.body_jntadr[body]
         joints = range(first, first + model.body_jntnum[body])
         for joint in joints:
-            if self.mjcf.enumeration_name("Joint", model.jnt_type[joint]) in ("BALL", "FREE"):
+            if self.mjcf.joint_type(joint) in ("BALL", "FREE"):
                 tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
-        inertia = pin.Inertia(float(model.body_mass[body]), model.body_ipos[body].copy(), tensor)
+        inertia = pin.Inertia(float(model.body_mass[body]), inertia_pose.translation, tensor)
         parent = self.body_links[model.body_parentid[body]]
-        placement = pin.SE3(_rotation_matrix(model.body_quat[body]), model.body_pos[body].copy())
+        placement = pose(model.body_quat[body], model.body_pos[body])
         series_joints: list[Joint] = []
-        previous_anchor = np.zeros(3)  # anchor of the part before, in the body's frame
+        previous_anchor = np.zeros(3)  # anchor of the previous joint, in the body's frame
         for joint in joints:
             if model.jnt_type[joint] == 0:
                 placement = pin.SE3.Identity()
@@ -175,10 +168,10 @@ class _MjcfReader:
             new_joints = self._read_joint(
                 joint, placement * anchor_offset if not series_joints else anchor_offset
             )
-            self.parts[joint] = [part.name for part in new_joints]
+            self.series_joints[joint] = [part.name for part in new_joints]
             series_joints += new_joints
             previous_anchor = anchor
-        self._add_link(name, source_location, inertial_from_inertia(inertia))
+        self.links[name] = Link(name, source_location, inertial_from_inertia(inertia))
         for i, part in enumerate(series_joints):
             last = i == len(series_joints) - 1
             child = (
@@ -187,7 +180,9 @@ class _MjcfReader:
                 else self._unique_link_name(f"{name}_{i + 1}")
             )
             if child != name:
-                self._add_link(child, source_location, composite_joint=None if last else name)
+                self.links[child] = Link(
+                    child, source_location, composite_joint=None if last else name
+                )
             if part.name in self.joints:
                 raise DescriptionError(
                     f"{part.source_location}: two joints '{part.name}', rename one"
@@ -202,10 +197,10 @@ class _MjcfReader:
             )
 
     def _read_joint(self, joint: int, placement: pin.SE3) -> list[Joint]:
-        """The freedoms of a joint, without their links."""
+        """Return the joints with one freedom that a joint consists of, without their links."""
         model, name = self.model, self.names[joint]
         source_location = self.mjcf.source_location(name, "joint", "freejoint")
-        kind = self.mjcf.enumeration_name("Joint", model.jnt_type[joint])
+        kind = self.mjcf.joint_type(joint)
         if kind in ("BALL", "FREE"):
             parts = joint_freedoms("spherical" if kind == "BALL" else "floating", (0.0, 0.0, 1.0))
             series_parts = joint_series(
@@ -213,42 +208,30 @@ class _MjcfReader:
             )
             return [part for part in series_parts if isinstance(part, Joint)]
         axis = model.jnt_axis[joint].copy()
-        is_hinge = kind == "HINGE"
+        offset = pin.SE3.Identity()
         reference_coordinate = float(model.qpos0[model.jnt_qposadr[joint]])
-        if is_hinge:
-            placement = placement * pin.SE3(
-                pin.AngleAxis(-reference_coordinate, axis).toRotationMatrix(), np.zeros(3)
-            )
+        if kind == "HINGE":
+            offset.rotation = pin.AngleAxis(-reference_coordinate, axis).toRotationMatrix()
         else:
-            placement = placement * pin.SE3(np.eye(3), -reference_coordinate * axis)
+            offset.translation = -reference_coordinate * axis
         limits = Limits(source_location=source_location)
         if model.jnt_limited[joint]:
             lower, upper = (parse_limit(float(x)) for x in model.jnt_range[joint])
             limits = Limits(lower, upper, source_location=source_location)
-        joint_type = "revolute" if is_hinge else "prismatic"
+        joint_type = "revolute" if kind == "HINGE" else "prismatic"
+        xyz, rpy = xyz_rpy_from_se3(placement * offset)
         return [
-            Joint(
-                name,
-                joint_type,
-                "",
-                "",
-                source_location,
-                *xyz_rpy_from_se3(placement),
-                to_vector(axis),
-                limits,
-            )
+            Joint(name, joint_type, "", "", source_location, xyz, rpy, to_vector(axis), limits)
         ]
 
     def _read_frames(self) -> MjcfFrames:
-        """Links of the named sites."""
+        """Return the frames of the sites."""
         frames = MjcfFrames(used_names=set(self.links))
         model = self.model
         for site in range(model.nsite):
             name = self.mjcf.element_name("SITE", site).strip()
             body = int(model.site_bodyid[site])
-            placement = pin.SE3(
-                _rotation_matrix(model.site_quat[site]), model.site_pos[site].copy()
-            )
+            placement = pose(model.site_quat[site], model.site_pos[site])
             if name and name == self.body_links[body] and placement.isIdentity(0.0):
                 frames.link_of_site[site] = name
                 continue
@@ -258,27 +241,19 @@ class _MjcfReader:
         return frames
 
     def _read_home(self) -> dict[str, float]:
-        """Coordinates of the key "home", else of the first key, else as the file draws them."""
+        """Return the coordinates of the key "home", else of the first key, else of `qpos0`."""
         model = self.model
         keys = [self.mjcf.element_name("KEY", i) for i in range(model.nkey)]
         key_index = keys.index("home") if "home" in keys else 0
         qpos = model.key_qpos[key_index] if keys else model.qpos0
         home: dict[str, float] = {}
-        for joint, joint_names in self.parts.items():
-            coordinate_index = model.jnt_qposadr[joint]
-            kind = self.mjcf.enumeration_name("Joint", model.jnt_type[joint])
-            values = list(qpos[coordinate_index : coordinate_index + 1])
-            if kind == "FREE":
-                values = [
-                    *qpos[coordinate_index : coordinate_index + 3],
-                    *_cardan_angles(
-                        _rotation_matrix(qpos[coordinate_index + 3 : coordinate_index + 7])
-                    ),
-                ]
-            elif kind == "BALL":
-                values = _cardan_angles(
-                    _rotation_matrix(qpos[coordinate_index : coordinate_index + 4])
-                )
+        for joint, joint_names in self.series_joints.items():
+            kind, first = self.mjcf.joint_type(joint), model.jnt_qposadr[joint]
+            translation_count = {"BALL": 0, "FREE": 3}.get(kind, 1)
+            values = list(qpos[first : first + translation_count])
+            if kind in ("BALL", "FREE"):
+                quaternion = qpos[first + translation_count : first + translation_count + 4]
+                values += _cardan_angles(pose(quaternion, np.zeros(3)).rotation)
             home |= {
                 x: self._clip_to_limits(x, float(y))
                 for x, y in zip(joint_names, values, strict=True)
@@ -287,7 +262,7 @@ class _MjcfReader:
         return home
 
     def _clip_to_limits(self, joint: str, value: float) -> float:
-        """A coordinate of home within the limits of its joint."""
+        """Return a coordinate of home, clipped to the limits of its joint."""
         limits = self.joints[joint].limits
         clipped = min(max(value, limits.lower), limits.upper)
         if clipped != value:
@@ -297,7 +272,7 @@ class _MjcfReader:
         return clipped
 
     def _custom_text(self, name: str) -> str:
-        """A `<text>` under `<custom>`, empty where there is none."""
+        """Return a `<text>` under `<custom>`, "" if there is none."""
         model = self.model
         for index in range(model.ntext):
             if self.mjcf.element_name("TEXT", index) == name:
@@ -307,7 +282,7 @@ class _MjcfReader:
         return ""
 
     def _listed_joints(self, name: str) -> list[str]:
-        """Joints that a `<text>` lists, none if one of them is not there."""
+        """Return the joints that a `<text>` lists, none if one of them is unknown."""
         joints = [word for word in self._custom_text(name).split(", ") if word]
         if all(joint in self.joints for joint in joints):
             return joints
@@ -325,17 +300,8 @@ class _MjcfReader:
         return None if tip else tree.single_leaf_link()
 
 
-def _rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) of MuJoCo's quaternion, w first; of length zero: none."""
-    length = float(np.linalg.norm(quaternion))
-    if length == 0:
-        return np.eye(3)
-    w, x, y, z = (float(value) / length for value in quaternion)
-    return np.asarray(pin.Quaternion(w, x, y, z).toRotationMatrix())
-
-
 def _cardan_angles(rotation: np.ndarray) -> list[float]:
-    """Angles a, b, c with turn = R_x(a) R_y(b) R_z(c)."""
+    """Return the angles a, b, c with rotation = R_x(a) R_y(b) R_z(c)."""
     first = np.arctan2(-rotation[1, 2], rotation[2, 2])
     sine, cosine = np.sin(first), np.cos(first)
     second = np.arctan2(rotation[0, 2], cosine * rotation[2, 2] - sine * rotation[1, 2])

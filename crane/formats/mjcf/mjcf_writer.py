@@ -1,4 +1,4 @@
-"""A MJCF file for MuJoCo."""
+"""Write a machine as a MJCF file for MuJoCo."""
 
 import warnings
 from collections.abc import Mapping
@@ -12,47 +12,40 @@ from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
 from crane.description import Coupling, Drive, ForceElement, LoopSpec, Rope
 from crane.description.specification import element_name
-from crane.formats.urdf_output import (
-    finite_limits,
-    format_document,
-    format_numbers,
-    origin_text,
-    solve_coupling,
-    unsupported_friction,
-    unsupported_sections,
-    warn_about_unsupported,
-)
+from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
+from crane.formats.urdf_elements import finite_limits, format_numbers
+from crane.formats.urdf_output import format_document, origin_text, solve_coupling
 from crane.machine import Machine
 
-_HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that make a hinge
-_ROUNDING_TOLERANCE = 1e-9  # share of an inertia that counts as rounding
-_MIN_MOMENT = 1e-14  # [kg m2] moment of inertia that MuJoCo still takes
+_HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
+_ROUNDING_TOLERANCE = 1e-9  # relative to the largest moment
+_MIN_MOMENT = 1e-14  # [kg m2] smallest moment of inertia that MuJoCo accepts
 
 
 def write_mjcf(machine: Machine, path: str | Path) -> None:
     """Write a machine as a MJCF file with equality constraints between sites.
 
-    Spherical loops become `connect`, fixed ones `weld`, revolute ones two `connect` at points of
-    the axis; couplings `joint`, of more than two joints `tendon`. Drives have a motor each, by a
-    fixed tendon where they act along more than one joint; where drives are not the active joints,
-    a text names these. Frames are sites, the home posture is the key "home". Coulomb and viscous
-    friction, springs and rotor inertias are there; the damping of force elements on joints becomes
-    viscous friction; force elements and ropes between frames are spatial tendons. A warning names
-    what else is left out. There are no shapes, so nothing collides.
+    Spherical loops become `connect`, fixed loops `weld`, revolute loops two `connect` at points on
+    the axis; couplings become `joint`, or `tendon` if they have more than two joints. Each drive
+    has a motor, with a fixed tendon if it acts along several joints; if the drives are not the
+    active joints, a text lists these. Frames are sites, the home configuration is the key "home".
+    Coulomb and viscous friction, springs and rotor inertias are written; damping of force elements
+    along joints becomes viscous friction; force elements and ropes between frames become spatial
+    tendons. A warning lists what is left out. Shapes are not written, so there are no contacts.
 
     Args:
-        machine: The machine, as it is: with its changes, locks and payload.
+        machine: The machine with its parameter changes, locked joints and payload.
         path: The file, .xml.
 
     Raises:
-        InputError: A loop or a joint is of a kind that MJCF has not.
-        OutputError: It cannot be written.
+        InputError: MJCF does not have a type of loop or joint.
+        OutputError: The file cannot be written.
     """
     writer = _MjcfWriter(machine)
     content = writer.build_content()
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(content)
-    unsupported = unsupported_friction(machine) + unsupported_sections(machine)
+    unsupported = unsupported_sections(machine)
     floating = [
         machine.joints[column + i]
         for column in machine.coordinates.floating_base_columns
@@ -67,23 +60,24 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
 
 
 class _MjcfWriter:
-    """The document as it grows.
+    """Builds the document.
 
     Args:
         machine: The machine.
+
+    Attributes:
+        unsupported: Parts of the machine that are left out.
     """
 
     def __init__(self, machine: Machine):
         self.machine, self.model, self.tree = machine, machine.model, machine.tree
         self.joints = range(1, self.model.njoints)
-        body_elements = machine.coordinates.body_of_joint[
-            1:
-        ]  # by index of the joint the last of its columns
+        last_columns = machine.coordinates.body_of_joint[1:]  # by index of the joint, from 1
         self.moved_links = [
             self.tree.root_link,
-            *(self.tree.joints[machine.joints[body - 1]].child for body in body_elements),
+            *(self.tree.joints[machine.joints[column - 1]].child for column in last_columns),
         ]
-        self.frames = [  # all other links
+        self.frames = [  # of all other links
             frame
             for frame in self.model.frames
             if frame.type == pin.FrameType.BODY
@@ -93,11 +87,11 @@ class _MjcfWriter:
         self.root = etree.Element("mujoco", model=machine.name)
         self.bodies: dict[int, etree._Element] = {}  # by index of the joint
         self.home_coordinates: list[float] = []
-        self.site_names: set[str] = set()  # of sites
+        self.site_names: set[str] = set()
         self.unsupported: list[str] = []
 
     def build_content(self) -> bytes:
-        """All of the file."""
+        """Return the file's content."""
         add = etree.SubElement
         add(self.root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
         add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
@@ -122,13 +116,8 @@ class _MjcfWriter:
             if item.between is not None:
                 self._add_spatial_tendon(tendons, item, item.between)
         self.root.extend(part for part in (tendons, equality, actuator) if len(part))
-        key = add(
-            add(self.root, "keyframe"),
-            "key",
-            name="home",
-            qpos=format_numbers(self.home_coordinates),
-        )
-        assert key is not None
+        keyframe = add(self.root, "keyframe")
+        add(keyframe, "key", name="home", qpos=format_numbers(self.home_coordinates))
         return format_document(self.root, origin_text(self.machine))
 
     def _add_texts(self) -> None:
@@ -137,7 +126,7 @@ class _MjcfWriter:
         if not machine.tip and len(self._leaf_links()) == 1:
             texts["tip"] = "none"
         if [drive.name for drive in machine.drives] != list(machine.active):
-            # else the drives say which joints are active
+            # otherwise the drives determine the active joints
             texts |= {"active": ", ".join(machine.active), "free": ", ".join(machine.free)}
         custom = etree.SubElement(self.root, "custom")
         for name, data in texts.items():
@@ -149,11 +138,11 @@ class _MjcfWriter:
         return [link for link in self.tree.links if link not in parents]
 
     def _child_joints(self, joint: int) -> list[int]:
-        """The joints on the link that a joint moves."""
+        """Return the joints on the link that a joint moves."""
         return [i for i in self.joints if self.model.parents[i] == joint]
 
     def _add_bodies(self) -> None:
-        """Bodies with the series of joints that move each, parents before children."""
+        """Add bodies with the series of joints that move each, parents before children."""
         pending = [(joint, self.bodies[0]) for joint in reversed(self._child_joints(0))]
         while pending:
             joint, parent = pending.pop()
@@ -162,7 +151,7 @@ class _MjcfWriter:
             pending += [(i, body) for i in reversed(self._child_joints(series[-1]))]
 
     def _joints_of_body(self, joint: int) -> list[int]:
-        """Joints that move one body: a joint, and those above it as long as there is no mass."""
+        """Return the joints of one body: a joint and those after it up to a link with mass."""
         series = [joint]
         while not self.model.inertias[series[-1]].mass:
             last = series[-1]
@@ -170,14 +159,13 @@ class _MjcfWriter:
             if len(child_joints) != 1 or any(frame.parentJoint == last for frame in self.frames):
                 raise InputError(
                     f"link '{self.moved_links[last]}' has no mass, which MuJoCo asks of every "
-                    f"body "
-                    "with frames or several joints on it: give it some, or write URDF+"
+                    "body with frames or several joints on it: give it some, or write URDF+"
                 )
             series += child_joints
         return series
 
     def _add_body(self, series: list[int], parent: etree._Element) -> etree._Element:
-        """A body with the series of joints that moves it."""
+        """Add a body with the series of joints that moves it."""
         body_placement = pin.SE3.Identity()
         for i in series:
             body_placement = body_placement * self.model.jointPlacements[i]
@@ -193,7 +181,7 @@ class _MjcfWriter:
         return body
 
     def _add_joint(self, body: etree._Element, joint: int, placement: pin.SE3) -> None:
-        """A joint, placed in its body's frame at zero."""
+        """Add a joint at a placement in its body's frame at coordinate zero."""
         machine, name = self.machine, self.model.names[joint]
         column = self.model.joints[joint].idx_v
         if column in machine.coordinates.floating_base_columns:
@@ -230,7 +218,7 @@ class _MjcfWriter:
         self.home_coordinates.append(float(machine.home[column]))
 
     def _add_free_joint(self, body: etree._Element, joint: int) -> None:
-        """A free joint, whose position is the body's pose in the world."""
+        """Add a free joint, whose coordinates are the body's pose in the world."""
         machine = self.machine
         etree.SubElement(body, "freejoint", name=self.model.names[joint])
         data = self.model.createData()
@@ -239,7 +227,7 @@ class _MjcfWriter:
         self.home_coordinates += [float(value) for value in (*position, w, x, y, z)]
 
     def _add_site(self, body: etree._Element, name: str, placement: pin.SE3) -> str:
-        """A site, under a name that no other has."""
+        """Add a site under a unique name, and return the name."""
         while name in self.site_names:
             name += "_"
         self.site_names.add(name)
@@ -252,7 +240,7 @@ class _MjcfWriter:
         return name
 
     def _frame_site(self, link: str) -> tuple[etree._Element, pin.SE3, str]:
-        """Body of a link, its placement there, and its site."""
+        """Return the body of a link, the placement on it, and the name of the site."""
         frame = self.model.frames[self.machine.frame(link)]
         if frame.parentJoint not in self.bodies:
             raise InputError(f"link '{link}' has no mass, which MuJoCo asks for: write URDF+")
@@ -300,10 +288,10 @@ class _MjcfWriter:
     def _add_spatial_tendon(
         self, tendons: etree._Element, item: ForceElement | Rope, links: tuple[str, str]
     ) -> None:
-        """A tendon straight from frame to frame.
+        """Add a tendon straight from frame to frame.
 
-        MuJoCo's springs have no constant force, so that of an element moves the length at which
-        its spring is slack. Damping of a rope acts while it is taut, that of a tendon always.
+        MuJoCo's springs have no constant force, so that of an element changes the rest length. The
+        damping of a rope acts only while it is taut, that of a tendon always: it is left out.
         """
         name, values = element_name(item), {}
         if isinstance(item, Rope):
@@ -336,14 +324,14 @@ class _MjcfWriter:
 
 
 def _add_tendon(tendons: etree._Element, tag: str, name: str) -> etree._Element:
-    """Add a tendon, under a name that no other has."""
+    """Add a tendon under a unique name."""
     while any(tendon.get("name") == name for tendon in tendons):
         name += "_"
     return etree.SubElement(tendons, tag, name=name)
 
 
 def _add_fixed_tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
-    """Add a fixed tendon."""
+    """Add a fixed tendon, and return its name."""
     tendon = _add_tendon(tendons, "fixed", name)
     for joint, factor in factors.items():
         etree.SubElement(tendon, "joint", joint=joint, coef=format_numbers([factor]))
@@ -351,22 +339,18 @@ def _add_fixed_tendon(tendons: etree._Element, name: str, factors: Mapping[str, 
 
 
 def _placement_attributes(placement: pin.SE3) -> dict[str, str]:
-    """Attributes of a placement, without those that say nothing."""
+    """Return the attributes of a placement that differ from the default."""
     found = {}
     if placement.translation.any():
         found["pos"] = format_numbers(placement.translation)
     if not np.array_equal(placement.rotation, np.eye(3)):
-        found["quat"] = _quaternion_text(placement.rotation)
+        x, y, z, w = pin.Quaternion(placement.rotation).normalize().coeffs()
+        found["quat"] = format_numbers([w, x, y, z])
     return found
 
 
-def _quaternion_text(rotation: np.ndarray) -> str:
-    x, y, z, w = pin.Quaternion(rotation).normalize().coeffs()
-    return format_numbers([w, x, y, z])
-
-
 def _add_inertial(body: etree._Element, inertia: pin.Inertia) -> None:
-    """Principal moments and axes; MuJoCo asks for moments of a possible body that are not zero."""
+    """Add principal moments and axes; MuJoCo requires positive, physically feasible moments."""
     moments, axes = np.linalg.eigh(inertia.inertia)
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
@@ -375,8 +359,7 @@ def _add_inertial(body: etree._Element, inertia: pin.Inertia) -> None:
     if violation > _ROUNDING_TOLERANCE * moments[2]:
         warnings.warn(
             f"the inertia of '{body.get('name')}' is of no possible body by {violation:.2g} kg "
-            f"m2, "
-            "which MuJoCo refuses: two moments are written larger",
+            "m2, which MuJoCo refuses: two moments are written larger",
             CraneWarning,
             stacklevel=5,
         )

@@ -1,38 +1,146 @@
-"""A MJCF file compiled by MuJoCo, with the lines of its elements for errors."""
+"""A MJCF file that MuJoCo compiles, with bounds on its size and lines of its elements."""
 
+import math
 import re
-import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, DescriptionError
+from crane.common.errors import DescriptionError
 from crane.common.optional_libraries import import_optional_library
+from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.mjcf.missing_meshes import (
     MassMissingError,
     compile_without_missing_files,
     missing_file,
 )
-from crane.formats.mjcf.size_limits import count_elements
 from crane.formats.xml_file import XmlFile
+
+MAX_COPIES = 10_000  # copied elements; MuJoCo's time to copy grows with the square
+# attributes whose product is a number of cells or bytes, and its bound
+_SIZE_ATTRIBUTES = {
+    "hfield": (("nrow", "ncol"), 10_000_000),
+    "texture": (("width", "height"), 10_000_000),
+    "numeric": (("size",), 1_000_000),
+    "user": (("dim",), 1_000_000),
+    "size": (("nuserdata",), 1_000_000),
+}
+_MAX_ATTRIBUTE_VALUES = {"size": 10_000, "mesh": 1_000}  # for other attributes
+# bounded above, or not allocated
+_UNCHECKED_ATTRIBUTES = {"nuserdata", "memory", "njmax", "nconmax", "nstack"}
+_FLEXIBLE_ELEMENTS = ("flex", "flexcomp")
+
+
+def count_elements(
+    xml: XmlFile, included: Mapping[str, int], models: Mapping[str, int]
+) -> tuple[int, int]:
+    """Count the elements of a file with its includes and copies, before MuJoCo creates them.
+
+    A few characters of MJCF can request copies that take days.
+
+    Args:
+        xml: The file.
+        included: Number of elements of each included file, by its name in the `<include>`.
+        models: Number of elements of each attached model, by name.
+
+    Returns:
+        Number of all elements, and of copies among them.
+
+    Raises:
+        DescriptionError: There are too many copies, or a size in the file is too large.
+    """
+    for element in xml.root.iter(*_FLEXIBLE_ELEMENTS):
+        raise xml.error_at(element, "flexible bodies are no machine's, leave out")
+    for element in xml.root.iter(*_SIZE_ATTRIBUTES, *_MAX_ATTRIBUTE_VALUES):
+        _check_sizes(xml, element)
+    return _count_below(xml, xml.root, included, models)
+
+
+def _count_below(
+    xml: XmlFile, element: etree._Element, included: Mapping[str, int], models: Mapping[str, int]
+) -> tuple[int, int]:
+    total, copied_count = 1, 0
+    if element.tag == "include":
+        total += included.get(element.get("file", ""), 0)
+    if element.tag == "attach":
+        copied_count += models.get(element.get("model", ""), 0)
+        total += copied_count
+    for child in element:
+        if isinstance(child.tag, str):
+            child_count, copied = _count_below(xml, child, included, models)
+            total, copied_count = total + child_count, copied_count + copied
+    if element.tag in ("replicate", "composite"):
+        repetitions = 1.0
+        for number in _read_numbers(element, "count"):
+            repetitions *= number if number > 1 else 1.0  # MuJoCo reports invalid counts
+        if total * repetitions > MAX_COPIES:
+            raise _too_many_copies_error(xml, element, total * repetitions)
+        copied_count += int(total * (repetitions - 1))
+        total = int(total * repetitions)
+    if copied_count > MAX_COPIES:
+        raise _too_many_copies_error(xml, element, copied_count)
+    return total, copied_count
+
+
+def _too_many_copies_error(
+    xml: XmlFile, element: etree._Element, count: float
+) -> DescriptionError:
+    return xml.error_at(
+        element,
+        f"<{element.tag}> stands for {count:.6g} elements by its copies, make at most "
+        f"{MAX_COPIES}",
+    )
+
+
+def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
+    """Raise for sizes from which MuJoCo would allocate too much."""
+    keys, maximum = _SIZE_ATTRIBUTES.get(element.tag, ((), 0))
+    product = math.prod(max(abs(x), 1.0) for key in keys for x in _read_numbers(element, key))
+    if keys and product > maximum:
+        given = " ".join(f'{key}="{element.get(key)[:20]}"' for key in keys if element.get(key))
+        raise _size_error(xml, element, given, maximum)
+    maximum = _MAX_ATTRIBUTE_VALUES.get(element.tag, 0)
+    if not maximum or (element.tag != "size" and not element.get("builtin")):
+        return
+    for key in ("params",) if element.tag == "mesh" else element.keys():
+        if max(_read_numbers(element, key), default=0.0) > maximum and (
+            key not in _UNCHECKED_ATTRIBUTES
+        ):
+            raise _size_error(xml, element, f'{key}="{element.get(key)[:20]}"', maximum)
+
+
+def _size_error(
+    xml: XmlFile, element: etree._Element, attributes: str, maximum: float
+) -> DescriptionError:
+    return xml.error_at(
+        element, f"{attributes} of <{element.tag}> is too large, make it at most {maximum}"
+    )
+
+
+def _read_numbers(element: etree._Element, key: str) -> list[float]:
+    """Return the numbers of an attribute, none if it is malformed, which MuJoCo reports."""
+    try:
+        return [float(word) for word in element.get(key, "").split()]
+    except ValueError:
+        return []
+
 
 _MAX_SHOWN_NAMES = 6  # names in a line
 
 
-class MujocoFile:
-    """A MJCF file.
+class MujocoFile(ConversionNotes):
+    """A MJCF file, compiled by MuJoCo, so that all elements have the meaning that they have there.
 
-    MuJoCo itself reads it, so that defaults, includes, units of angles, inertias from shapes and
-    all else mean what they mean there. Before, the file is read as strictly as every XML.
+    Before that, the file is read as strictly as any other XML.
 
     Args:
         file: The file.
 
     Attributes:
-        file: The file.
         model: MuJoCo's `MjModel`.
 
     Raises:
@@ -41,26 +149,23 @@ class MujocoFile:
     """
 
     def __init__(self, file: Path):
-        self.file = file
+        super().__init__(file, "MuJoCo", _MAX_SHOWN_NAMES)
         self._files: list[XmlFile] = []
-        self._unsupported_features: dict[str, list[str]] = {}
-        self._differences: dict[str, list[str]] = {}
         self._element_counts: dict[Path, int] = {}
         self._read_with_includes(file, [])
         self._mujoco = mujoco = import_optional_library("mujoco", f"{file.name}: reading MJCF")
         messages: list[str] = []
         previous_handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(messages.append)  # else into a file in the working folder
+        mujoco.set_mju_user_warning(messages.append)  # by default it writes a file MUJOCO_LOG.TXT
         try:
             self.model: Any = self._compile()
         except MassMissingError as error:
             raise DescriptionError(
                 f"{self.source_location(error.body, 'body')}: body '{error.body}' has its mass "
-                f"from "
-                f"'{error.mesh}', which is not there: put the file there, or give the body an "
-                "<inertial>"
+                f"from '{error.mesh}', which is not there: put the file there, or give the body "
+                "an <inertial>"
             ) from None
-        except Exception as error:  # ValueError, FatalError, and others of its parts
+        except Exception as error:  # ValueError, FatalError and others
             raise self._compilation_error(str(error) or type(error).__name__) from None
         finally:
             mujoco.set_mju_user_warning(previous_handler)
@@ -68,7 +173,7 @@ class MujocoFile:
             self.warn(f"MuJoCo says {'; '.join(messages)}")
 
     def _compile(self) -> Any:
-        """MuJoCo's model, without shapes and pictures whose files are not there."""
+        """Return the compiled model, without shapes and textures whose files are missing."""
         path = str(self.file)
         try:
             return self._mujoco.MjModel.from_xml_path(path)
@@ -88,7 +193,7 @@ class MujocoFile:
     def _read_with_includes(
         self, file: Path, including_files: list[Path], root_tag: str = "mujoco"
     ) -> int:
-        """Read a file and what it includes, strictly; the number of elements it stands for."""
+        """Read a file and its includes strictly, and return the number of their elements."""
         if file in including_files:
             raise DescriptionError(
                 f"{including_files[-1].name}: includes {file.name} in a circle, break it"
@@ -107,7 +212,7 @@ class MujocoFile:
             other = self._files[0].file.parent / name
             try:
                 is_there = bool(name) and other.is_file()
-            except (OSError, ValueError):  # a name longer than any file's
+            except (OSError, ValueError):  # such as a name that is too long
                 is_there = False
             if not is_there:
                 raise xml.error_at(
@@ -123,7 +228,7 @@ class MujocoFile:
         return self._element_counts[file]
 
     def _compilation_error(self, text: str) -> DescriptionError:
-        """MuJoCo's words, which span lines, as one line with the place."""
+        """Return an error in one line with file and line from MuJoCo's message."""
         text = " ".join(text.split())
         line = re.search(r",? line (\d+)", text)
         where = self.file.name
@@ -134,11 +239,11 @@ class MujocoFile:
         return DescriptionError(f"{where}: MuJoCo refuses it ({text}), correct it")
 
     def element_name(self, object_type: str, index: int) -> str:
-        """Name of a compiled element, empty where it has none.
+        """Return the name of a compiled element, "" if it has none.
 
         Args:
-            object_type: Of `mujoco.mjtObj`, such as "BODY".
-            index: Its number.
+            object_type: A name of `mujoco.mjtObj`, such as "BODY".
+            index: Index of the element.
         """
         found = self._mujoco.mj_id2name(
             self.model, getattr(self._mujoco.mjtObj, f"mjOBJ_{object_type}"), index
@@ -146,34 +251,34 @@ class MujocoFile:
         return found or ""
 
     def enumeration_name(self, enumeration: str, value: int) -> str:
-        """Name of a value of an enumeration of MuJoCo, such as HINGE of "Joint"."""
+        """Return the name of a value of an enumeration of MuJoCo, such as HINGE of "Joint"."""
         return str(getattr(self._mujoco, f"mjt{enumeration}")(value).name).partition("_")[2]
 
-    def body_name(self, index: int) -> str:
-        """Name of a body, invented where it has none."""
-        return self.element_name("BODY", index).strip() or f"body{index}"
+    def name(self, object_type: str, index: int) -> str:
+        """Return the name of a compiled element, or a generated one such as joint2."""
+        number = index + (object_type != "BODY")
+        return self.element_name(object_type, index).strip() or f"{object_type.lower()}{number}"
 
-    def joint_name(self, index: int) -> str:
-        """Name of a joint, invented where it has none."""
-        return self.element_name("JOINT", index).strip() or f"joint{index + 1}"
+    def joint_type(self, joint: int) -> str:
+        """Return the type of a joint: HINGE, SLIDE, BALL or FREE."""
+        return self.enumeration_name("Joint", self.model.jnt_type[joint])
 
-    def tendon_name(self, index: int) -> str:
-        """Name of a tendon, invented where it has none."""
-        return self.element_name("TENDON", index).strip() or f"tendon{index + 1}"
-
-    def actuator_name(self, index: int) -> str:
-        """Name of an actuator, invented where it has none."""
-        return self.element_name("ACTUATOR", index).strip() or f"actuator{index + 1}"
+    def note_unsupported_elements(
+        self, feature: str, object_type: str, indices: Iterable[int]
+    ) -> None:
+        """Note that compiled elements, if there are any, have a feature that is left out."""
+        if names := [self.name(object_type, index) for index in indices]:
+            self.note_unsupported(feature, *names)
 
     def transmission(self, actuator: int) -> tuple[str, int]:
-        """What an actuator acts by, such as JOINT or TENDON, and the number of that."""
+        """Return the type of an actuator's transmission, such as JOINT, and its target's index."""
         kind = self.enumeration_name("Trn", self.model.actuator_trntype[actuator])
         target = int(self.model.actuator_trnid[actuator, 0])
         return "JOINT" if kind == "JOINTINPARENT" else kind, target
 
     @property
     def disabled_features(self) -> set[str]:
-        """What the file switches off of MuJoCo's computing, such as CONTACT."""
+        """Names of the parts of MuJoCo's model that the file disables, such as CONTACT."""
         bits = self._mujoco.mjtDisableBit.__members__
         return {
             name.partition("_")[2]
@@ -182,7 +287,7 @@ class MujocoFile:
         }
 
     def source_location(self, name: str, *tags: str) -> str:
-        """File and line of the element with a name, as far as it can be found."""
+        """Return file and line of the element with a name; the file alone if it is not found."""
         places = (
             xml.source_location(element)
             for xml in self._files
@@ -192,52 +297,32 @@ class MujocoFile:
         return next(places, self.file.name)
 
     def equality_location(self, index: int) -> str:
-        """File and line of an equality constraint by its number."""
-        found: list[tuple[XmlFile, etree._Element]] = [
-            (xml, child) for xml in self._files for part in xml.root.iter("equality")
+        """Return file and line of an equality constraint by its index."""
+        locations = [
+            xml.source_location(child)
+            for xml in self._files
+            for part in xml.root.iter("equality")
             for child in part
-        ]  # fmt: skip
-        if len(found) != self.model.neq:
-            return self.file.name
-        xml, element = found[index]
-        return xml.source_location(element)
-
-    def note_unsupported(self, feature: str, *names: str) -> None:
-        """Note what is left out, to be told in one line with all else."""
-        self._unsupported_features.setdefault(feature, []).extend(names)
-
-    def note_difference(self, difference: str, *names: str) -> None:
-        """Note what is taken otherwise than MuJoCo does."""
-        self._differences.setdefault(difference, []).extend(names)
-
-    def warn_about_notes(self) -> None:
-        """Warn of all that has been noted, in a line of each kind."""
-        for heading, notes in (
-            ("left out of what MuJoCo has", self._unsupported_features),
-            ("otherwise than in MuJoCo", self._differences),
-        ):
-            words = [f"{what} ({list_names(x)})" if x else what for what, x in notes.items()]
-            if words:
-                self.warn(f"{heading}: {'; '.join(words)}")
-
-    def warn(self, text: str) -> None:
-        """Warn at once."""
-        warnings.warn(f"{self.file.name}: {text}", CraneWarning, stacklevel=3)
-
-
-def list_names(names: Iterable[str]) -> str:
-    """Names, the first of many."""
-    names = list(dict.fromkeys(names))
-    remainder = [f"{len(names) - _MAX_SHOWN_NAMES} more"] if len(names) > _MAX_SHOWN_NAMES else []
-    return ", ".join(names[:_MAX_SHOWN_NAMES] + remainder)
+        ]
+        return locations[index] if len(locations) == self.model.neq else self.file.name
 
 
 def nonzero_rows(model: Any, field: str) -> list[int]:
-    """Rows of a field in which a number is not zero; newer versions have more than older ones."""
+    """Return the rows of a field with a nonzero value, none if this MuJoCo lacks the field."""
     values = getattr(model, field, None)
     if values is None or not np.size(values):
         return []
-    found: list[int] = np.flatnonzero(
-        np.any(np.reshape(values, (len(values), -1)), axis=1)
-    ).tolist()
-    return found
+    is_nonzero = np.any(np.reshape(values, (len(values), -1)), axis=1)
+    return [int(row) for row in np.flatnonzero(is_nonzero)]
+
+
+def pose(quaternion: np.ndarray, position: np.ndarray) -> pin.SE3:
+    """Return a pose from a quaternion, w first, and a position (3,), as MuJoCo stores them.
+
+    A quaternion of length zero is no rotation.
+    """
+    length = float(np.linalg.norm(quaternion))
+    if length == 0:
+        return pin.SE3(np.eye(3), position.copy())
+    w, x, y, z = (float(value) / length for value in quaternion)
+    return pin.SE3(pin.Quaternion(w, x, y, z).toRotationMatrix(), position.copy())

@@ -1,8 +1,7 @@
-"""What MuJoCo would compute with and a machine does not have: noted, to be told in one line.
+"""Notes on features of MuJoCo that affect the motion and that a machine does not have.
 
-The list follows the fields of MuJoCo's mjModel that act on the motion. Softness of constraints
-(solref, solimp) is not told: loops close exactly here, whatever it says. Limits are not either: a
-run says which it passed.
+They follow the fields of MuJoCo's `mjModel`. Two are not noted: softness of constraints (solref,
+solimp), because loops close exactly, and limits, because a run reports the limits that it passed.
 """
 
 from typing import Any
@@ -17,7 +16,7 @@ _COUNTED_FEATURES = {"sensor": "nsensor", "camera": "ncam", "skin": "nskin", "pl
 
 
 def note_unsupported_features(mjcf: MujocoFile) -> None:
-    """Note all that is left out, or taken otherwise."""
+    """Note all features that are left out or interpreted differently."""
     disabled = mjcf.disabled_features
     if "CONTACT" not in disabled:
         _note_contacts(mjcf, disabled)
@@ -30,11 +29,11 @@ def note_unsupported_features(mjcf: MujocoFile) -> None:
         for i in range(model.ntendon)
         if fixed_tendon_factors(mjcf, i) is None and straight_tendon_sites(mjcf, i) is None
     ]
-    if spatial_tendons:
-        mjcf.note_unsupported(
-            "tendons that are not straight from a site to one of another body",
-            *map(mjcf.tendon_name, spatial_tendons),
-        )
+    mjcf.note_unsupported_elements(
+        "tendons that are not straight from a site to one of another body",
+        "TENDON",
+        spatial_tendons,
+    )
     for feature, field in _COUNTED_FEATURES.items():
         if count := int(getattr(model, field, 0)):
             mjcf.note_unsupported(f"{count} {feature}{'s' * (count > 1)}")
@@ -51,9 +50,7 @@ def _note_world(mjcf: MujocoFile, disabled: set[str]) -> None:
     if model.opt.density or model.opt.viscosity:
         mjcf.note_unsupported("forces of the air")
     if model.nmocap:
-        mocap_bodies = [
-            mjcf.body_name(body) for body in np.flatnonzero(model.body_mocapid >= 0).tolist()
-        ]
+        mocap_bodies = [mjcf.name("BODY", int(i)) for i in np.flatnonzero(model.body_mocapid >= 0)]
         mjcf.note_difference("what a program moves stands still (mocap)", *mocap_bodies)
     if (model.neq and "EQUALITY" in disabled) or "CONSTRAINT" in disabled:
         mjcf.note_difference("the file switches its constraints off, loops are closed here")
@@ -64,11 +61,10 @@ def _note_contacts(mjcf: MujocoFile, disabled: set[str]) -> None:
     if not geoms:
         return
     body_of_geom = mjcf.model.geom_bodyid
-    geoms.sort(
-        key=lambda geom: mjcf.model.body_weldid[body_of_geom[geom]] != 0
-    )  # floors and walls first
+    # floors and walls first
+    geoms.sort(key=lambda geom: mjcf.model.body_weldid[body_of_geom[geom]] != 0)
     names = [
-        mjcf.element_name("GEOM", x).strip() or f"one of {mjcf.body_name(int(body_of_geom[x]))}"
+        mjcf.element_name("GEOM", x).strip() or f"one of {mjcf.name('BODY', int(body_of_geom[x]))}"
         for x in geoms
     ]
     count = f"{len(geoms)} geom{'s' * (len(geoms) > 1)}"
@@ -76,20 +72,18 @@ def _note_contacts(mjcf: MujocoFile, disabled: set[str]) -> None:
 
 
 def colliding_geoms(model: Any, disabled: set[str]) -> list[int]:
-    """Numbers of the geoms that can touch another one, as MuJoCo decides on it.
+    """Return the indices of geoms that can touch another geom by MuJoCo's rules.
 
-    Two geoms can, if a bit of the contype of one is in the conaffinity of the other, they move
-    against each other, their bodies are not parent and child (unless one stands still), and no
-    exclude names them; or if a pair names them.
+    Two geoms can touch if a bit of the contype of one is in the conaffinity of the other, they
+    move relative to each other, their bodies are not parent and child (unless one is fixed), and
+    no exclude names them; or if a pair names them.
 
     Args:
         model: MuJoCo's model.
-        disabled: What is switched off, of `MujocoFile.disabled_features`.
+        disabled: As `MujocoFile.disabled_features`.
     """
     body_weld_ids = model.body_weldid
-    parent_bodies = body_weld_ids[
-        model.body_parentid[body_weld_ids]
-    ]  # of the body that each is a part of
+    parent_bodies = body_weld_ids[model.body_parentid[body_weld_ids]]  # of rigid bodies
     unique_geoms, unique_index = np.unique(
         np.column_stack([model.geom_bodyid, model.geom_contype, model.geom_conaffinity]).reshape(
             -1, 3
@@ -132,8 +126,7 @@ def _note_joints(mjcf: MujocoFile, disabled: set[str]) -> None:
     ):
         of_dofs = field.startswith("dof")
         found = [int(model.dof_jntid[i]) if of_dofs else i for i in nonzero_rows(model, field)]
-        if found:
-            mjcf.note_unsupported(feature, *map(mjcf.joint_name, found))
+        mjcf.note_unsupported_elements(feature, "JOINT", found)
     for switch, fields in (
         ("SPRING", ("jnt_stiffness", "tendon_stiffness")),
         ("DAMPER", ("dof_damping", "tendon_damping")),
@@ -145,17 +138,12 @@ def _note_joints(mjcf: MujocoFile, disabled: set[str]) -> None:
                 f"the file switches off what it calls {switch.lower()}, it acts here"
             )
     limited = [] if "LIMIT" in disabled else nonzero_rows(model, "jnt_limited")
-    ball_joints = [
-        i for i in limited if mjcf.enumeration_name("Joint", model.jnt_type[i]) == "BALL"
-    ]
-    if ball_joints:
-        mjcf.note_unsupported(
-            "limits of the angle of ball joints", *map(mjcf.joint_name, ball_joints)
-        )
+    ball_joints = [i for i in limited if mjcf.joint_type(i) == "BALL"]
+    mjcf.note_unsupported_elements("limits of the angle of ball joints", "JOINT", ball_joints)
 
 
 def _note_actuators(mjcf: MujocoFile, disabled: set[str]) -> None:
-    """Those that are no motors: their force is not what they are told, in N or N m."""
+    """Note actuators other than motors, whose force [N], [N m] is not their control signal."""
     model = mjcf.model
     count = len(model.actuator_trntype)
     nonstandard = set()
@@ -172,7 +160,7 @@ def _note_actuators(mjcf: MujocoFile, disabled: set[str]) -> None:
         mjcf.note_difference(
             "drives take forces in N and N m, without gains, gears, dynamics and limits of the "
             "actuators",
-            *map(mjcf.actuator_name, sorted(nonstandard)),
+            *(mjcf.name("ACTUATOR", i) for i in sorted(nonstandard)),
         )
     if count and "ACTUATION" in disabled:
         mjcf.note_difference(

@@ -1,1 +1,1 @@
-"""SDF of Gazebo and Drake, translated into URDF with loops."""
+"""SDF, the format of Gazebo and Drake, translated to URDF with loops."""

@@ -1,37 +1,36 @@
-"""Where links, joints and frames of SDF are, and which link each is fixed to.
+"""Poses of links, joints and frames of SDF, and the links that frames are fixed to.
 
-Every pose is relative to a frame: that which it names, or by default that of its model, for a
-joint its child, for a frame what it is attached to, for a model that of the model above. A model
-with a placement frame P is where its pose puts P: X_SM = X_SP (X_MP)^-1.
+Every pose is relative to a frame: the frame that it names, or by default the frame of the model;
+for a joint its child, for a frame the frame that it is attached to, for a model the frame of the
+parent model. The pose of a model with a placement frame P is that of P: X_SM = X_SP (X_MP)^-1.
 """
 
-import numpy as np
 import pinocchio as pin
 
 from crane.formats.sdf.model_scope import MergedFrame, ModelScope, find_scope
 from crane.formats.sdf.sdf_element import SdfElement
 
 _MODEL_FRAME, _WORLD_FRAME = "__model__", "world"
-_MAX_DEPTH = 200  # frames relative to each other
+_MAX_DEPTH = 200  # of frames relative to each other
 
 
 class SdfFramePoses:
-    """Poses of one file, found once each."""
+    """Poses of the frames of one file."""
 
     def __init__(self) -> None:
         self._known_poses: dict[tuple[int, str], pin.SE3] = {}
         self._open_keys: list[tuple[int, str]] = []
 
     def pose_in_scope(self, scope: ModelScope, name: str, referrer: SdfElement) -> pin.SE3:
-        """Pose of what has a name in a scope, relative to the frame of that scope.
+        """Return the pose of a named element relative to the frame of its scope.
 
         Args:
             scope: The scope.
-            name: A name in it, perhaps with `::`.
-            referrer: What names it, for errors.
+            name: Name in the scope, which may contain `::`.
+            referrer: The element that uses the name, for errors.
 
         Raises:
-            DescriptionError: It is unknown, or frames are relative to each other in a ring.
+            DescriptionError: The name is unknown, or frames form a cycle.
         """
         if name in ("", _MODEL_FRAME) or (name == _WORLD_FRAME and scope.parent is None):
             return pin.SE3.Identity()
@@ -39,9 +38,7 @@ class SdfFramePoses:
         if key in self._known_poses:
             return self._known_poses[key]
         if key in self._open_keys or len(self._open_keys) > _MAX_DEPTH:
-            raise referrer.xml.error_at(
-                referrer.element, f"{referrer.label} is relative to '{name}' in a ring, break it"
-            )
+            raise referrer.error(f"{referrer.label} is relative to '{name}' in a ring, break it")
         self._open_keys.append(key)
         try:
             self._known_poses[key] = self._find_pose(scope, name, referrer)
@@ -68,7 +65,7 @@ class SdfFramePoses:
     def _nested_model_pose(
         self, scope: ModelScope, inner: ModelScope, referrer: SdfElement
     ) -> pin.SE3:
-        """Pose of a model that is anywhere within a scope."""
+        """Return the pose of a model that is nested in a scope at any depth."""
         steps = []
         while inner is not scope and inner.parent is not None:
             steps.append((inner.parent, inner.name))
@@ -84,7 +81,7 @@ class SdfFramePoses:
         return self.element_pose(scope, frame, attached_to(frame))
 
     def _model_pose(self, scope: ModelScope, model: ModelScope, base: str) -> pin.SE3:
-        """Pose of a model's frame in the scope that it is in."""
+        """Return the pose of a model's frame in the parent scope."""
         placement = self.element_pose(scope, model.pose_element, base)
         placement_frame = model.placement_frame
         if placement_frame in ("", _MODEL_FRAME):
@@ -92,45 +89,48 @@ class SdfFramePoses:
         return placement * self.pose_in_scope(model, placement_frame, model.item).inverse()
 
     def element_pose(self, scope: ModelScope, item: SdfElement, default: str) -> pin.SE3:
-        """Pose of an element relative to the frame of its scope.
+        """Return the pose of an element relative to the frame of its scope.
 
         Args:
             scope: The scope.
             item: An element that may have a `<pose>`.
-            default: The frame that this is relative to if it does not say.
+            default: The frame that the pose is relative to by default.
         """
         placement, relative = item.read_pose()
         if relative == _MODEL_FRAME:
             relative = item.base_frame
         return self.pose_in_scope(scope, relative or default, item) * placement
 
-    def rotation_in_scope(self, scope: ModelScope, name: str, referrer: SdfElement) -> np.ndarray:
-        """(3, 3) axes of a frame in those of its scope."""
-        return np.asarray(self.pose_in_scope(scope, name, referrer).rotation)
-
     def pose_in_top(self, scope: ModelScope, top: ModelScope) -> pin.SE3:
-        """Pose of a scope's frame relative to that of one above."""
+        """Return the pose of a scope's frame relative to that of an ancestor."""
         return self._nested_model_pose(top, scope, scope.item)
 
 
 def attached_to(frame: SdfElement) -> str:
-    """What a frame is fixed to."""
-    given = str(frame.element.get("attached_to", "")).strip()
+    """Return the name that a frame is attached to."""
+    given = frame.attribute("attached_to")
     return frame.base_frame if given in ("", _MODEL_FRAME) else given
 
 
 def find_link(
     scope: ModelScope, name: str, referrer: SdfElement, depth: int = 0
 ) -> tuple[ModelScope, str] | None:
-    """The link that a name stands for or is fixed to; None for the world.
+    """Find the link that a named element is, or is fixed to.
+
+    Args:
+        scope: The scope in which the name is used.
+        name: The name.
+        referrer: The element that uses the name, for errors.
+        depth: Number of frames that were followed already.
+
+    Returns:
+        Scope and name of the link, None for the world.
 
     Raises:
-        DescriptionError: It is unknown, or fixed to itself in a ring.
+        DescriptionError: The name is unknown, or frames form a cycle.
     """
     if depth > _MAX_DEPTH:
-        raise referrer.xml.error_at(
-            referrer.element, f"{referrer.label} is attached to itself, break the ring"
-        )
+        raise referrer.error(f"{referrer.label} is attached to itself, break the ring")
     if name == _WORLD_FRAME and name not in scope.links:
         return None
     inner, rest = find_scope(scope, name, referrer)
@@ -152,14 +152,14 @@ def find_link(
 def canonical_link(
     scope: ModelScope, referrer: SdfElement, depth: int = 0
 ) -> tuple[ModelScope, str] | None:
-    """The link that a model's frame is fixed to: that which it names, else its first.
+    """Find the canonical link of a model: the link that it names, else its first one.
 
     Raises:
-        DescriptionError: It has none.
+        DescriptionError: The model has no link.
     """
-    if given := str(scope.item.element.get("canonical_link", "")).strip():
+    if given := scope.item.attribute("canonical_link"):
         return find_link(scope, given, referrer, depth + 1)
     for inner in scope.nested_scopes():
         if inner.links:
             return inner, next(iter(inner.links))
-    raise scope.item.xml.error_at(scope.item.element, f"{scope.item.label} has no link, add one")
+    raise scope.item.error(f"{scope.item.label} has no link, add one")

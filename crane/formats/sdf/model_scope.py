@@ -1,4 +1,4 @@
-"""Models of SDF within each other: the names in each, and what `<include>` brings into it."""
+"""Nested models of SDF, the names in each, and included files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,26 +9,26 @@ from crane.common.package_search import find_file
 from crane.formats.sdf.sdf_element import SdfElement
 from crane.formats.xml_file import XmlFile
 
-_MAX_DEPTH = 20  # models within each other
-_MAX_MODELS = 2000  # models in all
+_MAX_DEPTH = 20  # of nested models
+_MAX_MODELS = 2000
 
-NoteFunction = Callable[[str, str], None]  # what is left out, and its name
+NoteFunction = Callable[[str, str], None]  # arguments: unsupported feature, name
 
 
 @dataclass
 class ModelScope:
-    """A model, or the world, with what has a name in it.
+    """A model, or the world, with the names that it defines.
 
     Attributes:
-        item: Its element; of an included model that in its own file.
-        prefix: Before the names of its links in the whole machine.
-        parent: The scope that it is in.
-        version: Of the file it is written in.
-        links: By name.
-        joints: By name.
-        frames: By name.
-        models: By name.
-        include_element: The element that brought it here.
+        item: Its element; for an included model the element in the included file.
+        prefix: Prefix of the names of its links in the whole machine.
+        parent: The scope that contains it.
+        version: SDF version of its file.
+        links: Links by name.
+        joints: Joints by name.
+        frames: Frames by name.
+        models: Nested models by name.
+        include_element: The `<include>` of an included model.
     """
 
     item: SdfElement
@@ -43,44 +43,39 @@ class ModelScope:
 
     @property
     def name(self) -> str:
-        """Its name in the scope above."""
+        """Its name in the parent scope."""
         given = "" if self.include_element is None else self.include_element.text("name")
         return given or self.item.name
 
     @property
     def is_static(self) -> bool:
-        """Whether nothing in it moves."""
-        if (
-            self.include_element is not None
-            and self.include_element.single_child("static") is not None
-        ):
-            return self.include_element.is_true("static")
-        return self.item.is_true("static")
+        """Whether all of it is fixed to the world."""
+        return self._element_with("static").is_true("static")
 
     @property
     def pose_element(self) -> SdfElement:
-        """What says where it is: the `<include>` if that has a pose."""
-        if (
-            self.include_element is not None
-            and self.include_element.single_child("pose") is not None
-        ):
-            return self.include_element
-        return self.item
+        """The element with its pose: the `<include>` if that has one."""
+        return self._element_with("pose")
+
+    def _element_with(self, tag: str) -> SdfElement:
+        """Return the `<include>` if that has a child with a tag, else the model."""
+        include = self.include_element
+        return self.item if include is None or include.single_child(tag) is None else include
 
     @property
     def placement_frame(self) -> str:
-        """The frame of it that its pose places, empty for its own."""
+        """The frame of the model that its pose places, "" for its own frame."""
         placed = self.pose_element
         if placed is self.include_element and (given := placed.text("placement_frame")):
             return given
-        return str(self.item.element.get("placement_frame", "")).strip()
+        return self.item.attribute("placement_frame")
 
     def names(self) -> list[str]:
-        """All that has a name in it."""
+        """Return all names that it defines."""
         return [*self.links, *self.joints, *self.frames, *self.models]
 
     def nested_scopes(self) -> list["ModelScope"]:
-        """It and all models within."""
+        """Return this scope and those of all nested models."""
         return [
             self,
             *(inner for model in self.models.values() for inner in model.nested_scopes()),
@@ -88,7 +83,7 @@ class ModelScope:
 
     @property
     def can_move(self) -> bool:
-        """Whether it has a joint that is not fixed."""
+        """Whether it has a movable joint."""
         return not self.is_static and any(
             joint.element.get("type") != "fixed"
             for scope in self.nested_scopes() for joint in scope.joints.values()
@@ -96,11 +91,11 @@ class ModelScope:
 
 
 class ModelReader:
-    """Reads models, with the files that they include.
+    """Reads models and the files that they include.
 
     Args:
-        xml: The file to begin with.
-        note: Takes what is left out.
+        xml: The main file.
+        note: Receives unsupported features.
     """
 
     def __init__(self, xml: XmlFile, note: NoteFunction):
@@ -109,10 +104,10 @@ class ModelReader:
         self._model_count = 0
 
     def read_world(self) -> ModelScope:
-        """All models of the file, those of its only world or those beside it.
+        """Return the scope of all models of the file, in its world or outside.
 
         Raises:
-            DescriptionError: There is no model, or several worlds.
+            DescriptionError: There is no model, or there are several worlds.
         """
         root = self.xml.root
         version = sdf_version(self.xml)
@@ -129,36 +124,24 @@ class ModelReader:
         return scope
 
     def _read_children(self, scope: ModelScope, item: SdfElement, depth: int) -> None:
-        """Put what an element holds into a scope."""
+        """Add the children of an element to a scope."""
         parts_by_tag = {"link": scope.links, "joint": scope.joints, "frame": scope.frames}
         for child in item.element:
             tag = child.tag
+            part = item.wrap(child, f"{tag} '{child.get('name', '')}'")
             if tag in parts_by_tag:
-                part = SdfElement(
-                    item.xml, child, f"{tag} '{child.get('name', '')}'", item.base_frame
-                )
-                self._add_part(scope, part, parts_by_tag[tag])
+                self._add_part(part, parts_by_tag[tag])
             elif tag == "model":
-                inner = SdfElement(
-                    item.xml, child, f"model '{child.get('name', '')}'", item.base_frame
-                )
-                self._add_model(scope, inner, None, scope.version, depth)
+                self._add_model(scope, part, None, scope.version, depth)
             elif tag == "include":
-                self._read_include(
-                    scope, SdfElement(item.xml, child, "an include", item.base_frame), depth
-                )
+                self._read_include(scope, item.wrap(child, "an include"), depth)
 
-    def _add_part(
-        self, scope: ModelScope, part: SdfElement, same_kind: dict[str, SdfElement]
-    ) -> None:
+    def _add_part(self, part: SdfElement, same_kind: dict[str, SdfElement]) -> None:
         name = part.name
         if not name:
-            raise part.xml.error_at(
-                part.element, f'a {part.element.tag} has no name, add name="..."'
-            )
+            raise part.error(f'a {part.element.tag} has no name, add name="..."')
         if name in same_kind:
-            raise part.xml.error_at(
-                part.element,
+            raise part.error(
                 f"{part.label} is there twice (first in {same_kind[name].source_location}), "
                 f"rename one",
             )
@@ -174,13 +157,11 @@ class ModelReader:
     ) -> None:
         self._model_count += 1
         if depth > _MAX_DEPTH or self._model_count > _MAX_MODELS:
-            raise item.xml.error_at(
-                item.element, "models include each other without end, break it"
-            )
+            raise item.error("models include each other without end, break it")
         scope = ModelScope(item, "", parent_scope, version, include_element=include)
         name = scope.name
         if not name:
-            raise item.xml.error_at(item.element, 'a model has no name, add name="..."')
+            raise item.error('a model has no name, add name="..."')
         if name in parent_scope.models:
             location = (include or item).source_location
             raise DescriptionError(f"{location}: model '{name}' is there twice, rename one")
@@ -189,15 +170,14 @@ class ModelReader:
         self._read_children(scope, SdfElement(item.xml, item.element, item.label), depth + 1)
 
     def _read_include(self, scope: ModelScope, include: SdfElement, depth: int) -> None:
-        """A model of another file, in a world perhaps one that is not there."""
+        """Add a model of another file; a missing model of a world is noted."""
         uri = include.text("uri")
         file = self._find_model_file(uri, include)
         if file is None:
             if scope.parent is None:
                 self._note_unsupported("models that are not found", uri)
                 return
-            raise include.xml.error_at(
-                include.element,
+            raise include.error(
                 f"there is no model '{uri}', say where it is: --packages FOLDER, packages=[...] "
                 "in Python",
             )
@@ -206,9 +186,7 @@ class ModelReader:
         if len(models) != 1:
             if scope.parent is None and (xml.root.find("light") is not None):
                 return
-            raise include.xml.error_at(
-                include.element, f"'{uri}' has {len(models)} models, include a file with one"
-            )
+            raise include.error(f"'{uri}' has {len(models)} models, include a file with one")
         item = SdfElement(
             xml, models[0], f"model '{models[0].get('name', '')}'", include.base_frame
         )
@@ -220,11 +198,9 @@ class ModelReader:
     def _merge_model(
         self, scope: ModelScope, item: SdfElement, include: SdfElement, depth: int
     ) -> None:
-        """The parts of a model as parts of the one that includes it, with a frame of their own."""
+        """Add the parts of a model to the including model, with a frame for its pose."""
         if depth > _MAX_DEPTH:
-            raise item.xml.error_at(
-                item.element, "models include each other without end, break it"
-            )
+            raise item.error("models include each other without end, break it")
         name = f"_merged__{include.text('name') or item.name}__model__"
         inner = ModelScope(
             item, scope.prefix, scope, sdf_version(item.xml), include_element=include
@@ -243,7 +219,7 @@ class ModelReader:
         scope.models |= inner.models
 
     def _find_model_file(self, uri: str, include: SdfElement) -> Path | None:
-        """The SDF that a URI names: a file, or one in the folder of a model."""
+        """Return the SDF file of a URI, which names a file or the folder of a model."""
         found = find_file(uri, include.xml.file.parent) if uri else None
         if found is None or found.is_file():
             return found
@@ -263,13 +239,13 @@ class ModelReader:
 
 @dataclass(frozen=True)
 class MergedFrame(SdfElement):
-    """The frame of a model whose parts were merged into another."""
+    """The frame of a model whose parts were merged into another model."""
 
     merged_model: ModelScope | None = None
 
     @classmethod
     def from_scope(cls, scope: ModelScope) -> "MergedFrame":
-        """The frame of a model."""
+        """Return the frame of a merged model."""
         placed = scope.pose_element
         base = (
             scope.include_element.base_frame if scope.include_element is not None else "__model__"
@@ -278,7 +254,7 @@ class MergedFrame(SdfElement):
 
 
 def _file_from_config(folder: Path) -> Path | None:
-    """The newest file that a model.config lists, else model.sdf."""
+    """Return the file of the newest version in model.config, else model.sdf."""
     config = folder / "model.config"
     if not config.is_file():
         return folder / "model.sdf"
@@ -291,7 +267,7 @@ def _file_from_config(folder: Path) -> Path | None:
 
 
 def sdf_version(xml: XmlFile) -> tuple[int, int]:
-    """The version of SDF that a file is written in."""
+    """Return the SDF version of a file."""
     return _parse_version(xml.root.get("version", ""))
 
 
@@ -304,23 +280,28 @@ def _parse_version(text: str) -> tuple[int, int]:
 
 
 def find_scope(scope: ModelScope, name: str, referrer: SdfElement) -> tuple[ModelScope, str]:
-    """The scope in which a name with `::` is, and the rest of it.
+    """Find the scope that defines a name with `::`.
+
+    Args:
+        scope: The scope in which the name is used.
+        name: The name.
+        referrer: The element that uses the name, for errors.
+
+    Returns:
+        The scope, and the name in it.
 
     Raises:
         DescriptionError: It is unknown.
     """
-    if name in scope.links or name in scope.joints or name in scope.frames:
-        return scope, name
-    if name in scope.models or name == "__model__":
+    if name in scope.names() or name == "__model__":
         return scope, name
     parts = name.split("::")
     for cut in range(len(parts) - 1, 0, -1):
         first, rest = "::".join(parts[:cut]), "::".join(parts[cut:])
         if first in scope.models:
             return find_scope(scope.models[first], rest, referrer)
-    if len(parts) > 1 and parts[0] == scope.name and not scope.prefix:  # as some write it
+    if len(parts) > 1 and parts[0] == scope.name and not scope.prefix:  # some files do so
         return find_scope(scope, "::".join(parts[1:]), referrer)
-    raise referrer.xml.error_at(
-        referrer.element,
+    raise referrer.error(
         f"{referrer.label} names '{name}', which is unknown, {suggest_names(scope.names(), name)}",
     )

@@ -1,4 +1,4 @@
-"""Values of SDF, which stand as text in elements."""
+"""Elements of SDF and the values in their texts."""
 
 import math
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
+from crane.common.errors import DescriptionError
 from crane.description.pinocchio_conversion import rotation_from_rpy
 from crane.description.specification import unit_vector
 from crane.formats.xml_file import XmlFile
@@ -21,8 +22,8 @@ class SdfElement:
     Attributes:
         xml: The file.
         element: The element.
-        label: What it is, for errors.
-        base_frame: The frame that its poses are relative to if they say nothing.
+        label: Name of the element in errors.
+        base_frame: The frame that its poses are relative to by default.
     """
 
     xml: XmlFile
@@ -37,32 +38,49 @@ class SdfElement:
 
     @property
     def name(self) -> str:
-        """Its name, empty without one."""
-        return str(self.element.get("name", "")).strip()
+        """Its name, "" without one."""
+        return self.attribute("name")
+
+    def attribute(self, key: str) -> str:
+        """Return an attribute without surrounding blanks, "" if there is none."""
+        return str(self.element.get(key, "")).strip()
+
+    def error(self, problem: str) -> DescriptionError:
+        """Return an error with the source location of the element."""
+        return self.xml.error_at(self.element, problem)
+
+    def wrap(self, element: etree._Element, label: str) -> "SdfElement":
+        """Return another element of the same file with the same base frame."""
+        return SdfElement(self.xml, element, label, self.base_frame)
 
     def single_child(self, tag: str) -> "SdfElement | None":
-        """The child with a tag, if there is one.
+        """Return the child with a tag, None if there is none.
 
         Raises:
             DescriptionError: There are several.
         """
         child = self.xml.single_child(self.element, tag, self.label)
-        return None if child is None else SdfElement(self.xml, child, self.label, self.base_frame)
+        return None if child is None else self.wrap(child, self.label)
 
     def text(self, tag: str, default: str = "") -> str:
-        """Text of a child."""
+        """Return the text of a child."""
         child = self.single_child(tag)
         return default if child is None else (child.element.text or "").strip() or default
 
     def is_true(self, tag: str) -> bool:
-        """Whether a child says so."""
+        """Whether the text of a child is true."""
         return self.text(tag).lower() in ("true", "1")
 
     def numbers(self, tag: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
-        """Finite numbers of a child.
+        """Return the numbers in the text of a child.
+
+        Args:
+            tag: Tag of the child.
+            count: How many numbers there have to be.
+            default: Result without a child or text.
 
         Raises:
-            DescriptionError: There are others.
+            DescriptionError: The text is something else.
         """
         child = self.single_child(tag)
         if child is None or not (child.element.text or "").strip():
@@ -70,32 +88,30 @@ class SdfElement:
         return child.parse_numbers(count, f"<{tag}>")
 
     def number(self, tag: str, default: float) -> float:
-        """A number of a child, infinite for what SDF calls so, as `numbers`."""
+        """Return the number in the text of a child, which may be `inf`; see `numbers`."""
         text = self.text(tag).lower()
         if text.lstrip("+-") in ("inf", "infinity"):
             return -math.inf if text.startswith("-") else math.inf
         return self.numbers(tag, 1, (default,))[0]
 
     def parse_numbers(self, count: int, description: str) -> tuple[float, ...]:
-        """The numbers in its own text."""
+        """Return the numbers in the text of this element."""
         text = self.element.text or ""
         return self.xml.parse_numbers(self.element, text, f"{description} of {self.label}", count)
 
     def direction(self, tag: str) -> np.ndarray:
-        """Unit vector (3,) of a child, z without one.
+        """Return the unit vector (3,) of a child, z without one.
 
         Raises:
             DescriptionError: It is zero or malformed.
         """
         unit = unit_vector(self.numbers(tag, 3, (0.0, 0.0, 1.0)))
         if unit is None:
-            raise self.xml.error_at(
-                self.element, f"the axis of {self.label} is zero, give a direction"
-            )
+            raise self.error(f"the axis of {self.label} is zero, give a direction")
         return np.array(unit)
 
     def read_pose(self) -> tuple[pin.SE3, str]:
-        """Its `<pose>` and the frame that this is relative to, empty where it does not say."""
+        """Return the pose, and the frame that it is relative to, "" for the default."""
         child = self.single_child("pose")
         if child is None:
             return pin.SE3.Identity(), ""
@@ -107,7 +123,7 @@ class SdfElement:
             *xyz, qx, qy, qz, qw = child.parse_numbers(7, "<pose>")
             length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
             if length == 0:
-                raise self.xml.error_at(child.element, f"the pose of {self.label} has no rotation")
+                raise child.error(f"the pose of {self.label} has no rotation")
             quaternion = pin.Quaternion(qw / length, qx / length, qy / length, qz / length)
             return pin.SE3(quaternion.toRotationMatrix(), np.array(xyz)), relative_frame
         x, y, z, *angles = child.parse_numbers(6, "<pose>")

@@ -1,7 +1,7 @@
-"""Joints of SDF as edges with one freedom, none, or the three of a ball.
+"""Joints of SDF as edges of a graph with one degree of freedom, none, or the three of a ball.
 
-A universal joint is two edges with a link between them, as is a screw, whose slide s follows its
-turn q by s = pitch q / 2 pi. A gearbox is no edge: it couples the angles of two others.
+A universal joint is two edges with a link between them. So is a screw, whose translation s is
+coupled to its rotation q by s = pitch q / 2 pi. A gearbox couples the angles of two other joints.
 """
 
 import dataclasses
@@ -12,17 +12,15 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import suggest_names
-from crane.description.kinematic_tree import NO_LIMIT
+from crane.description.kinematic_tree import Limits, parse_limit
 from crane.formats.sdf.frame_poses import SdfFramePoses, find_link
 from crane.formats.sdf.model_scope import ModelScope
 from crane.formats.sdf.sdf_element import SdfElement
 
-WORLD_NODE = "::world"  # as no link can be called
+WORLD_NODE = "::world"  # not a possible name of a link
 _SINGLE_FREEDOM_TYPES = {
-    "revolute": "revolute",
-    "continuous": "revolute",
-    "prismatic": "prismatic",
-}
+    "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
+}  # fmt: skip
 _TWO_FREEDOM_TYPES = ("universal", "revolute2")
 _AXISLESS_TYPES = ("fixed", "ball")
 JOINT_TYPES = (*_SINGLE_FREEDOM_TYPES, *_TWO_FREEDOM_TYPES, *_AXISLESS_TYPES, "screw", "gearbox")
@@ -30,28 +28,22 @@ JOINT_TYPES = (*_SINGLE_FREEDOM_TYPES, *_TWO_FREEDOM_TYPES, *_AXISLESS_TYPES, "s
 
 @dataclass(frozen=True)
 class SdfAxis:
-    """What SDF says of one freedom.
+    """One degree of freedom of a joint.
 
     Attributes:
         item: The `<axis>` or the joint.
         direction: (3,) unit vector in the joint's frame.
-        lower: Limit, infinite for none.
-        upper: Limit.
-        effort: Limit; 0 where nothing drives it.
-        velocity: Limit.
+        limits: Limits; an effort of 0 means that no actuator drives it.
         damping: Viscous friction.
         friction: Coulomb friction.
-        stiffness: Of a spring.
-        reference: Where that is slack.
-        initial: Coordinate at the beginning; None if not given.
+        stiffness: Stiffness of a spring.
+        reference: Coordinate at which the spring is slack.
+        initial: Initial coordinate; None if not given.
     """
 
     item: SdfElement
     direction: np.ndarray
-    lower: float = -math.inf
-    upper: float = math.inf
-    effort: float = math.inf
-    velocity: float = math.inf
+    limits: Limits = Limits()
     damping: float = 0.0
     friction: float = 0.0
     stiffness: float = 0.0
@@ -64,16 +56,16 @@ class SdfJointEdge:
     """A joint between two links.
 
     Attributes:
-        name: Its name in the whole machine.
+        name: Name in the whole machine.
         kind: "revolute", "prismatic", "fixed" or "ball".
-        parent: Node that it stands on: the name of a link, or `WORLD_NODE`.
-        child: Node that it moves.
-        placement: Its frame at coordinate zero, in that of the top model.
+        parent: Parent node: the name of a link, or `WORLD_NODE`.
+        child: Child node.
+        placement: The joint's frame at coordinate zero, in the frame of the top model.
         item: The joint.
-        axis: Of its freedom; None for a fixed one and a ball.
+        axis: The degree of freedom; None for a fixed joint and a ball.
         is_coupled: Whether a coupling needs its coordinate.
-        composite_joint: The joint whose parts meet at the child, empty if that is a link of the
-            file.
+        composite_joint: The joint whose two edges meet at the child, "" if the child is a link of
+            the file.
     """
 
     name: str
@@ -89,7 +81,7 @@ class SdfJointEdge:
 
 @dataclass(frozen=True)
 class CoupledCoordinate:
-    """A coordinate that follows another: q = multiplier q_leader + offset."""
+    """A coordinate that depends on another: q = multiplier q_leader + offset."""
 
     name: str
     leader: str
@@ -100,9 +92,9 @@ class CoupledCoordinate:
 
 @dataclass(frozen=True)
 class Gearbox:
-    """Angles from a reference to two links that a gearbox couples: q_2 = -ratio q_1.
+    """A coupling q_2 = -ratio q_1 of the angles from a reference link to two links.
 
-    The directions (3,) of both angles are in the top model's frame.
+    The directions (3,) of both angles are in the frame of the top model.
     """
 
     reference: str
@@ -113,15 +105,15 @@ class Gearbox:
 
 
 class SdfJoints:
-    """The joints of a model and of those within it.
+    """The joints of a model and of the models nested in it.
 
     Args:
         top: The model.
         frames: Poses of its file.
 
     Attributes:
-        edges: In the order of the file.
-        coupled_coordinates: Coordinates that follow others.
+        edges: Joints in the order of the file.
+        coupled_coordinates: Coordinates that depend on others.
         gearboxes: Gearboxes.
     """
 
@@ -130,7 +122,7 @@ class SdfJoints:
         self.edges: list[SdfJointEdge] = []
         self.coupled_coordinates: list[CoupledCoordinate] = []
         self.gearboxes: list[Gearbox] = []
-        self._freedom_names: dict[str, list[str]] = {}  # joint -> names of its freedoms
+        self._freedom_names: dict[str, list[str]] = {}  # joint -> its coordinates
         scopes = [scope for scope in top.nested_scopes() if not scope.is_static]
         for scope in scopes:
             for joint in scope.joints.values():
@@ -145,24 +137,24 @@ class SdfJoints:
         ]
 
     def _read_joint(self, scope: ModelScope, joint: SdfElement) -> None:
-        kind = str(joint.element.get("type", "")).strip()
+        kind = joint.attribute("type")
         if kind not in JOINT_TYPES:
-            problem = (
-                f"the type '{kind}', {suggest_names(JOINT_TYPES, kind)}" if kind else "no type"
-            )
-            raise joint.xml.error_at(joint.element, f"{joint.label} has {problem}")
+            problem = "no type"
+            if kind:
+                problem = f"the type '{kind}', {suggest_names(JOINT_TYPES, kind)}"
+            raise joint.error(f"{joint.label} has {problem}")
         name = f"{scope.prefix}{joint.name}"
         ends = self._end_node(scope, joint, "parent"), self._end_node(scope, joint, "child")
         if ends[0] == ends[1]:
-            raise joint.xml.error_at(joint.element, f"{joint.label} joins '{ends[0]}' to itself")
+            raise joint.error(f"{joint.label} joins '{ends[0]}' to itself")
         child = joint.text("child")
         placement_in_scope = self._frames.element_pose(
             scope, joint, "" if ends[1] == WORLD_NODE else child
         )
         placement = self._frames.pose_in_top(scope, self._top) * placement_in_scope
-        tags = ("axis", "axis2")[
-            : 2 if kind in (*_TWO_FREEDOM_TYPES, "gearbox") else kind not in _AXISLESS_TYPES
-        ]
+        tags = [] if kind in _AXISLESS_TYPES else ["axis"]
+        if kind in (*_TWO_FREEDOM_TYPES, "gearbox"):
+            tags = ["axis", "axis2"]
         axes = [self._read_axis(scope, joint, tag, placement_in_scope) for tag in tags]
         self._freedom_names[name] = [name]
         if kind in _AXISLESS_TYPES:
@@ -181,10 +173,10 @@ class SdfJoints:
             self._add_gearbox(scope, ends, placement, joint, axes)
 
     def _end_node(self, scope: ModelScope, joint: SdfElement, tag: str) -> str:
-        """The node that an end of a joint stands for."""
+        """Return the node at an end of a joint."""
         name = joint.text(tag)
         if not name:
-            raise joint.xml.error_at(joint.element, f"{joint.label} has no <{tag}>, add it")
+            raise joint.error(f"{joint.label} has no <{tag}>, add it")
         found = find_link(scope, name, joint)
         if found is None:
             return WORLD_NODE
@@ -194,7 +186,7 @@ class SdfJoints:
     def _read_axis(
         self, scope: ModelScope, joint: SdfElement, tag: str, placement_in_scope: pin.SE3
     ) -> SdfAxis:
-        """The numbers of a freedom; about z without limits where nothing is said."""
+        """Read a degree of freedom; the default is about z without limits."""
         axis = joint.single_child(tag)
         if axis is None:
             return SdfAxis(joint, np.array([0.0, 0.0, 1.0]))
@@ -204,10 +196,12 @@ class SdfJoints:
         return SdfAxis(
             axis,
             self._axis_direction(scope, axis, placement_in_scope),
-            lower=_limit_or_infinity(limit.number("lower", -math.inf)),
-            upper=_limit_or_infinity(limit.number("upper", math.inf)),
-            effort=_maximum_or_infinity(limit.number("effort", -1.0)),
-            velocity=_maximum_or_infinity(limit.number("velocity", -1.0)),
+            Limits(
+                parse_limit(limit.number("lower", -math.inf)),
+                parse_limit(limit.number("upper", math.inf)),
+                _maximum_or_infinity(limit.number("effort", -1.0)),
+                _maximum_or_infinity(limit.number("velocity", -1.0)),
+            ),
             damping=dynamics.number("damping", 0.0),
             friction=dynamics.number("friction", 0.0),
             stiffness=dynamics.number("spring_stiffness", 0.0),
@@ -218,16 +212,16 @@ class SdfJoints:
     def _axis_direction(
         self, scope: ModelScope, axis: SdfElement, placement_in_scope: pin.SE3
     ) -> np.ndarray:
-        """An axis in the joint's frame; in the model's up to version 1.4."""
+        """Return an axis in the joint's frame; SDF 1.4 and older give it in the model's frame."""
         xyz = axis.direction("xyz")
         child = axis.single_child("xyz")
-        frame_name = "" if child is None else str(child.element.get("expressed_in", "")).strip()
+        frame_name = "" if child is None else child.attribute("expressed_in")
         if not frame_name and (scope.version <= (1, 4) or axis.is_true("use_parent_model_frame")):
             frame_name = axis.base_frame
         if not frame_name:
             return xyz
         frame_name = axis.base_frame if frame_name == "__model__" else frame_name
-        rotation = self._frames.rotation_in_scope(scope, frame_name, axis)
+        rotation = self._frames.pose_in_scope(scope, frame_name, axis).rotation
         return np.asarray(placement_in_scope.rotation.T @ rotation @ xyz)
 
     def _add_edge_pair(
@@ -239,22 +233,16 @@ class SdfJoints:
         joint: SdfElement,
         axes: list[SdfAxis],
     ) -> None:
-        """Two edges with a link between them."""
+        """Add two edges with a link between them."""
         middle_node = f"{names[0]}_between"
-        composite_joint = joint.name
-        self.edges += [
-            SdfJointEdge(
-                names[0],
-                kinds[0],
-                end_nodes[0],
-                middle_node,
-                placement,
-                joint,
-                axes[0],
-                composite_joint=composite_joint,
-            ),
-            SdfJointEdge(names[1], kinds[1], middle_node, end_nodes[1], placement, joint, axes[1]),
-        ]
+        first, second = (
+            SdfJointEdge(name, kind, parent, child, placement, joint, axis)
+            for name, kind, parent, child, axis in zip(
+                names, kinds, (end_nodes[0], middle_node), (middle_node, end_nodes[1]), axes,
+                strict=True,
+            )
+        )  # fmt: skip
+        self.edges += [dataclasses.replace(first, composite_joint=joint.name), second]
 
     def _add_screw(
         self,
@@ -266,7 +254,7 @@ class SdfJoints:
     ) -> None:
         travel_per_radian = joint.number("screw_thread_pitch", 0.0) / (2 * math.pi)
         if joint.single_child("screw_thread_pitch") is None:
-            pitch = joint.number("thread_pitch", 1.0)  # [rad/m], of a left-handed thread
+            pitch = joint.number("thread_pitch", 1.0)  # [rad/m], positive if left-handed
             travel_per_radian = -1.0 / pitch if pitch else 0.0
         slide = f"{name}_slide"
         names = [name, slide]
@@ -284,23 +272,16 @@ class SdfJoints:
         joint: SdfElement,
         axes: list[SdfAxis],
     ) -> None:
-        reference = self._end_node(scope, joint, "gearbox_reference_body")
         first_direction, second_direction = (
             np.asarray(placement.rotation @ axis.direction) for axis in axes
         )
+        reference = self._end_node(scope, joint, "gearbox_reference_body")
         ratio = joint.number("gearbox_ratio", 1.0)
-        self.gearboxes.append(
-            Gearbox(
-                reference,
-                (end_nodes[0], end_nodes[1]),
-                (first_direction, second_direction),
-                ratio,
-                joint,
-            )
-        )
+        directions = first_direction, second_direction
+        self.gearboxes.append(Gearbox(reference, end_nodes, directions, ratio, joint))
 
     def _read_mimic(self, scope: ModelScope, joint: SdfElement) -> None:
-        """Axes that follow one of another joint."""
+        """Read axes that mimic an axis of another joint."""
         own_freedoms = self._freedom_names.get(f"{scope.prefix}{joint.name}", [])
         for name, tag in zip(own_freedoms, ("axis", "axis2"), strict=False):
             axis = joint.single_child(tag)
@@ -311,7 +292,7 @@ class SdfJoints:
     def _coupled_coordinate(
         self, scope: ModelScope, name: str, mimic: SdfElement
     ) -> CoupledCoordinate:
-        leader = str(mimic.element.get("joint", "")).strip()
+        leader = mimic.attribute("joint")
         parts = self._freedom_names.get(f"{scope.prefix}{leader}")
         if parts is None:
             names = [
@@ -319,21 +300,16 @@ class SdfJoints:
                 for x in self._freedom_names
                 if x.startswith(scope.prefix)
             ]
-            raise mimic.xml.error_at(
-                mimic.element, f"{mimic.label} mimics the unknown joint '{leader}', "
+            raise mimic.error(
+                f"{mimic.label} mimics the unknown joint '{leader}', "
                 f"{suggest_names(names, leader)}"
-            )  # fmt: skip
+            )
         second = mimic.element.get("axis", "axis") == "axis2"
         multiplier = mimic.number("multiplier", 1.0)
         offset = mimic.number("offset", 0.0) - multiplier * mimic.number("reference", 0.0)
         return CoupledCoordinate(name, parts[-1 if second else 0], multiplier, offset, mimic)
 
 
-def _limit_or_infinity(value: float) -> float:
-    """A limit, infinite from 1e9 on: older versions write 1e16 for none."""
-    return math.copysign(math.inf, value) if abs(value) >= NO_LIMIT else value
-
-
 def _maximum_or_infinity(value: float) -> float:
-    """An effort or velocity; a negative one is not limited."""
-    return math.inf if value < 0 else _limit_or_infinity(value)
+    """Return an effort or velocity limit; a negative value means none."""
+    return math.inf if value < 0 else parse_limit(value)

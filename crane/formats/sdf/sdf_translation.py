@@ -1,9 +1,9 @@
-"""SDF translated into URDF with loops, so that one reader checks, draws and converts both.
+"""Translation of SDF to URDF with loops, so that the same reader checks, draws and converts both.
 
-SDF is a graph: its joints close loops by being there. A spanning tree of them becomes joints (see
-`crane.formats.sdf.spanning_tree`), the others become loops, and links keep their frames. What a
-file says of a joint that is passed from child to parent holds with its axis turned round, so that
-its coordinate stays what it is in SDF.
+SDF is a graph whose joints may close loops. The joints of a spanning tree (see
+`crane.formats.sdf.spanning_tree`) become joints, the others become loops, and links keep their
+frames. If the tree passes a joint from child to parent, its axis is reversed, so that its
+coordinate is that of SDF.
 """
 
 import dataclasses
@@ -13,12 +13,16 @@ from lxml import etree
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import load_options
+from crane.description.kinematic_tree import Joint, Limits
+from crane.description.pinocchio_conversion import to_vector, xyz_rpy_from_se3
 from crane.description.specification import ForceElement
-from crane.formats.sdf.conversion_notes import ConversionNotes
+from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import SdfFramePoses, canonical_link
-from crane.formats.sdf.gearboxes import gear_followers, mark_geared_edges
-from crane.formats.sdf.ground_attachment import GroundAttachment
-from crane.formats.sdf.link_inertias import add_inertial, warn_about_missing_inertial
+from crane.formats.sdf.link_elements import (
+    add_link_inertial,
+    add_shapes,
+    warn_about_missing_inertial,
+)
 from crane.formats.sdf.model_scope import ModelReader, ModelScope
 from crane.formats.sdf.sdf_element import SdfElement
 from crane.formats.sdf.sdf_joints import (
@@ -28,33 +32,44 @@ from crane.formats.sdf.sdf_joints import (
     SdfJointEdge,
     SdfJoints,
 )
-from crane.formats.sdf.sdf_shapes import add_shapes
-from crane.formats.sdf.spanning_tree import DisjointSets, order_from_root, spanning_tree
-from crane.formats.sdf.urdf_axis_elements import (
-    add_axis,
-    add_dynamics,
-    add_limit,
+from crane.formats.sdf.spanning_tree import (
+    DisjointSets,
+    gear_followers,
+    ground_edges,
+    mark_geared_edges,
+    order_from_root,
+    spanning_tree,
+)
+from crane.formats.sdf.unsupported_elements import note_unsupported_elements
+from crane.formats.urdf_elements import (
+    add_friction,
+    add_joint,
     add_origin,
-    is_limited,
+    finite_limits,
+    format_numbers,
 )
 from crane.formats.xml_file import SourceLocations, XmlFile
 
-_LOOP_TYPES = {"ball": "spherical"}
+_IDENTITY_TOLERANCE = 1e-15
+_MAX_SHOWN_NAMES = 4  # of unsupported elements in a warning
 
 
 def translate_to_urdf(xml: XmlFile) -> tuple[XmlFile, tuple[ForceElement, ...]]:
-    """The machine of an SDF as URDF, and its springs, for which URDF has no place.
+    """Translate the machine of an SDF file to URDF.
+
+    Returns:
+        The URDF, and the springs, which URDF does not have.
 
     Raises:
-        DescriptionError: With file, line, and what is wrong; several models move.
+        DescriptionError: The file is wrong, or several models move; the message has file and line.
     """
-    notes = ConversionNotes(xml)
+    notes = ConversionNotes(xml.file, "SDF", _MAX_SHOWN_NAMES)
     world = ModelReader(xml, notes.note_unsupported).read_world()
     return _SdfTranslation(xml, world, _choose_model(xml, world), notes).build_robot()
 
 
 def _choose_model(xml: XmlFile, world: ModelScope) -> ModelScope:
-    """The model that moves, or that which the argument `model` names."""
+    """Return the only movable model, or the model that the load argument `model` names."""
     model_name = load_options().arguments.get("model")
     names = list(world.models)
     if model_name is not None:
@@ -77,7 +92,7 @@ def _choose_model(xml: XmlFile, world: ModelScope) -> ModelScope:
 
 
 class _SdfTranslation:
-    """A robot as it is built."""
+    """Builds the URDF of a model."""
 
     def __init__(self, xml: XmlFile, world: ModelScope, top: ModelScope, notes: ConversionNotes):
         self._xml, self._top, self._notes = xml, top, notes
@@ -86,34 +101,30 @@ class _SdfTranslation:
         self._robot = etree.Element("robot", name=top.name)
         self._pose_in_world = self._frames.pose_in_scope(world, top.name, top.item)
         self._link_poses: dict[str, pin.SE3] = {WORLD_NODE: self._pose_in_world.inverse()}
-        self._links: dict[str, tuple[ModelScope, SdfElement]] = {}
-        self._renamed_nodes: dict[
-            str, str
-        ] = {}  # of the nodes that are called otherwise than in SDF
+        self._links: dict[str, SdfElement] = {}
+        self._scopes: dict[str, ModelScope] = {}  # by link
+        self._ground_link = ""
         self._springs: list[ForceElement] = []
         self._initial_positions: list[tuple[str, SdfAxis]] = []
 
     def build_robot(self) -> tuple[XmlFile, tuple[ForceElement, ...]]:
-        """The robot, with its springs."""
+        """Return the URDF and the springs."""
         if self._top.is_static:
             item = self._top.item
-            raise item.xml.error_at(item.element, f"{item.label} is static: nothing in it moves")
+            raise item.error(f"{item.label} is static: nothing in it moves")
         for scope in self._top.nested_scopes():
-            self._notes.check_model(scope)
+            note_unsupported_elements(scope, self._notes)
             for name, link in scope.links.items():
                 self._read_link(scope, name, link)
         if not self._links:
             canonical_link(self._top, self._top.item)  # raises
         joints = SdfJoints(self._top, self._frames)
-        groups = _rigid_bodies(joints.edges)
         edges, gears = mark_geared_edges(
             [_fix_locked_joint(edge, self._notes) for edge in joints.edges],
             joints.gearboxes,
-            groups,
+            _rigid_bodies(joints.edges),
         )
-        edges += GroundAttachment(
-            self._top, self._links, self._link_poses, self._notes
-        ).ground_edges(edges)
+        edges += ground_edges(edges, self._top, self._links, self._link_poses, self._notes)
         for edge in edges:
             if edge.composite_joint:
                 self._link_poses[edge.child] = edge.placement
@@ -121,8 +132,8 @@ class _SdfTranslation:
         self._add_links(edges)
         tree_edges = order_from_root(tree, WORLD_NODE)
         driven_joints = _driven_joints(edges, joints.coupled_coordinates)
-        for edge, forward in tree_edges:
-            self._add_joint(edge, forward, driven_joints)
+        for edge, is_forward in tree_edges:
+            self._add_joint(edge, is_forward, driven_joints)
         followers = [*joints.coupled_coordinates, *gear_followers(gears)]
         self._add_mimics(followers, {edge.name for edge, _ in tree_edges})
         tree_edge_ids = {id(edge) for edge, _ in tree_edges}
@@ -141,22 +152,21 @@ class _SdfTranslation:
         if scope.is_static:
             return
         full_name = f"{scope.prefix}{name}"
-        self._links[full_name] = scope, link
+        self._links[full_name], self._scopes[full_name] = link, scope
         pose_in_scope = self._frames.element_pose(scope, link, link.base_frame)
         self._link_poses[full_name] = self._frames.pose_in_top(scope, self._top) * pose_in_scope
 
-    # --- what is written ---------------------------------------------------------------------
-
     def _add_links(self, edges: list[SdfJointEdge]) -> None:
-        self._renamed_nodes[WORLD_NODE] = self._unique_link_name("world")
-        ground = etree.SubElement(self._robot, "link", name=self._renamed_nodes[WORLD_NODE])
+        self._ground_link = self._unique_link_name("world")
+        ground = etree.SubElement(self._robot, "link", name=self._ground_link)
         self._set_source_location(ground, self._top.item)
         bodies = _rigid_bodies(edges)
-        for name, (scope, link) in self._links.items():
+        for name, link in self._links.items():
+            scope = self._scopes[name]
             if bodies.representative(name) != bodies.representative(WORLD_NODE):
                 warn_about_missing_inertial(link)
             element = etree.SubElement(self._robot, "link", name=name)
-            add_inertial(element, scope, link, self._frames)
+            add_link_inertial(element, scope, link, self._frames)
             add_shapes(element, scope, link, self._frames, self._notes.note_unsupported)
             self._set_source_location(element, link)
         for edge in edges:
@@ -166,41 +176,45 @@ class _SdfTranslation:
                 )
                 self._set_source_location(link, edge.item)
 
+    def _link_name(self, node: str) -> str:
+        return self._ground_link if node == WORLD_NODE else node
+
     def _add_joint(
         self, edge: SdfJointEdge, is_forward: bool, driven_joints: set[str] | None
     ) -> None:
-        """A joint from parent to child, or the other way round with its axis turned."""
-        end_nodes = (edge.parent, edge.child) if is_forward else (edge.child, edge.parent)
-        link = self._joint_child_link(edge, end_nodes[1])
-        kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
+        """Add a joint from parent to child, or in the other direction with its axis reversed."""
+        parent, child = (edge.parent, edge.child) if is_forward else (edge.child, edge.parent)
         axis = edge.axis
-        if axis is not None and edge.kind == "revolute" and not is_limited(axis):
-            kind = "continuous"
-        joint = etree.SubElement(self._robot, "joint", name=edge.name, type=kind)
-        add_origin(joint, self._link_poses[end_nodes[0]].actInv(edge.placement))
-        etree.SubElement(joint, "parent", link=self._renamed_nodes.get(end_nodes[0], end_nodes[0]))
-        etree.SubElement(joint, "child", link=link)
+        placement = xyz_rpy_from_se3(self._link_poses[parent].actInv(edge.placement))
+        joint = Joint(
+            edge.name,
+            {"ball": "spherical"}.get(edge.kind, edge.kind),
+            self._link_name(parent),
+            self._joint_child_link(edge, child),
+            "",
+            *placement,
+        )
         if axis is not None:
-            add_axis(joint, axis.direction if is_forward else -axis.direction)
-            add_limit(joint, axis)
-            add_dynamics(joint, axis)
+            direction = to_vector(axis.direction if is_forward else -axis.direction)
+            joint = dataclasses.replace(joint, axis=direction, limits=axis.limits)
+        element = add_joint(self._robot, joint)
+        if axis is not None:
+            add_friction(element, axis.damping, axis.friction)
             self._record_spring_and_start(edge.name, axis)
             if driven_joints is not None:
-                joint.set("independent", str(edge.name in driven_joints).lower())
-        self._set_source_location(joint, edge.item if axis is None else axis.item)
+                element.set("independent", str(edge.name in driven_joints).lower())
+        self._set_source_location(element, edge.item if axis is None else axis.item)
 
     def _joint_child_link(self, edge: SdfJointEdge, link: str) -> str:
-        """The link that a joint moves: one in its frame, if the link's is another."""
+        """Return the link that a joint moves, a new one in its frame if the child has another."""
         offset = edge.placement.actInv(self._link_poses[link])
         if offset.isIdentity(_IDENTITY_TOLERANCE):
-            return self._renamed_nodes.get(link, link)
+            return self._link_name(link)
         name = self._unique_link_name(f"{edge.name}_frame")
         self._set_source_location(etree.SubElement(self._robot, "link", name=name), edge.item)
-        fixed = etree.SubElement(self._robot, "joint", name=f"{name}_fixed", type="fixed")
-        add_origin(fixed, offset)
-        etree.SubElement(fixed, "parent", link=name)
-        etree.SubElement(fixed, "child", link=self._renamed_nodes.get(link, link))
-        self._set_source_location(fixed, edge.item)
+        placement = xyz_rpy_from_se3(offset)
+        fixed = Joint(f"{name}_fixed", "fixed", name, self._link_name(link), "", *placement)
+        self._set_source_location(add_joint(self._robot, fixed), edge.item)
         return name
 
     def _unique_link_name(self, name: str) -> str:
@@ -211,9 +225,7 @@ class _SdfTranslation:
 
     def _record_spring_and_start(self, name: str, axis: SdfAxis) -> None:
         if axis.stiffness < 0:
-            raise axis.item.xml.error_at(
-                axis.item.element, f"the spring of {axis.item.label} has a negative stiffness"
-            )
+            raise axis.item.error(f"the spring of {axis.item.label} has a negative stiffness")
         if axis.stiffness:
             self._springs.append(ForceElement(name, axis.stiffness, axis.reference))
         if axis.initial is not None:
@@ -224,16 +236,13 @@ class _SdfTranslation:
         for follower in followers:
             for name in (follower.name, follower.leader):
                 if name not in joints:
-                    raise follower.item.xml.error_at(
-                        follower.item.element,
+                    raise follower.item.error(
                         f"{follower.item.label}: joint '{name}' is coupled and closes a loop of "
                         "coupled joints, leave one of them out",
                     )
             joint = elements[follower.name]
             if joint.find("mimic") is not None:
-                raise follower.item.xml.error_at(
-                    follower.item.element, f"joint '{follower.name}' follows two others, keep one"
-                )
+                raise follower.item.error(f"joint '{follower.name}' follows two others, keep one")
             mimic = etree.SubElement(
                 joint, "mimic", joint=follower.leader,
                 multiplier=repr(follower.multiplier), offset=repr(follower.offset),
@@ -245,20 +254,20 @@ class _SdfTranslation:
         for edge in loop_edges:
             if bodies.representative(edge.parent) == bodies.representative(edge.child):
                 if edge.kind != "fixed":
-                    raise edge.item.xml.error_at(
-                        edge.item.element,
+                    raise edge.item.error(
                         f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are "
                         "one body: leave it out",
                     )
                 continue
-            kind = _LOOP_TYPES.get(edge.kind, edge.kind)
+            kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
-                end = etree.SubElement(loop, tag, link=self._renamed_nodes.get(link, link))
-                add_origin(end, self._link_poses[link].actInv(edge.placement))
+                end = etree.SubElement(loop, tag, link=self._link_name(link))
+                offset = self._link_poses[link].actInv(edge.placement)
+                add_origin(end, *xyz_rpy_from_se3(offset))
             if edge.axis is not None:
-                add_axis(loop, edge.axis.direction)
-                if is_limited(edge.axis):
+                etree.SubElement(loop, "axis", xyz=format_numbers(edge.axis.direction))
+                if finite_limits(edge.axis.limits) is not None:
                     self._notes.note_unsupported("limits of joints that close loops", edge.name)
                 if edge.axis.damping or edge.axis.friction or edge.axis.stiffness:
                     self._notes.note_unsupported(
@@ -275,22 +284,19 @@ class _SdfTranslation:
             self._set_source_location(joint, axis.item)
 
 
-_IDENTITY_TOLERANCE = 1e-15
-
-
 def _rigid_bodies(edges: list[SdfJointEdge]) -> DisjointSets:
-    """The links that fixed joints make one body."""
-    groups = DisjointSets()
+    """Return the sets of links that fixed joints join to one body."""
+    bodies = DisjointSets()
     for edge in edges:
         if edge.kind == "fixed":
-            groups.join(edge.parent, edge.child)
-    return groups
+            bodies.join(edge.parent, edge.child)
+    return bodies
 
 
 def _fix_locked_joint(edge: SdfJointEdge, notes: ConversionNotes) -> SdfJointEdge:
-    """A joint that may only stand at zero is fixed: the way to write that before 1.5 had it."""
-    axis = edge.axis
-    if axis is None or edge.is_coupled or axis.lower != axis.upper or axis.lower:
+    """Return a joint limited to zero as a fixed joint, which SDF before 1.5 does not have."""
+    limits = Limits() if edge.axis is None else edge.axis.limits
+    if edge.is_coupled or limits.lower != limits.upper or limits.lower:
         return edge
     notes.note_difference("joints limited to 0 are fixed", edge.name)
     return dataclasses.replace(edge, kind="fixed", axis=None)
@@ -299,14 +305,12 @@ def _fix_locked_joint(edge: SdfJointEdge, notes: ConversionNotes) -> SdfJointEdg
 def _driven_joints(
     edges: list[SdfJointEdge], followers: list[CoupledCoordinate]
 ) -> set[str] | None:
-    """Joints that have an effort; None where the file does not tell them from others.
+    """Return the joints with an effort, None if all or no joints have one.
 
-    An effort of 0 says that nothing drives a joint, unless all have it.
+    An effort of 0 means that no actuator drives the joint, unless all joints have it.
     """
     axis_of_joint = {edge.name: edge.axis for edge in edges if edge.axis is not None}
     coupled_names = {follower.name for follower in followers}
-    with_effort = {
-        name for name, axis in axis_of_joint.items() if axis.effort and name not in coupled_names
-    }
-    without_effort = {name for name, axis in axis_of_joint.items() if not axis.effort}
+    without_effort = {name for name, axis in axis_of_joint.items() if not axis.limits.effort}
+    with_effort = axis_of_joint.keys() - without_effort - coupled_names
     return with_effort if with_effort and without_effort else None

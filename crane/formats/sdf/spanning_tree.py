@@ -1,96 +1,105 @@
-"""Which joints make the tree, and which close its loops."""
+"""The graph of links and joints of an SDF model: spanning tree, gears, joints to the ground."""
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 
-from crane.formats.sdf.sdf_joints import SdfAxis, SdfJointEdge
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import CraneWarning
+from crane.common.package_search import load_options
+from crane.formats.conversion_notes import ConversionNotes
+from crane.formats.sdf.frame_poses import canonical_link
+from crane.formats.sdf.model_scope import ModelScope
+from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.sdf.sdf_joints import (
+    WORLD_NODE,
+    CoupledCoordinate,
+    Gearbox,
+    SdfJointEdge,
+)
 
 _PRIORITY_CLASSES = 5
 
 
 class DisjointSets:
-    """Things that are joined, by union and find."""
+    """Disjoint sets of names (union-find)."""
 
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
 
     def representative(self, name: str) -> str:
-        """What stands for all that a thing is joined to."""
+        """Return the representative of the set that a name belongs to."""
         while (parent := self._parents.get(name, name)) != name:
             self._parents[name] = name = self._parents.get(parent, parent)
         return name
 
     def join(self, first: str, second: str) -> bool:
-        """Join two things; whether they were not."""
-        first_representative, second_representative = (
-            self.representative(first),
-            self.representative(second),
-        )
-        self._parents[second_representative] = first_representative
-        return first_representative != second_representative
+        """Join the sets of two names, and return whether they were different."""
+        root, other_root = self.representative(first), self.representative(second)
+        self._parents[other_root] = root
+        return root != other_root
 
 
 def _priority_class(edge: SdfJointEdge) -> int:
-    """How much of a joint would be lost if it closed a loop; less is kept first."""
+    """Class of a joint by what would be lost if it closed a loop; 0 enters the tree first."""
     axis = edge.axis
     if edge.kind == "fixed" or edge.is_coupled:
         return 0
     if axis is None:
-        return (
-            _PRIORITY_CLASSES - 1
-        )  # a ball is three equations, and in a tree three Cardan angles
-    if _has_force_or_start(axis):
+        return _PRIORITY_CLASSES - 1  # a ball is three equations, or three Cardan angles in a tree
+    if axis.damping or axis.friction or axis.stiffness or axis.initial is not None:
         return 1
-    return 2 if edge.composite_joint or abs(axis.lower) < float("inf") > abs(axis.upper) else 3
-
-
-def _has_force_or_start(axis: SdfAxis) -> bool:
-    """Whether a force acts along an axis, or a file says where it begins."""
-    forces = (axis.damping, axis.friction, axis.stiffness)
-    return any(forces) or axis.initial is not None
+    return (
+        2
+        if edge.composite_joint or np.isfinite([axis.limits.lower, axis.limits.upper]).all()
+        else 3
+    )
 
 
 def spanning_tree(edges: Sequence[SdfJointEdge], root: str) -> list[SdfJointEdge]:
-    """The joints of a tree, of those with more to say first, each kind breadth-first from a root.
+    """Return the joints of a spanning tree, by priority class and breadth-first from a root.
 
     Args:
         edges: All joints.
-        root: The node to begin with.
+        root: The root node.
     """
-    groups, found = DisjointSets(), []
+    bodies, found = DisjointSets(), []
     for rank in range(_PRIORITY_CLASSES):
         some = [edge for edge in edges if _priority_class(edge) == rank]
-        found += _breadth_first(some, groups, root)
+        found += _breadth_first(some, bodies, root)
     return found
 
 
 def _breadth_first(
-    edges: Sequence[SdfJointEdge], groups: DisjointSets, root: str
+    edges: Sequence[SdfJointEdge], bodies: DisjointSets, root: str
 ) -> list[SdfJointEdge]:
-    """Joints that join groups of nodes, the nearest to the root first."""
+    """Return joints that join sets of nodes, the nearest to the root first, and join the sets."""
     edges_by_node: dict[str, list[SdfJointEdge]] = {}
     for edge in edges:
         for end in (edge.parent, edge.child):
-            edges_by_node.setdefault(groups.representative(end), []).append(edge)
+            edges_by_node.setdefault(bodies.representative(end), []).append(edge)
     found: list[SdfJointEdge] = []
     seen: set[str] = set()
-    for start in (groups.representative(root), *edges_by_node):
+    for start in (bodies.representative(root), *edges_by_node):
         pending = [] if start in seen else [start]
         seen.add(start)
         for node in pending:
             for edge in edges_by_node.get(node, ()):
-                ends = groups.representative(edge.parent), groups.representative(edge.child)
+                ends = bodies.representative(edge.parent), bodies.representative(edge.child)
                 other_end = ends[ends[0] == node]
                 if other_end not in seen:
                     seen.add(other_end)
                     pending.append(other_end)
                     found.append(edge)
     for edge in found:
-        groups.join(edge.parent, edge.child)
+        bodies.join(edge.parent, edge.child)
     return found
 
 
 def order_from_root(edges: Iterable[SdfJointEdge], root: str) -> list[tuple[SdfJointEdge, bool]]:
-    """The joints of a tree from the root on, and whether each goes from parent to child."""
+    """Return the joints of a tree from the root on, and whether each points away from the root."""
     edges_by_node: dict[str, list[SdfJointEdge]] = {}
     for edge in edges:
         edges_by_node.setdefault(edge.parent, []).append(edge)
@@ -104,3 +113,135 @@ def order_from_root(edges: Iterable[SdfJointEdge], root: str) -> list[tuple[SdfJ
                 pending.append(other_end)
                 found.append((edge, edge.parent == node))
     return found
+
+
+_PARALLEL_TOLERANCE = 1e-6
+
+GearAngles = tuple[Gearbox, list[tuple[str, float]]]  # name and sign of the joint of each angle
+
+
+def mark_geared_edges(
+    edges: list[SdfJointEdge], gears: Sequence[Gearbox], bodies: DisjointSets
+) -> tuple[list[SdfJointEdge], list[GearAngles]]:
+    """Mark the joints that gearboxes couple.
+
+    Args:
+        edges: All joints.
+        gears: All gearboxes.
+        bodies: Sets of links that are one body.
+
+    Returns:
+        All joints, and the joints of both angles of each gearbox.
+
+    Raises:
+        DescriptionError: No joint turns a link against the reference about the gear's axis.
+    """
+    gear_angles: list[GearAngles] = []
+    for gear in gears:
+        angles = [
+            _gear_angle(edges, gear, bodies, link, direction)
+            for link, direction in zip(gear.links, gear.directions, strict=True)
+        ]
+        gear_angles.append((gear, angles))
+    bound_names = {name for _, angles in gear_angles for name, _ in angles}
+    return [
+        dataclasses.replace(x, is_coupled=True) if x.name in bound_names else x for x in edges
+    ], gear_angles
+
+
+def _gear_angle(
+    edges: Sequence[SdfJointEdge],
+    gear: Gearbox,
+    bodies: DisjointSets,
+    link: str,
+    direction: np.ndarray,
+) -> tuple[str, float]:
+    """Return the joint between the reference and a link, and the sign of its coordinate."""
+    required_bodies = bodies.representative(gear.reference), bodies.representative(link)
+    for edge in edges:
+        ends = bodies.representative(edge.parent), bodies.representative(edge.child)
+        if edge.kind != "revolute" or edge.axis is None or {*ends} != {*required_bodies}:
+            continue
+        cosine = float(direction @ edge.placement.rotation @ edge.axis.direction)
+        if abs(abs(cosine) - 1) > _PARALLEL_TOLERANCE:
+            continue
+        is_forward = ends == required_bodies
+        return edge.name, float(np.sign(cosine)) * (1.0 if is_forward else -1.0)
+    raise gear.item.error(
+        f"{gear.item.label}: no joint turns '{link.removeprefix('::')}' against "
+        f"'{gear.reference.removeprefix('::')}' "
+        "about the gear's axis, name another gearbox_reference_body",
+    )
+
+
+def gear_followers(gears: Sequence[GearAngles]) -> list[CoupledCoordinate]:
+    """Return the couplings of gears: s_2 q_2 = -ratio s_1 q_1 with the signs s of both angles."""
+    return [
+        CoupledCoordinate(second, first, -gear.ratio * first_sign / second_sign, 0.0, gear.item)
+        for gear, ((first, first_sign), (second, second_sign)) in gears
+    ]
+
+
+_MAX_LISTED = 4
+
+
+def ground_edges(
+    edges: Sequence[SdfJointEdge],
+    top: ModelScope,
+    links: Mapping[str, SdfElement],
+    link_poses: Mapping[str, pin.SE3],
+    notes: ConversionNotes,
+) -> list[SdfJointEdge]:
+    """Return joints to the world for the parts of a model that no joint connects to it.
+
+    If no part is connected to the world, all of them are fixed to it in their poses, or float if
+    the load options request it. If some parts are connected, the others float.
+
+    Args:
+        edges: All joints.
+        top: The model.
+        links: Its links by name.
+        link_poses: Poses of the links in the model's frame.
+        notes: Receives the links that float.
+    """
+    bodies = DisjointSets()
+    for edge in edges:
+        bodies.join(edge.parent, edge.child)
+    unattached = [
+        link for link in _root_candidates(edges, top, links) if bodies.join(WORLD_NODE, link)
+    ]
+    is_connected = any(WORLD_NODE in (edge.parent, edge.child) for edge in edges)
+    is_floating = load_options().floating_root
+    # a single part floats by the joints that machines of other formats get
+    is_fixed = not is_connected and not (is_floating and len(unattached) > 1)
+    if unattached and not is_floating:
+        if is_fixed:
+            listed = ", ".join(f"'{link}'" for link in unattached[:_MAX_LISTED])
+            warnings.warn(
+                f"{links[unattached[0]].source_location}: nothing joins '{top.name}' to the "
+                f"world, it is taken as standing on the ground by link {listed}: --floating "
+                "(floating=True) lets it float",
+                CraneWarning,
+                stacklevel=3,
+            )
+        else:
+            notes.note_difference("links that no joint ties to the others float", *unattached)
+    kind, suffix = ("fixed", "world") if is_fixed else ("floating", "free")
+    used_names = {edge.name for edge in edges}
+    added = []
+    for link in unattached:
+        name = f"{link}_{suffix}"
+        while name in used_names:
+            name += "_"
+        added.append(SdfJointEdge(name, kind, WORLD_NODE, link, link_poses[link], links[link]))
+    return added
+
+
+def _root_candidates(
+    edges: Sequence[SdfJointEdge], top: ModelScope, links: Mapping[str, SdfElement]
+) -> list[str]:
+    """Sort links: first those that no joint moves and the canonical link."""
+    first = canonical_link(top, top.item)
+    canonical_name = "" if first is None else f"{first[0].prefix}{first[1]}"
+    children = {edge.child for edge in edges}
+    return sorted(links, key=lambda link: (link in children, link != canonical_name))

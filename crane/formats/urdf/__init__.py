@@ -1,1 +1,1 @@
-"""URDF, with loops as elements of its own."""
+"""URDF, with elements for loops and couplings."""

@@ -1,26 +1,29 @@
-"""Links and joints of a URDF, checked."""
+"""Strict reading of links and joints of a URDF, and of the tree that they form."""
 
 import dataclasses
 import math
 import warnings
+from collections.abc import Container, Mapping
+from difflib import get_close_matches
 
 from lxml import etree
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import CraneWarning, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.inertia_feasibility import inertia_problem
 from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, parse_limit
 from crane.description.specification import Friction
-from crane.formats.joint_series import joint_freedoms, joint_series
+from crane.formats.joint_series import MULTI_FREEDOM_TYPES, joint_freedoms, joint_series
+from crane.formats.urdf.loop_elements import read_end_link, unknown_link_error
 from crane.formats.xml_file import XmlFile
 
 
 def read_link(xml: XmlFile, name: str, element: etree._Element, is_moved: bool) -> Link:
-    """A checked link.
+    """Read a link.
 
     Args:
         xml: The file.
-        name: Its name.
+        name: Name of the link.
         element: The `<link>`.
         is_moved: Whether a joint moves it.
     """
@@ -67,7 +70,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
     if is_moved and is_strict():
         report_error(error, harmless=True)
     elif is_strict() or not problem.is_formal:
-        # rigidly attached, it only adds to another body, whose sum is checked later
+        # a fixed link only adds to another body, whose total inertia is checked later
         warnings.warn(str(error), CraneWarning, stacklevel=2)
     finding_location = xml.source_location(tensor_tag) if problem.is_formal else ""
     return dataclasses.replace(link_inertial, finding_location=finding_location)
@@ -76,13 +79,13 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
 def read_joint(
     xml: XmlFile, name: str, element: etree._Element, end_links: tuple[str, str]
 ) -> Joint:
-    """A joint with one freedom, or none, whose limits are not read yet.
+    """Read a joint with one or no degree of freedom, except its limits.
 
     Args:
         xml: The file.
-        name: Its name.
+        name: Name of the joint.
         element: The `<joint>`.
-        end_links: Its parent and child link.
+        end_links: Parent and child link.
     """
     label, kind = f"joint '{name}'", element.get("type")
     xml.single_child(element, "mimic", label)
@@ -101,7 +104,7 @@ def read_joint(
 def read_multi_freedom_joint(
     xml: XmlFile, name: str, element: etree._Element, end_links: tuple[str, str]
 ) -> list[Link | Joint]:
-    """A joint with several freedoms as a series of joints, with the links between them."""
+    """Read a joint with several freedoms as a series of joints and the links between them."""
     label, kind = f"joint '{name}'", element.get("type")
     for tag in ("dynamics", "mimic"):
         if (found := xml.single_child(element, tag, label)) is not None:
@@ -115,7 +118,7 @@ def read_multi_freedom_joint(
 
 
 def _read_maximum(xml: XmlFile, element: etree._Element, key: str, label: str) -> float:
-    """The effort or velocity that a `<limit>` allows, infinite where it has none."""
+    """Read effort or velocity of a `<limit>`, infinite if it has none."""
     if element.get(key) is None:
         return math.inf
     value: float = xml.number(element, key, f"the limit of {label}")
@@ -125,13 +128,13 @@ def _read_maximum(xml: XmlFile, element: etree._Element, key: str, label: str) -
 
 
 def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
-    """Limits of a joint that moves; what the file leaves open is open, and warned of.
+    """Read the limits of a movable joint, infinite with a warning if the file has none.
 
-    Exporters write `<limit effort velocity/>` without lower and upper, which the specification of
-    URDF reads as a range from 0 to 0, or all four as zeros, forms that nobody has filled in.
+    Some exporters write `<limit effort velocity/>` without lower and upper, which the
+    specification of URDF interprets as a range from 0 to 0, or all four values as zeros.
 
     Raises:
-        DescriptionError: They leave it nothing to move.
+        DescriptionError: The limits leave no range of motion.
     """
     label, kind = f"joint '{name}'", joint.get("type")
     element = xml.single_child(joint, "limit", label)
@@ -174,7 +177,7 @@ def _warn_about_missing_limits(xml: XmlFile, element: etree._Element, problem: s
 
 
 def read_friction(xml: XmlFile, name: str, joint: etree._Element) -> Friction | None:
-    """Friction of a joint by its `<dynamics>`, None where it has none."""
+    """Read the friction of a joint from its `<dynamics>`, None if it has none."""
     label = f"joint '{name}'"
     tag = xml.single_child(joint, "dynamics", label)
     if tag is None or joint.get("type") == "fixed":
@@ -185,3 +188,158 @@ def read_friction(xml: XmlFile, name: str, joint: etree._Element) -> Friction | 
     if min(damping, friction) < 0:
         raise xml.error_at(tag, f"damping or friction of {label} is negative, make it positive")
     return Friction(viscous=damping, coulomb=friction) if damping or friction else None
+
+
+MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
+
+EndLinks = dict[str, tuple[str, str]]  # parent and child link by joint, "" for a missing one
+_NO_ENDS = ("", "")
+_MAX_LISTED = 8  # joints of a cycle in an error
+
+
+def read_graph(
+    xml: XmlFile, links: Mapping[str, etree._Element], joints: Mapping[str, etree._Element]
+) -> tuple[EndLinks, str, set[str]]:
+    """Read the graph of links and joints.
+
+    Joints with both ends form a forest, whatever the file contains. A joint that joins a link to
+    itself has no ends once the error was recorded. Neither has a joint that is cut because it
+    gives a link a second parent or closes a cycle.
+
+    Args:
+        xml: The file.
+        links: The `<link>` elements by name.
+        joints: The `<joint>` elements by name.
+
+    Returns:
+        Parent and child link by joint, the root link, and the joints that are cut.
+
+    Raises:
+        DescriptionError: An end is missing or unknown, or the joints do not form one tree.
+    """
+    end_links = {name: _read_end_links(xml, name, joint, links) for name, joint in joints.items()}
+    cut_joints: set[str] = set()
+    root = _find_root(xml, links, joints, end_links, cut_joints)
+    for name in cut_joints:
+        end_links[name] = _NO_ENDS
+    return end_links, root, cut_joints
+
+
+def _read_end_links(
+    xml: XmlFile, name: str, joint: etree._Element, links: Mapping[str, etree._Element]
+) -> tuple[str, str]:
+    """Read parent and child link of a joint, "" after an error, and correct an unknown type."""
+    label, kinds = f"joint '{name}'", (*MOVABLE_TYPES, *MULTI_FREEDOM_TYPES, "fixed")
+    kind = joint.get("type")
+    if kind not in kinds:
+        report_error(
+            xml.error_at(
+                joint,
+                f"{label} has no type, {suggest_names(kinds)}"
+                if not kind
+                else f"{label} has the type '{kind}', which is not supported, "
+                f"{suggest_names(kinds, kind)}",
+            )
+        )
+        similar = get_close_matches(kind or "", kinds, 1, 0.75)
+        joint.set("type", similar[0] if similar else "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = etree.SubElement(joint, "limit")
+        if limit.get("lower") is None and limit.get("upper") is None:
+            limit.attrib.update({"lower": "-1", "upper": "1"})  # avoids a follow-up error
+    ends = []
+    for end in ("parent", "child"):
+        tag, link = read_end_link(xml, joint, end, label)
+        if not link:
+            report_error(
+                xml.error_at(joint, f'{label} has no {end} link, add <{end} link="..."/>')
+            )
+        elif link not in links:
+            report_error(
+                unknown_link_error(xml, tag, f"{label} has the unknown {end}", link, links)
+            )
+            link = ""
+        ends.append(link)
+    if ends[0] and ends[0] == ends[1]:
+        report_error(
+            xml.error_at(joint, f"{label} joins link '{ends[0]}' to itself, change one end")
+        )
+        return _NO_ENDS
+    return ends[0], ends[1]
+
+
+def _find_root(
+    xml: XmlFile,
+    links: Mapping[str, etree._Element],
+    joints: Mapping[str, etree._Element],
+    end_links: EndLinks,
+    cut_joints: set[str],
+) -> str:
+    """Return the root link, and add the joints that are to be cut to `cut_joints`."""
+    parents: dict[str, tuple[str, str]] = {}  # link -> parent, joint
+    for name, (parent, child) in end_links.items():
+        if child in parents:
+            report_error(
+                xml.error_at(
+                    joints[name],
+                    f"link '{child}' has two parents, joints '{parents[child][1]}' and '{name}': "
+                    "keep one and close the other as a loop",
+                )
+            )
+            cut_joints.add(name)
+        elif child:
+            parents[child] = (parent, name)
+    roots = [name for name in links if name not in parents]
+    joined_count = len(parents)
+    visited = {""}  # links whose ancestors have been followed
+    for name in links:
+        seen, repeated_link = _ancestors(parents, name, visited)
+        visited |= seen
+        if repeated_link is None:
+            continue
+        closing_joint, ring = parents[repeated_link][1], _loop_text(parents, repeated_link)
+        report_error(
+            xml.error_at(
+                joints[closing_joint],
+                f"link '{repeated_link}' is its own ancestor: cut the ring of joints {ring} at "
+                f"'{closing_joint}' and "
+                "close it as a loop",
+            )
+        )
+        cut_joints.add(closing_joint)
+        del parents[repeated_link]
+    # joints with errors, each of which may have had one of the roots as its child
+    unplaced_count = len(xml.root.findall("joint")) - joined_count
+    if len(roots) - unplaced_count > 1:
+        listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
+        report_error(
+            xml.error_at(
+                links[roots[1]], f"{len(roots)} links have no parent ({listed}): join all but one"
+            )
+        )
+    return roots[0] if roots else next(iter(links))
+
+
+def _ancestors(
+    parents: Mapping[str, tuple[str, str]], link: str, visited: Container[str]
+) -> tuple[set[str], str | None]:
+    """Return a link and its ancestors up to a visited one, and the link that occurs twice."""
+    seen = {link}
+    while link in parents and link not in visited:
+        link = parents[link][0]
+        if link in seen:
+            return seen, link
+        seen.add(link)
+    return seen, None
+
+
+def _loop_text(parents: Mapping[str, tuple[str, str]], link: str) -> str:
+    """List the joints of the cycle that a link is in, from the link on."""
+    found: list[str] = []
+    current = link
+    while current != link or not found:
+        current, joint = parents[current]
+        found.append(joint)
+    found.reverse()
+    return ", ".join(found[:_MAX_LISTED]) + (", ..." if len(found) > _MAX_LISTED else "")

@@ -1,32 +1,57 @@
-"""Loops in a URDF: the elements and attributes of URDF+ (Chignoli et al., arXiv 2411.19753)."""
+"""Loops and couplings of a URDF, by the elements of URDF+ and by the proposed `<constraint>`.
 
+URDF+ is by Chignoli et al., arXiv 2411.19753. The element `<constraint>` is proposed as
+ros/urdfdom#264 and ros/urdfdom_headers#108 ("Add constraints to describe closed loops", open since
+8 June 2026):
+
+    <constraint name="Name" type="Type">
+    <parent link="Parent_Name"/>
+    <parent_origin xyz="Offset_Child" rpy="RPY_Parent"/>
+    <parent_axis xyz="Joint_Axis_Parent"/>
+    <child link="Child_Name"/>
+    <child_origin xyz="Offset_Child" rpy="RPY_Child"/>
+    <child_axis xyz="Joint_Axis_Child"/>
+    </constraint>
+
+By the parser of the proposal, `urdf_parser/src/constraint.cpp`, types are revolute, prismatic,
+universal and spherical, each also with the suffix `_joint`, and link, a link that was cut. Missing
+origins are the identity, a missing axis is 1 0 0, and `child_axis` has a meaning for universal
+alone. The proposal may still change, so it is read only on request.
+"""
+
+import os
 from collections.abc import Mapping
 
+import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneError, suggest_names
+from crane.common.package_search import URDF_CONSTRAINT, asked
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.kinematic_tree import Joint
-from crane.description.specification import LoopSpec
+from crane.description.specification import Coupling, LoopSpec
 from crane.formats.joint_series import MULTI_FREEDOM_TYPES, joint_freedoms, series_joint_names
 from crane.formats.xml_file import XmlFile
 
-# Those of URDF+, whose "continuous" is a revolute joint (a loop has no limits), and cylindrical.
+# Types of URDF+, whose "continuous" is a revolute joint without limits, and cylindrical.
 _LOOP_TYPES = (
     "fixed", "revolute", "continuous", "prismatic", "spherical", "planar", "cylindrical",
 )  # fmt: skip
-_DEFAULT_AXIS = (1.0, 0.0, 0.0)  # axis of a URDF joint that names none
+_DEFAULT_AXIS = (1.0, 0.0, 0.0)  # of a joint, loop or constraint without an axis
 
 
 def read_loops(
     xml: XmlFile, elements: Mapping[str, etree._Element], links: Mapping[str, etree._Element]
 ) -> tuple[tuple[LoopSpec, ...], tuple[Joint, ...]]:
-    """Loops of `<loop>` elements, and the fixed joints of the two frames that each puts on links.
+    """Read `<loop>` elements.
 
     Args:
         xml: The file.
         elements: The `<loop>` elements by name.
         links: The `<link>` elements by name.
+
+    Returns:
+        The loops, and the fixed joints of the two frames that each loop adds to links.
 
     Raises:
         DescriptionError: A loop is malformed or names an unknown link.
@@ -54,8 +79,7 @@ def _read_loop(
         )
     end_joints = []
     for end in ("predecessor", "successor"):
-        tag = xml.single_child(element, end, label)
-        link = "" if tag is None else tag.get("link", "").strip()
+        tag, link = read_end_link(xml, element, end, label)
         if not link:
             report_error(xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>'))
             continue
@@ -63,12 +87,11 @@ def _read_loop(
             report_error(
                 unknown_link_error(xml, tag, f"{label} has the unknown {end}", link, links)
             )
-        if f"{name}_{end}" in links:
-            same_named = links[f"{name}_{end}"]
-            problem = f"link '{name}_{end}' has the name of a frame of {label}, rename one"
-            report_error(xml.error_at(same_named, problem))
-        xyz, rpy = xml.placement(tag, f"the {end} of {label}")
         frame = f"{name}_{end}"
+        if frame in links:
+            problem = f"link '{frame}' has the name of a frame of {label}, rename one"
+            report_error(xml.error_at(links[frame], problem))
+        xyz, rpy = xml.placement(tag, f"the {end} of {label}")
         end_joints.append(Joint(f"{frame}_fixed", "fixed", link, frame, source_location, xyz, rpy))
     axis = xml.direction(element, label, _DEFAULT_AXIS)
     known_ends = [end for end in end_joints if end.parent in links and end.child not in links]
@@ -80,6 +103,14 @@ def _read_loop(
     ), end_joints
 
 
+def read_end_link(
+    xml: XmlFile, element: etree._Element, tag: str, label: str
+) -> tuple[etree._Element | None, str]:
+    """Return the child with a tag, and the link that it names, "" for none."""
+    child = xml.single_child(element, tag, label)
+    return child, "" if child is None else child.get("link", "").strip()
+
+
 def unknown_link_error(
     xml: XmlFile,
     tag: etree._Element,
@@ -87,7 +118,7 @@ def unknown_link_error(
     link: str,
     links: Mapping[str, etree._Element],
 ) -> CraneError:
-    """The error about a link that is not there, unless one has lost its name."""
+    """Return the error about an unknown link, a follow-up error if a link has no name."""
     if "link" in xml.unnamed_kinds:
         return FollowUpError(f"link '{link}' may be the one without a name")
     return xml.error_at(tag, f"{problem} '{link}', {suggest_names(links, link)}")
@@ -96,44 +127,37 @@ def unknown_link_error(
 def independent_joints(
     xml: XmlFile, joints: Mapping[str, etree._Element]
 ) -> tuple[str, ...] | None:
-    """Moving joints marked `independent="true"`; None where no joint has the attribute.
+    """Return the moving joints marked `independent="true"`, None if no joint has the attribute.
 
-    Where some are marked "false", those without a mark are independent, as in URDF+.
+    If some joints are marked "false", those without a mark are independent, as in URDF+.
 
     Raises:
-        DescriptionError: The attribute is neither true nor false, or stands on a fixed joint.
+        DescriptionError: The attribute is neither true nor false, or belongs to a fixed joint.
     """
     marked_joints = {
         name: joint for name, joint in joints.items() if "independent" in joint.attrib
     }
     for name, joint in marked_joints.items():
-        value = joint.get("independent").lower()  # the authors' own files have "True"
-        joint.set("independent", value)
+        value = joint.get("independent").lower()  # files of the authors of URDF+ have "True"
         if value not in ("true", "false"):
             problem = f"independent=\"{value}\" of joint '{name}' is neither true nor false"
             report_error(xml.error_at(joint, problem))
             value = "true"
-            joint.set("independent", value)
         if value == "true" and joint.get("type") == "fixed":
-            report_error(
-                xml.error_at(
-                    joint, f"joint '{name}' is fixed and independent, keep one of the two"
-                )
-            )
-            joint.set("independent", "false")
+            problem = f"joint '{name}' is fixed and independent, keep one of the two"
+            report_error(xml.error_at(joint, problem))
+            value = "false"
+        joint.set("independent", value)
     if not marked_joints:
         return None
     values = {joint.get("independent") for joint in marked_joints.values()}
     if values == {"true", "false"} or (values == {"false"} and xml.root.find("loop") is None):
-        # as URDF+ has it: those without a mark are independent, too
-        passive = (
-            joint.find("mimic") is not None or joint.get("type") == "fixed"
-            for joint in joints.values()
-        )
+        # by URDF+ joints without a mark are independent, too
         marked_joints = {
             name: joint
-            for (name, joint), follows in zip(joints.items(), passive, strict=True)
-            if name in marked_joints or not follows
+            for name, joint in joints.items()
+            if name in marked_joints
+            or (joint.find("mimic") is None and joint.get("type") != "fixed")
         }
     names: list[str] = []
     for name, joint in marked_joints.items():
@@ -146,3 +170,171 @@ def independent_joints(
             else [name]
         )
     return tuple(names)
+
+
+CONSTRAINT_HINT = (
+    f"read it by --arg {URDF_CONSTRAINT}:=true, arguments={{'{URDF_CONSTRAINT}': True}} in Python"
+)
+_CONSTRAINT_TYPES = {
+    "revolute": "revolute", "prismatic": "prismatic", "spherical": "spherical", "link": "fixed",
+}  # fmt: skip
+_END_TAGS = {"parent": "predecessor", "child": "successor"}
+_CHILDREN = {
+    "constraint": {f"{end}{part}" for end in _END_TAGS for part in ("", "_origin", "_axis")}
+}  # fmt: skip
+_ATTRIBUTES = {"constraint": {"name", "type"}} | {
+    f"{end}{part}": keys
+    for end in _END_TAGS
+    for part, keys in (("", {"link"}), ("_origin", {"xyz", "rpy"}), ("_axis", {"xyz"}))
+}
+_PARALLEL_TOLERANCE = 1e-9
+
+
+def read_constraints(xml: XmlFile) -> None:
+    """Replace each `<constraint>` by a `<loop>`, if the load argument requests it.
+
+    Raises:
+        DescriptionError: A constraint is malformed, or of a type that no `<loop>` has.
+        InputError: The load argument is neither true nor false.
+    """
+    if not asked(URDF_CONSTRAINT):
+        return
+    for element in xml.root.findall("constraint"):
+        with error_recovery():
+            _convert_to_loop(xml, element)
+            continue
+        xml.root.remove(element)  # its error was recorded
+
+
+def _convert_to_loop(xml: XmlFile, element: etree._Element) -> None:
+    if not (name := element.get("name", "").strip()):
+        raise xml.error_at(element, 'a constraint has no name, add name="..."')
+    label = f"constraint '{name}'"
+    xml.check_elements(element, _CHILDREN, _ATTRIBUTES, set(_ATTRIBUTES) - {"constraint"})
+    element.set("type", _loop_type(xml, element, label))
+    _check_axes(xml, element, label)
+    for end, tag in _END_TAGS.items():
+        child, link = read_end_link(xml, element, end, label)
+        if child is None or not link:
+            raise xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>')
+        if (origin := xml.single_child(element, f"{end}_origin", label)) is not None:
+            origin.tag = "origin"
+            child.append(origin)
+        child.tag = tag
+    for axis in element.findall("parent_axis"):
+        axis.tag = "axis"
+    element.tag = "loop"
+
+
+def _loop_type(xml: XmlFile, element: etree._Element, label: str) -> str:
+    """Return the loop type of a constraint."""
+    kind = element.get("type", "")
+    base_type = kind if kind == "link_joint" else kind.removesuffix("_joint")
+    if base_type == "universal":
+        raise xml.error_at(
+            element,
+            f"{label} is universal, which no loop is: hang a link without mass on its parent by "
+            "a continuous joint about parent_axis, and close to that, with revolute",
+        )
+    if base_type not in _CONSTRAINT_TYPES:
+        problem = f"the unknown type '{kind}'" if kind else "no type"
+        raise xml.error_at(
+            element,
+            f"{label} has {problem}, {suggest_names(_CONSTRAINT_TYPES, base_type or None)}",
+        )
+    return _CONSTRAINT_TYPES[base_type]
+
+
+def _check_axes(xml: XmlFile, element: etree._Element, label: str) -> None:
+    """Raise if the axes differ, because a loop has the same axis in both frames."""
+    parent, child = (xml.single_child(element, f"{end}_axis", label) for end in _END_TAGS)
+    if child is None:
+        return
+    parent_axis, child_axis = (
+        _DEFAULT_AXIS if axis is None else xml.vector(axis, "xyz", f"an axis of {label}", 3)
+        for axis in (parent, child)
+    )
+    product = np.linalg.norm(parent_axis) * np.linalg.norm(child_axis)
+    if not np.linalg.norm(np.cross(parent_axis, child_axis)) <= _PARALLEL_TOLERANCE * product:
+        raise xml.error_at(
+            child,
+            f"the child_axis of {label} is another than parent_axis, turn the child's frame by "
+            "the rpy of child_origin and leave child_axis out",
+        )
+    element.remove(child)
+
+
+_COUPLING_TYPES = ("rolling",)  # belts, chains and gears; also the default
+
+
+def read_coupling(
+    xml: XmlFile,
+    name: str,
+    element: etree._Element,
+    joints: Mapping[str, etree._Element],
+    end_links: Mapping[str, tuple[str, str]],
+    links: Mapping[str, etree._Element],
+) -> Coupling:
+    """Read the linear constraint of a `<coupling>`.
+
+    With the moving joints on the paths from the nearest common ancestor of both links to the
+    predecessor, P, and to the successor, S,
+
+        ratio sum_P q = sum_S q,
+
+    whatever the directions of the axes.
+
+    Args:
+        xml: The file.
+        name: Name of the coupling.
+        element: The `<coupling>`.
+        joints: The `<joint>` elements by name.
+        end_links: Parent and child link by joint.
+        links: The `<link>` elements by name.
+
+    Raises:
+        DescriptionError: It is malformed, or constrains no joint.
+    """
+    label = f"coupling '{name}'"
+    kind = element.get("type", _COUPLING_TYPES[0])
+    if kind not in _COUPLING_TYPES:
+        raise xml.error_at(
+            element,
+            f"{label} has the unknown type '{kind}', {suggest_names(_COUPLING_TYPES, kind)}",
+        )
+    parents = {
+        child: (parent, joint) for joint, (parent, child) in end_links.items() if parent and child
+    }
+    paths = []
+    for end in ("predecessor", "successor"):
+        tag, link = read_end_link(xml, element, end, label)
+        if not link:
+            raise xml.error_at(element, f'{label} has no {end}, add <{end} link="..."/>')
+        if link not in links:
+            raise xml.error_at(
+                tag, f"{label} has the unknown {end} '{link}', {suggest_names(links, link)}"
+            )
+        path = []
+        while link in parents:
+            link, joint = parents[link]
+            path.append(joint)
+        paths.append(path[::-1])
+    common_count = len(os.path.commonprefix(paths))  # joints to the nearest common ancestor
+    predecessor_joints, successor_joints = (
+        [joint for joint in path[common_count:] if joints[joint].get("type") != "fixed"]
+        for path in paths
+    )
+    for joint in (*predecessor_joints, *successor_joints):
+        if joints[joint].get("type") in MULTI_FREEDOM_TYPES:
+            raise xml.error_at(
+                element,
+                f"{label} counts the joint '{joint}', which has several freedoms: use others",
+            )
+    tag = xml.single_child(element, "ratio", label)
+    ratio = 1.0 if tag is None else xml.number(tag, "value", f"the ratio of {label}")
+    factors = dict.fromkeys(reversed(successor_joints), 1.0) | dict.fromkeys(
+        predecessor_joints if ratio else (), -ratio
+    )
+    if not factors:
+        raise xml.error_at(element, f"{label} binds no joint, name two links that move")
+    return Coupling(name, factors, 0.0, xml.source_location(element))

@@ -1,4 +1,4 @@
-"""What a URDF says and nobody reads: warned of, unless other programs are known to write it."""
+"""Warnings about elements of a URDF that are not read and belong to no known program."""
 
 import warnings
 from collections.abc import Mapping, Set
@@ -7,11 +7,11 @@ from difflib import get_close_matches
 from lxml import etree
 
 from crane.common.errors import CraneWarning, suggest_names
-from crane.formats.urdf.constraint_elements import CONSTRAINT_HINT
+from crane.formats.urdf.loop_elements import CONSTRAINT_HINT
 from crane.formats.xml_file import XmlFile
 
-# Of simulators, controllers and planners (ROS, SRDF, Gazebo, Drake, PyBullet, MuJoCo, PR2);
-# whatever has a namespace is another program's, too.
+# Elements of simulators, controllers and planners (ROS, SRDF, Gazebo, Drake, PyBullet, MuJoCo,
+# PR2). Elements with a namespace belong to other programs, too.
 _FOREIGN_ELEMENTS = {
     "robot": {
         "sensor", "ros2_control", "mujoco", "group", "chain", "virtual_joint", "passive_joint",
@@ -30,8 +30,8 @@ _FOREIGN_ELEMENTS = {
     "collision": {"verbose", "contact_coefficients", "surface", "contact", "map"},
     "visual": {"map"},
 }  # fmt: skip
-_MAX_WARNINGS = 3  # lines on elements of one file
-_MIN_SIMILARITY = 0.6  # likeness from which another name may have been meant
+_MAX_WARNINGS = 3  # for one file
+_MIN_SIMILARITY = 0.6  # of a suggested name
 
 
 def warn_about_unknown_elements(
@@ -40,9 +40,9 @@ def warn_about_unknown_elements(
     attributes: Mapping[str, Set[str]],
     joints: Mapping[str, etree._Element],
 ) -> None:
-    """Warn of elements that are left out, and of limits that say less than they must.
+    """Warn of unknown elements, which are left out, and of incomplete limits.
 
-    Equal ones are counted, and told at the first.
+    Equal elements have one warning, at the first of them, with their number.
 
     Args:
         xml: The file.
@@ -51,7 +51,7 @@ def warn_about_unknown_elements(
         joints: The `<joint>` elements by name.
     """
     found: dict[tuple[str, str], list[etree._Element]] = {}
-    known_tags = set().union(*children.values())  # what has a place is an error in another
+    known_tags = set().union(*children.values())  # a misplaced known element is an error
     children_of_read_elements = [
         (parent, child)
         for parent in children
@@ -61,13 +61,9 @@ def warn_about_unknown_elements(
     ]
     for parent, child in children_of_read_elements:
         tag = child.tag
-        if (
-            not isinstance(tag, str)
-            or tag in known_tags
-            or tag in _FOREIGN_ELEMENTS.get(parent, ())
+        if isinstance(tag, str) and not (
+            tag in known_tags or tag in _FOREIGN_ELEMENTS.get(parent, ()) or tag.startswith("{")
         ):
-            continue
-        if not tag.startswith("{"):
             found.setdefault((parent, tag), []).append(child)
     unknown_groups = [
         (
@@ -77,7 +73,7 @@ def warn_about_unknown_elements(
         )
         for (parent, tag), elements in found.items()
     ]
-    unknown_groups.sort(key=lambda item: item[2].startswith("known"))  # slips first
+    unknown_groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
     for elements, what, hint in unknown_groups[:_MAX_WARNINGS]:
         _warn_about_elements(xml, elements, what, f"it is left out, {hint}")
     if remaining_groups := unknown_groups[_MAX_WARNINGS:]:
@@ -95,7 +91,7 @@ def warn_about_unknown_elements(
 
 
 def _is_inside_read_elements(element: etree._Element, children: Mapping[str, Set[str]]) -> bool:
-    """Whether all that an element stands in is read, too."""
+    """Whether all ancestors of an element are read."""
     while (parent := element.getparent()) is not None:
         if element.tag not in children.get(parent.tag, ()):
             return False
@@ -104,7 +100,7 @@ def _is_inside_read_elements(element: etree._Element, children: Mapping[str, Set
 
 
 def _suggest_element(tag: str, tags: Set[str], attributes: Mapping[str, Set[str]]) -> str:
-    """The element, or attribute of one, that may have been meant by an unknown element."""
+    """Suggest a known element or attribute in place of an unknown element."""
     if tag == "constraint":
         return CONSTRAINT_HINT
     element_of_attribute = {

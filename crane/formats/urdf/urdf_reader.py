@@ -1,7 +1,7 @@
-"""Strict reading of URDF files: what other readers swallow silently is caught here."""
+"""Strict reading of URDF files, with errors where other readers ignore mistakes."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,18 +18,21 @@ from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.specification import Coupling, ForceElement, Friction, LoopSpec
 from crane.formats.joint_series import MULTI_FREEDOM_TYPES
 from crane.formats.robot_files import open_robot
-from crane.formats.urdf.constraint_elements import read_constraints
-from crane.formats.urdf.coupling_elements import read_coupling
-from crane.formats.urdf.home_elements import read_home, read_tip
-from crane.formats.urdf.joint_graph import MOVABLE_TYPES, read_graph
 from crane.formats.urdf.link_joint_elements import (
+    MOVABLE_TYPES,
     read_friction,
+    read_graph,
     read_joint,
     read_limits,
     read_link,
     read_multi_freedom_joint,
 )
-from crane.formats.urdf.loop_elements import independent_joints, read_loops
+from crane.formats.urdf.loop_elements import (
+    independent_joints,
+    read_constraints,
+    read_coupling,
+    read_loops,
+)
 from crane.formats.urdf.unknown_elements import warn_about_unknown_elements
 from crane.formats.xml_file import XmlFile
 
@@ -70,10 +73,8 @@ _ATTRIBUTES = {
     "dynamics": {"damping", "friction"},
 }
 _CLOSED_ELEMENTS = {"origin", "axis", "mass", "inertia"}
-_OBSOLETE_ELEMENTS = {
-    "loop_constraint": "loop",
-    "joint_constraint": "coupling",
-}  # before URDF+ was published
+# elements of drafts of URDF+
+_OBSOLETE_ELEMENTS = {"loop_constraint": "loop", "joint_constraint": "coupling"}
 
 
 @dataclass(frozen=True)
@@ -82,19 +83,19 @@ class UrdfModel:
 
     Attributes:
         file: The file.
-        name: The robot's.
-        tree: Its links and joints.
+        name: Name of the robot.
+        tree: Links and joints.
         root_link: Name of the root link.
         loops: Loops of `<loop>` elements.
         independent_joints: Joints marked `independent="true"`; None where no joint has the
             attribute.
-        friction: Friction of `<dynamics>` elements.
-        couplings: Joints that mimic another, and `<coupling>` elements.
-        home: Coordinates of the group state "home".
-        home_locations: File and line of each.
+        friction: Friction of `<dynamics>` elements by joint.
+        couplings: Couplings of `<mimic>` and `<coupling>` elements.
+        home: Coordinates of the group state "home" by joint.
+        home_locations: File and line of each coordinate of home.
         tip: Link of the end effector "tip".
-        is_complete: Whether all elements have names of their own, if not only some are here.
-        springs: Of a format that has some.
+        is_complete: Whether all elements have unique names, so that none is missing here.
+        springs: Springs, if the file is in a format that has some.
     """
 
     file: Path
@@ -113,39 +114,24 @@ class UrdfModel:
 
     @property
     def moving_joints(self) -> tuple[str, ...]:
-        """Its moving joints."""
+        """Names of the moving joints."""
         return tuple(joint.name for joint in self.tree.moving_joints)
 
 
 def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> UrdfModel:
-    """Read and check one URDF, or what stands for one, see `crane.formats.robot_files`.
+    """Read and check a URDF, or a file that is converted to one by `crane.formats.robot_files`.
 
     Args:
         file: The file.
-        edit: Changes its elements before they are read.
+        edit: Function that changes the elements before they are read.
 
     Raises:
-        DescriptionError: With file, line, and what is wrong.
+        DescriptionError: The file is wrong; the message has file and line.
     """
     source = open_robot(file)
     xml = source.xml
     record_parsed_file(xml)
-    if xml.root.tag != "robot":
-        raise xml.error_at(
-            xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>"
-        )
-    read_constraints(xml)
-    xml.check_elements(xml.root, _CHILDREN, _ATTRIBUTES, _CLOSED_ELEMENTS)
-    if edit is not None:
-        edit(xml)
-    for tag, replacement_tag in _OBSOLETE_ELEMENTS.items():
-        for element in xml.root.iterfind(tag):
-            report_error(
-                xml.error_at(
-                    element,
-                    f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one",
-                )
-            )
+    _check_elements(xml, edit)
     links, joints = _elements_by_name(xml, "link"), _elements_by_name(xml, "joint")
     warn_about_unknown_elements(xml, _CHILDREN, _ATTRIBUTES, joints)
     if not links:
@@ -170,14 +156,11 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     loops, frames = read_loops(xml, _elements_by_name(xml, "loop"), links)
     for frame in frames:
         parts.append(Link(frame.child, frame.source_location))
-        if (same_named := joints.get(frame.name)) is not None:
-            report_error(
-                xml.error_at(
-                    same_named, f"joint '{frame.name}' has the name of a loop's, rename it"
-                )
-            )
-            continue
-        parts.append(frame)
+        if (same_named := joints.get(frame.name)) is None:
+            parts.append(frame)
+        else:
+            problem = f"joint '{frame.name}' has the name of a loop's, rename it"
+            report_error(xml.error_at(same_named, problem))
     couplings = _read_mimics(xml, joints, independent_names)
     for name, element in _elements_by_name(xml, "coupling").items():
         with error_recovery():
@@ -201,17 +184,33 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     )
 
 
+def _check_elements(xml: XmlFile, edit: Callable[[XmlFile], None] | None) -> None:
+    """Check names of elements and attributes, and edit the elements."""
+    if xml.root.tag != "robot":
+        raise xml.error_at(
+            xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>"
+        )
+    read_constraints(xml)
+    xml.check_elements(xml.root, _CHILDREN, _ATTRIBUTES, _CLOSED_ELEMENTS)
+    if edit is not None:
+        edit(xml)
+    for tag, replacement_tag in _OBSOLETE_ELEMENTS.items():
+        for element in xml.root.iterfind(tag):
+            problem = f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one"
+            report_error(xml.error_at(element, problem))
+
+
 def _read_single_freedom_joint(
     xml: XmlFile, name: str, joint: etree._Element, end_links: tuple[str, str], is_cut: bool
 ) -> list[Link | Joint]:
-    """A joint with one freedom, or none; without limits where they are wrong."""
-    found: list[Link | Joint] = []
+    """Read a joint with one or no degree of freedom, without limits if they are wrong."""
+    joints: list[Link | Joint] = []
     with error_recovery():
-        read = dataclasses.replace(read_joint(xml, name, joint, end_links), is_cut=is_cut)
-        found = [read]
-        if read.is_movable:
-            found = [dataclasses.replace(read, limits=read_limits(xml, name, joint))]
-    return found
+        found = dataclasses.replace(read_joint(xml, name, joint, end_links), is_cut=is_cut)
+        joints = [found]
+        if found.is_movable:
+            joints = [dataclasses.replace(found, limits=read_limits(xml, name, joint))]
+    return joints
 
 
 def _read_joint_series(
@@ -221,7 +220,7 @@ def _read_joint_series(
     links: Mapping[str, etree._Element],
     joints: Mapping[str, etree._Element],
 ) -> list[Link | Joint]:
-    """What a joint with several freedoms becomes, without parts whose names are taken."""
+    """Read a composite joint as a series of joints, without parts whose names exist already."""
     series_parts: list[Link | Joint] = []
     with error_recovery():
         series_parts = read_multi_freedom_joint(xml, name, joints[name], end_links)
@@ -239,7 +238,7 @@ def _read_joint_series(
 def _read_mimics(
     xml: XmlFile, joints: Mapping[str, etree._Element], independent_names: tuple[str, ...] | None
 ) -> tuple[Coupling, ...]:
-    """Couplings q = multiplier q_other + offset of joints that mimic another."""
+    """Read the couplings q = multiplier q_other + offset of joints that mimic another."""
     moving = [name for name, joint in joints.items() if joint.get("type") in MOVABLE_TYPES]
     found = []
     for name, joint in joints.items():
@@ -263,11 +262,9 @@ def _read_mimic(
     if other not in joints and "joint" in xml.unnamed_kinds:
         raise FollowUpError(f"joint '{other}' may be one without a name")
     if other not in movable_joints:
-        problem = (
-            f"mimics '{other}', which does not move"
-            if other in joints
-            else (f"mimics the unknown joint '{other}'")
-        )
+        problem = f"mimics the unknown joint '{other}'"
+        if other in joints:
+            problem = f"mimics '{other}', which does not move"
         raise xml.error_at(
             mimic, f"joint '{name}' {problem}, {suggest_names(movable_joints, other)}"
         )
@@ -284,7 +281,7 @@ def _read_mimic(
 
 
 def _elements_by_name(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
-    """Elements of one kind by their names."""
+    """Return the elements with a tag by name; missing and repeated names are errors."""
     found: dict[str, etree._Element] = {}
     for element in xml.root.iterfind(kind):
         name = element.get("name", "").strip()
@@ -299,3 +296,73 @@ def _elements_by_name(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
         else:
             found[name] = element
     return found
+
+
+def read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float], dict[str, str]]:
+    """Read `<group_state name="home">`, an element of SRDF.
+
+    Args:
+        xml: The file.
+        joints: Names of the moving joints.
+
+    Returns:
+        Coordinates, and their files and lines, by joint.
+
+    Raises:
+        DescriptionError: A joint is unknown, fixed, repeated or has no number.
+    """
+    home: dict[str, float] = {}
+    source_locations: dict[str, str] = {}
+    joint_elements = [
+        joint
+        for state in xml.root.iterfind("group_state")
+        if state.get("name", "").strip() == "home"
+        for joint in state.iterfind("joint")
+    ]
+    for joint in joint_elements:
+        with error_recovery():
+            name, value = _read_coordinate(xml, joint, joints, home)
+            home[name], source_locations[name] = value, xml.source_location(joint)
+    return home, source_locations
+
+
+def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
+    """Read the link of `<end_effector name="tip" parent_link="LINK"/>`, an element of SRDF.
+
+    Args:
+        xml: The file.
+        links: The `<link>` elements by name.
+
+    Returns:
+        The link, None if there is no such element.
+
+    Raises:
+        DescriptionError: The link is unknown.
+    """
+    tips = [x for x in xml.root.iterfind("end_effector") if x.get("name", "").strip() == "tip"]
+    if not tips:
+        return None
+    link = str(tips[0].get("parent_link", "")).strip()
+    if not link:
+        raise xml.error_at(
+            tips[0], f'the tip has no link, write parent_link="LINK", {suggest_names(links)}'
+        )
+    if link not in links:
+        raise xml.error_at(
+            tips[0], f"the tip is the unknown link '{link}', {suggest_names(links, link)}"
+        )
+    return link
+
+
+def _read_coordinate(
+    xml: XmlFile, joint: etree._Element, joints: Collection[str], earlier_names: Container[str]
+) -> tuple[str, float]:
+    name = joint.get("name", "").strip()
+    if name not in joints:
+        hint = suggest_names(joints, name)
+        problem = f"home names the joint '{name}', which is unknown or does not move, {hint}"
+        raise xml.error_at(joint, problem)
+    value = xml.number(joint, "value", f"home of '{name}'")
+    if name in earlier_names:
+        raise xml.error_at(joint, f"home of '{name}' is there twice, keep one")
+    return name, value

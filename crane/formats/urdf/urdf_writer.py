@@ -1,5 +1,6 @@
-"""One URDF with the elements of URDF+."""
+"""Write a machine as one URDF: with the loop elements of URDF+, or as a plain tree."""
 
+import dataclasses
 from pathlib import Path
 
 from lxml import etree
@@ -8,21 +9,21 @@ from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError
 from crane.description import Coupling, LoopSpec
 from crane.description.kinematic_tree import Tree
-from crane.formats.urdf_output import (
+from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
+from crane.formats.urdf_elements import (
     add_friction,
     add_joint,
     add_link,
     add_origin,
+    format_numbers,
+)
+from crane.formats.urdf_output import (
     compound_drive_factors,
     copy_shapes,
     format_document,
-    format_numbers,
     origin_text,
     rotor_inertias,
     solve_coupling,
-    unsupported_friction,
-    unsupported_sections,
-    warn_about_unsupported,
     with_floating_joints,
 )
 from crane.machine import Machine
@@ -31,22 +32,22 @@ from crane.machine import Machine
 def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     """Write a machine as one URDF with `<loop>` and `<coupling>` elements.
 
-    The home posture, which names the assembly branch, becomes a `<group_state name="home">`, as
-    SRDF has it; other readers of URDF ignore it. Of friction there are Coulomb and viscous
-    friction. A warning names what else is left out.
+    The home configuration, which selects the assembly mode, becomes a `<group_state name="home">`
+    as in SRDF; other readers of URDF ignore it. Of friction, Coulomb and viscous friction are
+    written. A warning lists what is left out.
 
     Args:
-        machine: The machine, as it is: with its changes, locks and payload.
+        machine: The machine with its parameter changes, locked joints and payload.
         path: The file, .urdf.
 
     Raises:
-        InputError: A coupling binds several joints in a way that no `<coupling>` says.
-        OutputError: It cannot be written.
+        InputError: No `<coupling>` represents a coupling of several joints.
+        OutputError: The file cannot be written.
     """
     tree = with_floating_joints(machine)
     robot = etree.Element("robot", name=machine.name)
-    loop_frames = {  # which reading a loop makes again
-        f"{loop.name}_{end}": frame
+    loop_frames = {  # the reader adds them with the loops
+        frame
         for loop in machine.closure.equations.loops
         for end, frame in (("predecessor", loop.predecessor), ("successor", loop.successor))
         if frame == f"{loop.name}_{end}"
@@ -60,7 +61,9 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     passive = [joint for joint in machine.joints if joint not in machine.active]
     for name in (*machine.active, *passive):
         if name in tree.joints:
-            _add_moving_joint(machine, robot, name)
+            element = add_joint(robot, tree.joints[name])
+            element.set("independent", str(name in machine.active).lower())
+            _add_joint_friction(element, machine, name)
     for joint in tree.joints.values():
         if joint.kind == "floating":
             add_joint(robot, joint).set("independent", "true")
@@ -75,7 +78,7 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
         etree.SubElement(robot, "end_effector", tip)
     copy_shapes(robot, machine)
-    unsupported = unsupported_friction(machine) + unsupported_sections(machine)
+    unsupported = unsupported_sections(machine)
     unsupported += ["springs and forces"] if machine.forces else []
     unsupported += ["ropes"] if machine.ropes else []
     unsupported += ["rotor inertias"] if rotor_inertias(machine) else []
@@ -85,10 +88,9 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     warn_about_unsupported(machine, "URDF+", unsupported)
 
 
-def _add_moving_joint(machine: Machine, robot: etree._Element, name: str) -> None:
-    element = add_joint(robot, machine.tree.joints[name])
-    element.set("independent", str(name in machine.active).lower())
-    add_friction(element, machine, name)
+def _add_joint_friction(element: etree._Element, machine: Machine, joint: str) -> None:
+    if (friction := machine.friction.get(joint)) is not None:
+        add_friction(element, friction.viscous, friction.coulomb)
 
 
 def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
@@ -98,14 +100,13 @@ def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
         if name != f"{loop.name}_{end}":
             etree.SubElement(element, end, link=name)
             continue
-        add_origin(
-            etree.SubElement(element, end, link=parent_joints[name].parent), parent_joints[name]
-        )
+        joint = parent_joints[name]
+        add_origin(etree.SubElement(element, end, link=joint.parent), joint.xyz, joint.rpy)
     etree.SubElement(element, "axis", xyz=format_numbers(loop.axis))
 
 
 def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -> None:
-    """A <coupling> where one says the same, else a <mimic>."""
+    """Add a `<coupling>` if one represents the coupling, else a `<mimic>`."""
     joints, derivatives, offset = solve_coupling(coupling)
     is_mimic = len(joints) <= 2 and coupling.name == f"{joints[0]}_mimic"
     ends = None if is_mimic or offset else _coupling_ends(machine, joints, derivatives)
@@ -121,9 +122,8 @@ def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -
             "machine file"
         )
     others = [name for name in machine.joints if name != joints[0]]
-    other = (
-        joints[1] if derivatives else others[0]
-    )  # that of a joint which is held counts for nothing
+    # the joint that a held joint mimics has no effect
+    other = joints[1] if derivatives else others[0]
     (follower,) = (j for j in robot.iterfind("joint") if j.get("name") == joints[0])
     multiplier = format_numbers([derivatives[0] if derivatives else 0.0])
     mimic = {"joint": other, "multiplier": multiplier, "offset": format_numbers([offset])}
@@ -138,9 +138,10 @@ def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -
 def _coupling_ends(
     machine: Machine, joints: list[str], derivatives: list[float]
 ) -> tuple[str, str, float] | None:
-    """Predecessor, successor and ratio with ratio sum_P q = sum_S q, if there are such links.
+    """Return predecessor, successor and ratio with ratio sum_P q = sum_S q, if there are any.
 
-    Joints of one way have one factor: those of the successor's that of the first joint.
+    All joints on the path to the successor have the factor of the first joint, and all joints on
+    the path to the predecessor have one other factor.
     """
     model = machine.model
     successor_joints = [joints[0]] + [
@@ -155,18 +156,41 @@ def _coupling_ends(
     joint_paths = [
         sorted(model.getJointId(x) for x in way) for way in (predecessor_joints, successor_joints)
     ]
-    for path in joint_paths:  # depth-first numbers rise from parent to child
+    for path in joint_paths:  # indices rise from parent to child
         if any(model.parents[b] != a for a, b in zip(path, path[1:], strict=False)):
             return None
     top_joints = [model.parents[way[0]] for way in joint_paths if way]
     if len(set(top_joints)) > 1:
         return None
-    links = [_moved_link(machine, way[-1] if way else top_joints[0]) for way in joint_paths]
+    joints_of_ends = [path[-1] if path else top_joints[0] for path in joint_paths]
+    links = [
+        machine.tree.joints[model.names[joint]].child if joint else machine.tree.root_link
+        for joint in joints_of_ends
+    ]
     return links[0], links[1], ratios.pop() if ratios else 1.0
 
 
-def _moved_link(machine: Machine, joint: int) -> str:
-    """The link that a joint of the model moves, the root link for the world."""
-    return (
-        machine.tree.joints[machine.model.names[joint]].child if joint else machine.tree.root_link
-    )
+def robot_description(machine: Machine) -> str:
+    """Return the whole machine as one plain URDF, a tree that every reader of URDF accepts.
+
+    Its joints are those of `Machine.joints` with their names, zeros and signs, so joint states of
+    all of them determine the pose of every link; `crane.Transmission` computes them from the
+    coordinates of the actuators. A floating base is a joint of type "floating", which joint states
+    do not contain. Loops are cut: the two frames of a loop are links that coincide where the loop
+    is closed. No joint mimics another. Meshes are named by URIs, `file://` or the `package://` of
+    the machine's own files.
+
+    Args:
+        machine: The machine with its parameter changes, locked joints and payload.
+
+    Returns:
+        The text of the URDF.
+    """
+    robot = etree.Element("robot", name=machine.name)
+    tree = with_floating_joints(machine)
+    for link in tree.links.values():
+        add_link(robot, dataclasses.replace(link, composite_joint=None))
+    for joint in tree.joints.values():
+        _add_joint_friction(add_joint(robot, joint), machine, joint.name)
+    copy_shapes(robot, machine, uris=True)
+    return format_document(robot, origin_text(machine)).decode()

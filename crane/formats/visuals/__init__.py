@@ -1,1 +1,1 @@
-"""Shapes and meshes that links are drawn with."""
+"""Shapes and meshes of links."""

@@ -1,4 +1,4 @@
-"""Mesh files: where they are, and their triangles."""
+"""Mesh files: their paths and their triangles."""
 
 import json
 import os
@@ -17,12 +17,10 @@ from crane.common.package_search import find_file
 from crane.common.samples import Array
 from crane.formats.visuals import mesh_process
 
-_MAX_FILE_SIZE = 200e6  # bytes of a file
-_MAX_CACHED_SIZE = 4 << 20  # bytes of a file, and of what it holds, that is kept
+_MAX_FILE_SIZE = 200e6  # bytes
+_MAX_CACHED_SIZE = 4 << 20  # bytes of a cached file, and of its answer
 _MAX_ATTEMPTS = 3
-_TIMEOUT_PER_FILE = (
-    10 * mesh_process.MAX_SECONDS
-)  # [s] per file, for systems that do not limit computing
+_TIMEOUT_PER_FILE = 10 * mesh_process.MAX_SECONDS  # [s], for systems without CPU limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +29,8 @@ class MeshPart:
 
     Attributes:
         vertices: (V, 3) [units of the file].
-        faces: (F, 3) numbers of vertices.
-        colour: Red, green, blue, opacity, 0 to 1; None where the file has none.
+        faces: (F, 3) indices of vertices.
+        colour: Red, green, blue, opacity, 0 to 1; None if the file has none.
     """
 
     vertices: Array
@@ -41,25 +39,26 @@ class MeshPart:
 
 
 def find_mesh_file(name: str, folder: Path) -> Path | None:
-    """The file that a mesh's name stands for, None if there is none, see `find_file`.
+    """Return the file that a mesh is in, None if it does not exist.
 
     Args:
-        name: As `<mesh filename>` has it.
-        folder: Of the URDF.
+        name: As in `<mesh filename>`, see `find_file`.
+        folder: Folder of the URDF.
     """
     found = find_file(name, folder)
     return found if found is not None and found.is_file() else None
 
 
 def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]:
-    """Triangles of mesh files by their paths, or what is wrong with a file, in a few words.
+    """Return the triangles of mesh files by path, or in a few words why a file cannot be read.
 
-    Files may be damaged, or declare sizes beyond all memory: another process reads them, with 20 s
-    of computing and 2 GB per file. Where it ends at a file, it begins anew after that, twice. What
-    it says of small files is kept: it takes longer to start than to read a robot's meshes.
+    Files may be damaged or declare sizes beyond all memory, so another process reads them, with 20
+    s of computing and 2 GB for each file. If it crashes, it is restarted after the file that
+    caused it, up to twice. Its results for small files are cached, because the process takes
+    longer to start than to read the meshes of a robot.
     """
     found: dict[Path, tuple[MeshPart, ...] | str] = {}
-    entry_names: dict[Path, str | None] = {}  # and under which name to keep what is said
+    entry_names: dict[Path, str | None] = {}  # of the cache
     for file in dict.fromkeys(files):
         size = file.stat().st_size
         if size > _MAX_FILE_SIZE:
@@ -73,7 +72,10 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
             found[file] = _parse_answer(cached)
     for _ in range(_MAX_ATTEMPTS):
         remaining_triangles = mesh_process.MAX_TRIANGLES - sum(
-            map(_count_triangles, found.values())
+            len(part.faces)
+            for parts in found.values()
+            if not isinstance(parts, str)
+            for part in parts
         )
         answers = _run_mesh_process(list(entry_names), remaining_triangles) if entry_names else []
         for (file, name), answer in zip(list(entry_names.items()), answers, strict=False):
@@ -90,7 +92,7 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[MeshPart, ...] | str]
 
 
 def _cache_entry_name(file: Path) -> str:
-    """Under which what is said of a file is kept: by the content, and by who reads it."""
+    """Return the cache entry of a file, by its content and by the versions of the reader."""
     builds = [file_cache.package_build(package) for package in ("trimesh", "collada")]
     program = Path(mesh_process.__file__).read_bytes()
     return file_cache.entry_name(
@@ -98,17 +100,9 @@ def _cache_entry_name(file: Path) -> str:
     )
 
 
-def _count_triangles(parts_or_problem: tuple[MeshPart, ...] | str) -> int:
-    return (
-        0
-        if isinstance(parts_or_problem, str)
-        else sum(len(part.faces) for part in parts_or_problem)
-    )
-
-
 def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
-    """What the process says, of at least one file."""
-    program = [sys.executable, "-P", mesh_process.__file__]  # its folder has an xml.py
+    """Return the answers of the process, at least one."""
+    program = [sys.executable, "-P", mesh_process.__file__]  # without its folder in sys.path
     request = {"files": [str(file.resolve()) for file in files], "triangles": max_triangles}
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # threads count as memory
     try:
@@ -135,7 +129,7 @@ def _run_mesh_process(files: list[Path], max_triangles: int) -> list[bytes]:
 
 
 def _split_answers(output: bytes) -> Iterator[bytes]:
-    """Whole answers of the process."""
+    """Yield the complete answers of the process."""
     position = 0
     while (end := output.find(b"\n", position)) >= 0:
         parts = json.loads(output[position:end]).get("parts", ())
@@ -152,7 +146,7 @@ def _answer_header(answer: bytes) -> dict[str, Any]:
 
 
 def _parse_answer(answer: bytes) -> tuple[MeshPart, ...] | str:
-    """The triangles of an answer, or what is wrong."""
+    """Return the triangles of an answer, or its error text."""
     header = _answer_header(answer)
     if "wrong" in header:
         return str(header["wrong"])
@@ -160,14 +154,14 @@ def _parse_answer(answer: bytes) -> tuple[MeshPart, ...] | str:
 
 
 def _part_size(part: dict[str, Any]) -> int:
-    """How many bytes the triangles of a part take."""
+    """Return the number of bytes of the triangles of a part."""
     return 8 * 3 * int(part["vertices"] + part["faces"])
 
 
 def _parse_parts(
     part_headers: list[dict[str, Any]], output: bytes, position: int
 ) -> Iterator[MeshPart]:
-    """The parts that stand one after the other in an answer from a byte on."""
+    """Yield the parts of an answer from a byte position on."""
     for part in part_headers:
         v, f = 3 * part["vertices"], 3 * part["faces"]
         vertices = np.frombuffer(output, np.float64, v, position).reshape(-1, 3)

@@ -1,12 +1,12 @@
-"""A process that reads mesh files: whatever is in them can end this process, and nothing else.
+"""A process that reads mesh files, so that a damaged file can crash only this process.
 
-Run by crane.formats.visuals.mesh_files, which sends it, as JSON, {"files": paths, "triangles": how
-many they may have together}. Per file it writes a line of JSON, {"parts": [{"vertices": V,
-"faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether nothing else was opened for it}
-or {"wrong": "what"}, then the numbers of each part: V 3 float64, F 3 int64. Time and memory are
-limited, because readers of a dozen formats believe the sizes that a damaged file declares.
+`crane.formats.visuals.mesh_files` runs it and sends a JSON object {"files": paths, "triangles":
+largest number in all files}. For each file the process writes a line of JSON, {"parts":
+[{"vertices": V, "faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether no other file
+was opened for it} or {"wrong": "message"}, then the arrays of each part: V 3 float64, F 3 int64.
+Time and memory are limited, because mesh readers trust the sizes that a damaged file declares.
 
-It imports nothing of the package, which takes longer than most meshes.
+It imports nothing of the package, which would take longer than reading most meshes.
 """
 
 import json
@@ -17,26 +17,24 @@ from typing import Any, BinaryIO
 
 MAX_MEMORY, MAX_SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
 MAX_TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
-_MAX_REPEATED, _MAX_REPETITION_FACTOR = (
-    100_000,
-    10,
-)  # triangles that a file may repeat its parts to: as many, or tenfold
+# triangles of instances of the same geometry: so many, or so many times the geometry
+_MAX_REPEATED, _MAX_REPETITION_FACTOR = 100_000, 10
 _MESH_FORMATS = ("stl", "obj", "dae", "glb", "gltf", "ply", "off")
 
 
 def main() -> None:
-    """Read what is asked for."""
-    import logging  # which whoever asks for it has no use for
+    """Read the files of the request."""
+    import logging  # not needed by modules that only use the constants
 
     output = os.fdopen(os.dup(1), "wb")
     null_device = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null_device, 1)  # the output is ours alone
+    os.dup2(null_device, 1)  # libraries cannot write into the output
     os.dup2(null_device, 2)
     warnings.simplefilter("ignore")
     logging.disable()
     request = json.load(sys.stdin)
     files, remaining = request["files"], request["triangles"]
-    # what trimesh does without when it reads, and takes longer to import than most meshes to read
+    # trimesh does not need these to read, and importing them takes longer than most meshes
     for name in ("networkx", "rtree", "scipy", "shapely"):
         sys.modules[name] = None  # type: ignore[assignment]
     try:
@@ -52,30 +50,23 @@ def main() -> None:
             remaining -= sum(part["faces"] for part in header["parts"])
         except MemoryError:
             header, arrays = {"wrong": f"reading it takes more than {MAX_MEMORY >> 30} GB"}, []
-        except Exception as error:  # whatever a reader raises for what is none of its format
+        except Exception as error:  # readers raise anything for malformed files
             message = " ".join(str(error).split()) or type(error).__name__
             header, arrays = {"wrong": message[:80]}, []
         _send_answer(output, header, arrays)
 
 
 def _limit_resources() -> None:
-    """Time for one more file, and memory, where the system can limit them."""
+    """Limit time for one more file, and memory, if the system supports it."""
     try:
         import resource
     except ImportError:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
-    hard_limit = resource.getrlimit(resource.RLIMIT_CPU)[1]
     time_limit = int(used.ru_utime + used.ru_stime) + MAX_SECONDS
-    resource.setrlimit(
-        resource.RLIMIT_CPU,
-        (time_limit if hard_limit < 0 else min(time_limit, hard_limit), hard_limit),
-    )
-    hard_limit = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(
-        resource.RLIMIT_AS,
-        (MAX_MEMORY if hard_limit < 0 else min(MAX_MEMORY, hard_limit), hard_limit),
-    )
+    for kind, limit in ((resource.RLIMIT_CPU, time_limit), (resource.RLIMIT_AS, MAX_MEMORY)):
+        hard_limit = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (limit if hard_limit < 0 else min(limit, hard_limit), hard_limit))
 
 
 def _send_answer(output: BinaryIO, header: dict[str, Any], arrays: list[Any]) -> None:
@@ -86,12 +77,12 @@ def _send_answer(output: BinaryIO, header: dict[str, Any], arrays: list[Any]) ->
 
 
 def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]]:
-    """Triangles of a file, in the frame of its scene, if there are not too many."""
+    """Return the triangles of a file in the frame of its scene."""
     import numpy as np
     import trimesh
 
     class Beside(trimesh.resolvers.FilePathResolver):
-        """Opens materials, pictures and buffers, and notes that it did."""
+        """Opens materials, textures and buffers, and records that it did."""
 
         asked = False
 
@@ -145,7 +136,7 @@ def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]
 
 
 def _part_colour(part: Any) -> tuple[float, ...] | None:
-    """Its own colour, if it has one that can be read."""
+    """Return the colour of a part, None if it has no readable one."""
     try:
         if not part.visual.defined:
             return None
@@ -153,7 +144,7 @@ def _part_colour(part: Any) -> tuple[float, ...] | None:
         colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in material.main_color)
     except MemoryError:
         raise
-    except Exception:  # a texture that is damaged, a colour that is none
+    except Exception:  # such as a damaged texture
         return None
     return colour if len(colour) == 4 and all(x == x for x in colour) else None
 

@@ -1,6 +1,6 @@
-"""What URDFs draw: the shapes of visuals and collisions, read in one place.
+"""Shapes of visuals and collisions of a URDF.
 
-A shape that cannot be drawn is no reason to refuse a machine: it is told and left out.
+A shape that cannot be drawn is reported and left out; it is no reason to refuse a machine.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,10 +19,10 @@ from crane.formats.xml_file import XmlFile
 
 Colour = tuple[float, float, float, float]
 
-DEFAULT_COLOUR: Colour = (0.62, 0.64, 0.67, 1.0)  # where a URDF names no colour
+DEFAULT_COLOUR: Colour = (0.62, 0.64, 0.67, 1.0)  # of shapes without a colour
 _SHAPE_TAGS = ("box", "cylinder", "sphere", "capsule", "mesh")
-_MAX_DISTANCE = 1e6  # [m], beyond which nothing is drawn
-_MAX_NAME_LENGTH = 100  # characters of a name that are shown
+_MAX_DISTANCE = 1e6  # [m] of a shape that is drawn
+_MAX_NAME_LENGTH = 100  # characters shown
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,10 @@ class Visual:
 
     Attributes:
         link: Name of the link.
-        shape: What is drawn.
+        shape: The shape.
         placement: (4, 4) pose of the shape in the link's frame.
         colour: Red, green, blue, opacity, 0 to 1.
-        mesh_label: Name of the mesh that the shape is a part of, with file and line before it; ""
-            for other shapes.
+        mesh_label: File, line and name of the mesh that the shape belongs to; "" for other shapes.
     """
 
     link: str
@@ -78,7 +77,7 @@ class Visual:
     mesh_label: str = ""
 
     def bounding_corners(self) -> Array:
-        """(8, 3) corners, in the link's frame, of a box that encloses the shape."""
+        """Return the corners (8, 3) of a box around the shape, in the link's frame."""
         match self.shape:
             case BoxShape(size):
                 high = np.array(size) / 2
@@ -95,14 +94,12 @@ class Visual:
 
 @dataclass(frozen=True)
 class UrdfShapes:
-    """What a URDF draws.
+    """The shapes of a URDF.
 
     Attributes:
-        shapes: Of each tag that was asked for.
-        missing_meshes: Names of the meshes whose files are not there, each with its place, file
-            and line.
-        problems: What else cannot be drawn as it is, with file and line, what becomes of it, and
-            what to do.
+        shapes: Shapes by tag.
+        missing_meshes: File and line by name of each mesh whose file does not exist.
+        problems: Other problems, with file, line, consequence and advice.
     """
 
     shapes: Mapping[str, Sequence[Visual]]
@@ -112,7 +109,7 @@ class UrdfShapes:
 
 @dataclass(frozen=True)
 class _MeshReference:
-    """A mesh that is to be read: its scale (3,) and file."""
+    """A mesh that is not read yet: its name, scale (3,) and file."""
 
     name: str
     scale: tuple[float, ...]
@@ -122,12 +119,12 @@ class _MeshReference:
 def read_shapes(
     xml: XmlFile, tags: Sequence[str] = ("visual",), replacement: BoxShape | None = None
 ) -> UrdfShapes:
-    """The shapes in a URDF that can be drawn.
+    """Read the shapes of a URDF that can be drawn.
 
     Args:
         xml: The file.
-        tags: Of elements in links that have shapes, visual and collision.
-        replacement: Is drawn in the place of a mesh that cannot be read; None to leave it out.
+        tags: Tags of the elements of links to read: visual, collision.
+        replacement: Shape in place of a mesh that cannot be read; None to leave it out.
     """
     reader = _ShapeReader(xml)
     shapes = {tag: reader.read_elements(tag) for tag in tags}
@@ -141,8 +138,8 @@ def read_shapes(
         {
             tag: [
                 visual
-                for drawn in found
-                for visual in reader.create_visuals(drawn, meshes, replacement)
+                for unloaded in found
+                for visual in reader.create_visuals(unloaded, meshes, replacement)
             ]
             for tag, found in shapes.items()
         },
@@ -153,7 +150,7 @@ def read_shapes(
 
 @dataclass(frozen=True)
 class _UnloadedShape:
-    """A shape where it stands, before its mesh is read."""
+    """A shape on a link, before its mesh is read."""
 
     link: str
     shape: Shape | _MeshReference
@@ -163,7 +160,7 @@ class _UnloadedShape:
 
 
 class _ShapeReader:
-    """Reads a file, and remembers what is wrong with it."""
+    """Reads the shapes of a file, and collects problems."""
 
     def __init__(self, xml: XmlFile):
         self.xml = xml
@@ -173,13 +170,15 @@ class _ShapeReader:
         with raise_errors():
             self._colours = {
                 material.get("name", "").strip(): colour
-                for material in reversed(list(xml.root.iter("material")))  # the first one counts
+                for material in reversed(
+                    list(xml.root.iter("material"))
+                )  # the first of a name applies
                 if (colour := self._read_colour(material)) is not None
             }
-        self.problems.clear()  # which are told where they are used
+        self.problems.clear()  # reported for the visuals that use them
 
     def read_elements(self, tag: str) -> list[_UnloadedShape]:
-        """Shapes of elements with a tag."""
+        """Return the shapes of elements with a tag."""
         found: list[_UnloadedShape] = []
         for element in self.xml.root.iterfind(f"link/{tag}"):
             link = element.getparent().get("name", "").strip()
@@ -217,7 +216,7 @@ class _ShapeReader:
     def _read_shape(
         self, shape: etree._Element, label: str
     ) -> list[tuple[Shape | _MeshReference, Array]]:
-        """A shape, each part with its pose (4, 4) in it."""
+        """Return the parts of a shape, each with its pose (4, 4)."""
         identity = np.eye(4)
         if shape.tag == "mesh":
             name = shape.get("filename", "")
@@ -236,7 +235,7 @@ class _ShapeReader:
         parts: list[tuple[Shape | _MeshReference, Array]] = [
             (CylinderShape(radius, length), identity)
         ]
-        if shape.tag == "capsule":  # whose length is that between the centres of its balls
+        if shape.tag == "capsule":  # its length is between the centres of the spheres
             for end in (-length / 2, length / 2):
                 parts.append((SphereShape(radius), _pose_matrix((0.0, 0.0, end))))
         return parts
@@ -259,7 +258,7 @@ class _ShapeReader:
             raise self.xml.error_at(element, f"{label} has a length of {largest:g} m, give metres")
 
     def _read_colour(self, material: etree._Element) -> Colour | None:
-        """The colour of a material, if it has one that is one."""
+        """Return the colour of a material, None if it has no valid one."""
         colour = material.find("color")
         if colour is None:
             return None
@@ -282,7 +281,7 @@ class _ShapeReader:
         meshes: Mapping[Path, tuple[MeshPart, ...] | str],
         replacement: BoxShape | None,
     ) -> list[Visual]:
-        """A shape with what its mesh holds, if it is one."""
+        """Return a shape with the triangles of its mesh."""
         shape = unloaded.shape
         if not isinstance(shape, _MeshReference):
             return [
@@ -301,8 +300,7 @@ class _ShapeReader:
             first_location = self._damaged_meshes.setdefault(short_name, unloaded.source_location)
             self.problems.append(
                 f"{first_location}: mesh file '{short_name}' cannot be read ({parts}), export "
-                f"it again; a box "
-                "is drawn instead"
+                "it again; a box is drawn instead"
             )
         elif any(_largest_coordinate(part, shape.scale) > _MAX_DISTANCE for part in parts):
             self.problems.append(
@@ -334,5 +332,5 @@ def _largest_coordinate(part: MeshPart, scale: tuple[float, ...]) -> float:
 
 
 def _pose_matrix(xyz: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
-    """(4, 4) pose; angles about the fixed axes x, y, z."""
+    """Return a pose (4, 4) from a position and angles about the fixed axes x, y, z."""
     return np.asarray(pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz)).homogeneous)

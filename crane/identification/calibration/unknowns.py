@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from crane.common.errors import InputError, suggest_names
-from crane.description.parameter_changes import unknown_parameter_text
+from crane.description.machine_parameters import unknown_parameter_text
 from crane.description.sensors import SENSOR_PREFIX
 from crane.description.specification import MachineSpec
 

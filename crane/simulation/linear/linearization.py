@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_samples
-from crane.description.parameter_changes import unknown_parameter_text
+from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.formats.machine_loading import MachineVariants

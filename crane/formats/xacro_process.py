@@ -1,11 +1,10 @@
-"""A process that expands a xacro file: whatever is in it can end this process, and nothing else.
+"""A process that expands a xacro file, so that the file can crash only this process.
 
-Run by crane.formats.xacro.xacro_expansion with what it needs as JSON on its input; it writes a
-line of JSON. xacro computes with Python's expressions, without bounds, so time and memory are
-limited.
+`crane.formats.robot_files` runs it with its request as JSON on the standard input; it writes a
+line of JSON. xacro evaluates Python expressions without bounds, so time and memory are limited.
 
-Every element of the result says where it was written: the attribute `LOCATION_ATTRIBUTE` has the
-number of its file and its line.
+The attribute `LOCATION_ATTRIBUTE` of every element of the result contains index of the file and
+line.
 """
 
 import json
@@ -24,10 +23,10 @@ _XACRO_PREFIX = "xacro:"
 
 
 def main() -> None:
-    """Expand what is asked for."""
+    """Expand the file of the request."""
     output = os.fdopen(os.dup(1), "w", encoding="utf-8")
     null_device = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null_device, 1)  # the output is ours alone
+    os.dup2(null_device, 1)  # expressions cannot write into the output
     os.dup2(null_device, 2)
     request = json.load(sys.stdin)
     sys.path.insert(0, request["root"])
@@ -43,7 +42,7 @@ def main() -> None:
 
 
 def _limit_resources() -> None:
-    """Bound time and memory, where the system can."""
+    """Limit time and memory, if the system supports it."""
     try:
         import resource
     except ImportError:
@@ -59,14 +58,14 @@ def _limit_resources() -> None:
 
 
 class _ReadFiles:
-    """The files that were read, with the lines of their elements, and the arguments they have."""
+    """The files that were read, with the lines of their elements, and their arguments."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
         self.arguments: dict[str, None] = {}
 
     def parse_file(self, file: str) -> Any:
-        """The document of a file, each element but those of xacro with its place."""
+        """Return the document of a file with the locations of all elements but those of xacro."""
         number = len(self.names)
         self.names.append(file)
         files = self
@@ -79,7 +78,7 @@ class _ReadFiles:
         return Marking().parseString(Path(file).read_bytes())
 
     def set_location(self, element: Any, number: int, line: int) -> None:
-        """Note where an element was written."""
+        """Record where an element is written."""
         if not element.tagName.startswith(_XACRO_PREFIX):
             element.setAttribute(LOCATION_ATTRIBUTE, f"{number}:{line}")
         elif element.localName == "arg":
@@ -114,7 +113,7 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
         found["wrong"] = f"expanding it takes more than {MAX_MEMORY >> 30} GB"
     except RecursionError:
         found["wrong"] = "its macros or files use themselves without end"
-    except Exception as error:  # whatever xacro and the expressions in a file raise
+    except Exception as error:  # xacro and expressions raise anything
         found["wrong"] = " ".join(str(error).split())[:300] or type(error).__name__
     if "wrong" in found and missing:
         found |= {"package": missing[0]}
@@ -126,7 +125,7 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
 def _provide_package_search(
     folder: Path, packages: list[str], missing_packages: list[str], xacro: Any
 ) -> None:
-    """Let xacro find packages as this program does, whether ROS is installed or not."""
+    """Make xacro find packages as this package does, whether ROS is installed or not."""
     from crane.common.package_search import find_file, find_package, use_load_options
 
     def share(name: str) -> str:

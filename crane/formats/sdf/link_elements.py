@@ -1,0 +1,274 @@
+"""Inertial, visual and collision elements of links of SDF, as elements of URDF."""
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.common.errors import CraneWarning
+from crane.common.package_search import find_file
+from crane.common.samples import Array
+from crane.description.kinematic_tree import Inertial
+from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
+from crane.formats.sdf.frame_poses import SdfFramePoses
+from crane.formats.sdf.model_scope import ModelScope, NoteFunction
+from crane.formats.sdf.sdf_element import SdfElement
+from crane.formats.urdf_elements import TENSOR_ATTRIBUTES, add_inertial, add_origin
+from crane.formats.visuals.mesh_files import read_meshes
+
+_DEFAULT_DENSITY = 1000.0  # [kg/m3], default of SDF
+
+
+def add_link_inertial(
+    element: etree._Element, scope: ModelScope, link: SdfElement, frames: SdfFramePoses
+) -> None:
+    """Add the `<inertial>` of a link, with the defaults of SDF: 1 kg, 1 kg m2.
+
+    With `auto="true"` the inertia is that of the collisions, each of one density; if there is a
+    `<mass>`, scaled to it.
+
+    Raises:
+        DescriptionError: A number is malformed, or the volume of a shape is unknown.
+    """
+    inertial_element = link.single_child("inertial")
+    if inertial_element is None:
+        inertial_element = link.wrap(etree.Element("inertial"), link.label)
+    tensor_element = inertial_element.single_child("inertia")
+    if tensor_element is None:
+        tensor_element = link.wrap(etree.Element("inertia"), link.label)
+    if any(
+        x.attribute("auto").lower() in ("true", "1") for x in (inertial_element, tensor_element)
+    ):
+        inertial = _collision_inertial(scope, link, inertial_element, frames)
+    else:
+        placement, _ = inertial_element.read_pose()
+        tensor = (tensor_element.number(key, float(key[1] == key[2])) for key in TENSOR_ATTRIBUTES)
+        mass = inertial_element.number("mass", 1.0)
+        inertial = Inertial(mass, *xyz_rpy_from_se3(placement), tuple(tensor))
+    add_inertial(element, inertial)
+
+
+def warn_about_missing_inertial(link: SdfElement) -> None:
+    """Warn of a moving link without `<inertial>`."""
+    if link.single_child("inertial") is None:
+        warnings.warn(
+            f"{link.source_location}: {link.label} has no <inertial>, which SDF takes as 1 kg "
+            "and 1 kg m2: write what it has",
+            CraneWarning,
+            stacklevel=2,
+        )
+
+
+def _collision_inertial(
+    scope: ModelScope, link: SdfElement, inertial_element: SdfElement, frames: SdfFramePoses
+) -> Inertial:
+    """Return the inertial of the collisions of a link, filled with their densities."""
+    density = inertial_element.number("density", _DEFAULT_DENSITY)
+    link_pose = frames.element_pose(scope, link, link.base_frame)
+    total_inertia = pin.Inertia.Zero()
+    for child in link.element.iterfind("collision"):
+        shape = link.wrap(child, f"a collision of {link.label}")
+        shape_pose = link_pose.actInv(frames.element_pose(scope, shape, link.name))
+        total_inertia += shape_pose.act(solid_inertia(shape, shape.number("density", density)))
+    computed_inertial = inertial_from_inertia(total_inertia)
+    if computed_inertial is None:
+        raise link.xml.error_at(
+            inertial_element.element, f"{link.label} has no collision to take its mass from"
+        )
+    mass = inertial_element.number("mass", computed_inertial.mass)
+    tensor = tuple(x * mass / computed_inertial.mass for x in computed_inertial.tensor)
+    return dataclasses.replace(computed_inertial, mass=mass, tensor=tensor)
+
+
+_SOLID_TYPES = ("box", "capsule", "cone", "cylinder", "ellipsoid", "mesh", "sphere")
+
+
+def solid_inertia(shape: SdfElement, density: float) -> pin.Inertia:
+    """Return the inertia of a `<collision>` of one density [kg/m3], in the frame of its geometry.
+
+    Raises:
+        DescriptionError: The volume is unknown: another shape, or a mesh that is not closed or
+            cannot be read.
+    """
+    solid_element = _geometry_shape(shape)
+    tag = "" if solid_element is None else solid_element.element.tag
+    if solid_element is None or tag not in _SOLID_TYPES:
+        raise _unknown_volume_error(shape, f"is no {', '.join(_SOLID_TYPES)}")
+    if tag == "mesh":
+        return _mesh_inertia(solid_element, density)
+    if tag == "box":
+        x, y, z = _read_sizes(solid_element, "size", 3)
+        return pin.Inertia.FromBox(density * x * y * z, x, y, z)
+    if tag in ("ellipsoid", "sphere"):
+        radii = _read_sizes(solid_element, "radius", 1) * 3
+        if tag == "ellipsoid":
+            radii = _read_sizes(solid_element, "radii", 3)
+        mass = density * 4 / 3 * math.pi * float(np.prod(radii))
+        return pin.Inertia.FromEllipsoid(mass, *radii)
+    (radius,), (length,) = (_read_sizes(solid_element, key, 1) for key in ("radius", "length"))
+    mass = density * math.pi * radius**2 * length
+    if tag == "cylinder":
+        return pin.Inertia.FromCylinder(mass, radius, length)
+    if tag == "capsule":  # its length is between the centres of the spheres
+        sphere_mass = density * 4 / 3 * math.pi * radius**3
+        return pin.Inertia.FromCapsule(mass + sphere_mass, radius, length)
+    transverse_factor = 3 / 80 * (4 * radius**2 + length**2)  # a cone with its tip at length / 2
+    moments = mass / 3 * np.diag([transverse_factor, transverse_factor, 0.3 * radius**2])
+    return pin.Inertia(mass / 3, np.array([0.0, 0.0, -length / 4]), moments)
+
+
+def _unknown_volume_error(item: SdfElement, reason: str) -> Exception:
+    hint = "write its <mass> and <inertia> instead of auto"
+    return item.error(f"{item.label} {reason}, so that its volume is unknown: {hint}")
+
+
+def _read_sizes(element: SdfElement, tag: str, count: int) -> tuple[float, ...]:
+    sizes = element.numbers(tag, count, (1.0,) * count)
+    if min(sizes) <= 0:
+        raise element.error(f"<{tag}> of {element.label} is not positive, give metres")
+    return sizes
+
+
+def _mesh_inertia(mesh_element: SdfElement, density: float) -> pin.Inertia:
+    name = mesh_element.text("uri") or mesh_element.text("filename")
+    if mesh_element.single_child("submesh") is not None:
+        raise _unknown_volume_error(mesh_element, f"takes a part of the mesh '{name}'")
+    file = find_file(name, mesh_element.xml.file.parent) if name else None
+    if file is None or not file.is_file():
+        raise _unknown_volume_error(mesh_element, f"has the mesh '{name}', which is not there")
+    parts = read_meshes([file])[file]
+    if isinstance(parts, str):
+        raise _unknown_volume_error(
+            mesh_element, f"has the mesh '{name}', which cannot be read ({parts})"
+        )
+    scale = np.array(mesh_element.numbers("scale", 3, (1.0, 1.0, 1.0)))
+    triangles = np.concatenate([part.vertices[part.faces] for part in parts]) * scale
+    if edges := _count_open_edges(triangles):
+        raise _unknown_volume_error(
+            mesh_element, f"has the mesh '{name}', which {edges} edges leave open"
+        )
+    mass, com, tensor = inertia_of_triangles(triangles, density)
+    if not mass > 0:
+        raise _unknown_volume_error(mesh_element, f"has the mesh '{name}', which is flat")
+    return pin.Inertia(mass, com, tensor)
+
+
+def _count_open_edges(triangles: Array) -> int:
+    """Count the edges that triangles do not traverse equally often in both directions.
+
+    Vertices that agree to nine digits of the mesh's size are the same: formats without shared
+    vertices, such as STL, contain each several times.
+    """
+    points = triangles.reshape(-1, 3)
+    grid = float(np.ptp(points, axis=0).max()) * 1e-9 or 1.0
+    _, index = np.unique(np.round(points / grid), axis=0, return_inverse=True)
+    corners = index.reshape(-1, 3)
+    directed_edges = np.concatenate([corners[:, [i, (i + 1) % 3]] for i in range(3)])
+    directed_edges = directed_edges[directed_edges[:, 0] != directed_edges[:, 1]]
+    sign = np.where(directed_edges[:, 0] < directed_edges[:, 1], 1, -1)
+    _, edge = np.unique(np.sort(directed_edges, axis=1), axis=0, return_inverse=True)
+    return int(np.count_nonzero(np.bincount(edge.ravel(), weights=sign)))
+
+
+def inertia_of_triangles(triangles: Array, density: float) -> tuple[float, Array, Array]:
+    """Return mass, centre of mass (3,) and central inertia (3, 3) of a closed mesh (F, 3, 3).
+
+    The tetrahedron from the origin to a triangle a, b, c has, with six times its signed volume
+    d = a . (b x c) and s = a + b + c,
+
+        V = d / 6,    int x dV = d s / 24,
+        int x x^T dV = d (s s^T + a a^T + b b^T + c c^T) / 120.
+
+    The sum over all triangles is the integral over the body, negative if they face inwards.
+    """
+    centroid = triangles.reshape(-1, 3).mean(axis=0)  # as origin it reduces rounding errors
+    corners = triangles - centroid
+    volumes = np.linalg.det(corners)
+    sums = corners.sum(axis=1)
+    volume = volumes.sum() / 6
+    first = volumes @ sums / 24
+    second = np.einsum("f,fi,fj->ij", volumes, sums, sums)
+    second = (second + np.einsum("f,fki,fkj->ij", volumes, corners, corners)) / 120
+    if volume == 0:
+        return 0.0, centroid, np.zeros((3, 3))
+    com = first / volume
+    second = math.copysign(density, volume) * (second - volume * np.outer(com, com))
+    return density * abs(float(volume)), centroid + com, np.trace(second) * np.eye(3) - second
+
+
+_SIZE_ATTRIBUTES = {
+    "box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",),
+    "capsule": ("radius", "length"),
+}  # fmt: skip
+_WORLD_SHAPES = ("plane", "heightmap", "empty")  # shapes of the ground
+
+
+def add_shapes(
+    element: etree._Element,
+    scope: ModelScope,
+    link: SdfElement,
+    frames: SdfFramePoses,
+    note: NoteFunction,
+) -> None:
+    """Add visuals and collisions of a link; `note` receives shapes that URDF does not have."""
+    link_pose = frames.element_pose(scope, link, link.base_frame)
+    for child in link.element:
+        if child.tag not in ("visual", "collision"):
+            continue
+        shape = link.wrap(child, f"a {child.tag} of {link.label}")
+        if (geometry := _shape_element(shape, note)) is not None:
+            added = etree.SubElement(element, child.tag)
+            shape_pose = frames.element_pose(scope, shape, link.name)
+            add_origin(added, *xyz_rpy_from_se3(link_pose.actInv(shape_pose)))
+            etree.SubElement(added, "geometry").append(geometry)
+            _add_colour(added, shape)
+
+
+def _geometry_shape(item: SdfElement) -> SdfElement | None:
+    """Return the shape in the `<geometry>` of a visual or collision."""
+    geometry = item.single_child("geometry")
+    tags = [] if geometry is None else [x.tag for x in geometry.element if isinstance(x.tag, str)]
+    return geometry.single_child(tags[0]) if geometry is not None and tags else None
+
+
+def _shape_element(item: SdfElement, note: NoteFunction) -> etree._Element | None:
+    """Return the shape of a visual or collision as an element of URDF, None if it has none."""
+    shape = _geometry_shape(item)
+    if shape is None or (tag := shape.element.tag) in _WORLD_SHAPES:
+        return None
+    if tag == "mesh":
+        return _mesh_element(shape)
+    if tag not in _SIZE_ATTRIBUTES:
+        note("shapes", tag)
+        return None
+    made = etree.Element(tag)
+    for key in _SIZE_ATTRIBUTES[tag]:
+        made.set(key, shape.text(key, "1 1 1" if key == "size" else "1"))
+    return made
+
+
+def _mesh_element(shape: SdfElement) -> etree._Element:
+    """Return a mesh by its absolute path, because included models have other folders."""
+    name = shape.text("uri") or shape.text("filename")
+    file = find_file(name, shape.xml.file.parent) if name else None
+    is_file = file is not None and file.is_file()
+    made = etree.Element("mesh", filename=str(file) if is_file else name)
+    if scale := shape.text("scale"):
+        made.set("scale", scale)
+    return made
+
+
+def _add_colour(visual: etree._Element, item: SdfElement) -> None:
+    """Add the diffuse colour, else the ambient colour."""
+    material = item.single_child("material")
+    if material is None or visual.tag != "visual":
+        return
+    text = material.text("diffuse") or material.text("ambient")
+    if not text:
+        return
+    words = text.split()
+    rgba = " ".join([*words, "1"][:4] if len(words) == 3 else words)
+    etree.SubElement(etree.SubElement(visual, "material", name=""), "color", rgba=rgba)

@@ -1,1 +1,0 @@
-"""xacro: URDF and other XML written with macros, expanded by the package of that name."""
