@@ -34,8 +34,8 @@ from crane.description.specification import (
     Friction,
     MachineSpec,
 )
-from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.parameter_checks import parameter_names
+from crane.hydraulics.circuit_elements import parameter_names
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 
 PAYLOAD_MASS = "payload.mass"
 PINS_PREFIX = "pins."

@@ -133,7 +133,7 @@ def simulate_batch(
         if found.stop is not None:
             raise found.stop
         time, rows = found.time, found.rows
-        energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.lost])
+        energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.dissipated])
         q_a = rows.q[:, machine.closure.active]
         doubts = [
             *found.notes,

@@ -17,11 +17,10 @@ from crane.dynamics.dynamics import QUANTITY_ARGUMENTS
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats import load
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import controller_settings, trace_machine
-from crane.simulation.integration.state_layouts import state_layout
 
 _KINEMATIC_QUANTITIES = ("loops", "gamma", "tip")  # what depends on q alone
 _SIMULATION_QUANTITY = "simulation"
@@ -60,7 +59,7 @@ def casadi_function(
     "simulation" gives the rates q_rate (nq,), a_a (n,), circuit_rate of the states of
     `crane.hydraulics.CircuitEquations` (`ValveDrive(machine, command).circuit.states` names them,
     its `start` has those at rest) and balance_rate (6,) of the oil's and the energy's balances, in
-    `crane.hydraulics.circuit_equations.BALANCE_UNITS`. `signals` are those of the valves [V].
+    `crane.hydraulics.circuit_states.BALANCE_UNITS`. `signals` are those of the valves [V].
 
     Args:
         machine: The machine, or what `crane.load` takes.

@@ -1,6 +1,6 @@
-"""What a simulation leaves: a recording with channels."""
+"""Recording of a simulation: its channels, and readings of ideal sensors."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -8,18 +8,31 @@ import numpy as np
 
 from crane.codegen import Layout, LayoutView
 from crane.common import scratch_arrays
-from crane.common.errors import CraneError, format_one_line
+from crane.common.errors import CraneError, RecordingError, format_one_line, suggest_names
 from crane.common.one_line_repr import shorten_to_line
 from crane.common.samples import MAX_QUANTITY, Array
 from crane.control import Controller, ValveDrive, ZeroForce, controller_reference
 from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.description.sensors import (
+    FORCE_SUFFIX,
+    FORCE_UNITS,
+    INCLINATION_PREFIX,
+    SUPPLY_PRESSURE,
+    TANK_PRESSURE,
+    VALVE_SIGNAL_PREFIX,
+    VELOCITY_SUFFIX,
+    VELOCITY_UNITS,
+    quantity_unit,
+)
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.dynamics.tipping_stability import TippingStability, has_supports
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory
-from crane.recordings.recording import FORCE_UNITS, Recording
+from crane.recordings.ideal_sensors import ideal_readings
+from crane.recordings.recording import Recording
+from crane.recordings.timeseries import TIME, Table, accepted_units, check_unit
 
 ChannelColumn = tuple[str, Array, str]  # name, values, unit
 
@@ -170,16 +183,23 @@ def _channel_columns(
             rows.friction[:, i],
             FORCE_UNITS[machine.unit(joint)],
         )
-    for column, values in zip(find_stick_slip_columns(machine), rows.rest.T, strict=True):
+    for column, values in zip(
+        find_stick_slip_columns(machine), rows.friction_at_rest.T, strict=True
+    ):
         joint = machine.joints[column]
         yield f"rest_{joint}", values, FORCE_UNITS[machine.unit(joint)]
-    names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
+    names = {
+        "kinetic": "kinetic",
+        "potential": "potential",
+        "work": "work",
+        "dissipated": "dissipated",
+    }
     for name, part in names.items():
         yield name, getattr(rows, part)[:, 0], "J"
     yield from _external_force_columns(machine, rows)
     yield from _stability_columns(machine, rows)
     if isinstance(control, ValveDrive):
-        integrals = rows.own[:, -len(BALANCE_UNITS) :]
+        integrals = rows.controller[:, -len(BALANCE_UNITS) :]
         units = [*control.channels, *BALANCE_UNITS.items()]
         delayed_signals: dict[str, Array] = {}
         if control.delays.any():  # a log has what was commanded, not what arrives
@@ -194,7 +214,7 @@ def _channel_columns(
 
 def _external_force_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
     """What acts from outside, in the world's axes at the origins of frames, and its work."""
-    columns = iter(rows.outside.T)
+    columns = iter(rows.external.T)
     for k, force in enumerate(machine.external_forces):
         for part, values in zip(WRENCH_COMPONENTS, columns, strict=False):
             if part.startswith("force") or values.any():
@@ -217,7 +237,7 @@ def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelCo
         titles += [(word, "")]
 
     def stand(part: slice) -> Array:
-        q, outside = rows.q[part], rows.outside[part]
+        q, outside = rows.q[part], rows.external[part]
         columns: list[Array] = []
         if stability.is_stationary:
             v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[part])
@@ -263,3 +283,97 @@ def _controller_name(control: Controller) -> str:
     if isinstance(control, ValveDrive):
         return getattr(control.command, "title", type(control.command).__name__)
     return "" if isinstance(control, ZeroForce) else type(control).__name__
+
+
+_INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)
+
+
+def simulated_columns(machine: Machine, table: Table) -> list[str]:
+    """Columns of a measured table that a simulation of its inputs says something of.
+
+    Joints, their velocities and forces, pressures, channels of the circuit, the tip, and
+    inclinations of links, `inclination_LINK` and `inclination_LINK_velocity`.
+
+    Raises:
+        RecordingError: A column is in a unit of something else, or of no link.
+    """
+    return _select_columns(machine, table, simulated_units(machine))
+
+
+def recorded_columns(machine: Machine, table: Table, recording: Recording) -> list[str]:
+    """Columns of a measured table that a recording of a simulation says something of.
+
+    Raises:
+        RecordingError: As for `simulated_columns`.
+    """
+    units = recording.units | recording.channel_units
+    units |= {x + VELOCITY_SUFFIX: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
+    driven = (x for x in recording.joints if x not in recording.free)
+    units |= {x + FORCE_SUFFIX: FORCE_UNITS[recording.units[x]] for x in driven}
+    return _select_columns(machine, table, units)
+
+
+def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
+    """Columns, but for the inputs, that have one of these units by name, or are inclinations."""
+    columns = []
+    for name, unit in table.units.items():
+        if name == TIME:
+            continue
+        wanted = units.get(name)
+        if name.startswith(INCLINATION_PREFIX):
+            wanted = quantity_unit(machine.tree, name)
+            if wanted is None:
+                link = name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
+                links = machine.tree.links
+                raise RecordingError(
+                    f"column '{name}' is of no link, {suggest_names(links, link)}"
+                )
+        if wanted is not None:
+            check_unit(name, unit, accepted_units(wanted))
+            if not name.startswith(_INPUT_PREFIXES):
+                columns.append(name)
+    return columns
+
+
+def simulated_units(machine: Machine) -> dict[str, str]:
+    """By column, of what a simulation on valves records."""
+    joint_units = {joint: machine.unit(joint) for joint in machine.joints}
+    units = dict(joint_units)
+    units |= {
+        joint + VELOCITY_SUFFIX: VELOCITY_UNITS[joint_units[joint]] for joint in machine.active
+    }
+    units |= {
+        joint + FORCE_SUFFIX: FORCE_UNITS[joint_units[joint]] for joint in machine.driven_joints
+    }
+    units |= {f"tip_{axis}": "m" for axis in "xyz" if machine.tip is not None}
+    for joint in machine.hydraulics.joints if machine.hydraulics else ():
+        units |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}
+        units |= {f"spool_{joint}": ""}
+    return units
+
+
+def read_simulation(machine: Machine, recording: Recording, names: list[str]) -> Array:
+    """What ideal sensors say (N, k) at the recorded instants, SI units.
+
+    Args:
+        machine: The machine that was simulated.
+        recording: Its simulation.
+        names: See `simulated_columns`.
+    """
+    columns = recording.columns()
+    inclination_names = [name for name in names if name.startswith(INCLINATION_PREFIX)]
+    readings = columns | (
+        _inclination_readings(machine, recording, inclination_names) if inclination_names else {}
+    )
+    values = [readings[name] for name in names]
+    return np.column_stack(values) if values else np.empty((len(recording.time), 0))
+
+
+def _inclination_readings(
+    machine: Machine, recording: Recording, names: list[str]
+) -> dict[str, Array]:
+    columns = recording.columns()
+    q = np.column_stack([columns[joint] for joint in machine.joints])
+    order = [recording.joints.index(joint) for joint in machine.active]
+    v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
+    return ideal_readings(machine, q, v, names)

@@ -33,7 +33,7 @@ from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_qua
 from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.stroke_check import check_strokes
 from crane.recordings.timeseries import TIME, Table, table_column
-from crane.simulation.simulated_readings import read_simulation, recorded_columns
+from crane.simulation.recorded_run import read_simulation, recorded_columns
 from crane.simulation.simulation_run import Progress, simulate
 
 _START_FIT_DURATION, _MAX_REST_DURATION = (

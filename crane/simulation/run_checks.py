@@ -178,11 +178,8 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
     for contact in contacts:
-        height = float(
-            contact.ground.distance_and_normal(
-                frames.frame_pose(contact.frame).translation.tolist()
-            )[0]
-        )  # type: ignore[arg-type]
+        position = frames.frame_pose(contact.frame).translation.tolist()
+        height = float(contact.ground.distance_and_normal(position)[0])  # type: ignore[arg-type]
         depth = contact.radius - height
         if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
             return (
@@ -195,13 +192,13 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
 def _energy_imbalance(rows: LayoutView) -> Array:
     """(N,) work less change of energy less dissipation [J]: what a run has lost by its steps."""
     stored = rows.kinetic[:, 0] + rows.potential[:, 0]
-    imbalance_over_time: Array = rows.work.sum(axis=1) - rows.lost[:, 0] - stored + stored[0]
+    imbalance_over_time: Array = rows.work.sum(axis=1) - rows.dissipated[:, 0] - stored + stored[0]
     return imbalance_over_time
 
 
 def _energy_throughput(rows: LayoutView) -> float:
     """The energy that went through [J]."""
-    parts = rows.work, rows.lost, rows.kinetic, rows.potential
+    parts = rows.work, rows.dissipated, rows.kinetic, rows.potential
     return float(max(np.ptp(part) for part in parts))
 
 
@@ -245,7 +242,7 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     columns = list(smoothings)
     if not columns:
         return ""
-    dissipated_energy = rows.lost[:, 0]
+    dissipated_energy = rows.dissipated[:, 0]
     dissipated_per_step, energy_tolerance = (
         np.diff(dissipated_energy),
         1e-6 * float(np.diff(dissipated_energy).max()),

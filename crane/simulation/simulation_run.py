@@ -41,16 +41,16 @@ from crane.motion.limit_violations import limit_violation_message, passive_limit
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
 from crane.simulation.integration.chart_switching import ChartIntegrator, ChartSwitchingIntegrator
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.dormand_prince import DormandPrinceStepper
-from crane.simulation.integration.error_controlled_integrator import ErrorControlledIntegrator
-from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
-from crane.simulation.integration.fixed_step_integrator import FixedStepIntegrator
-from crane.simulation.integration.integration_halt import IntegrationHaltError, explain_halt
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.error_controlled_stepper import (
+    DormandPrinceStepper,
+    ErrorControlledStepper,
+)
+from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.python_stepper import IntegrationHaltError, explain_halt
 from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
 from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIntegrator
-from crane.simulation.integration.state_layouts import row_layout
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.run_checks import (
     buried_contact_text,

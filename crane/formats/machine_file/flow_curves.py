@@ -8,7 +8,7 @@ from pathlib import Path
 from crane.common.errors import InputError
 from crane.common.file_contents import read_plain_file
 from crane.formats.machine_file.yaml_section import MAX_FILE_SIZE, YamlSection
-from crane.hydraulics.opening_curve import OpeningCurve
+from crane.hydraulics.components import OpeningCurve
 
 _KEYS = ("coefficient", "shape", "flow", "drop", "area", "discharge", "density", "file")
 _DEFAULT_DISCHARGE, _DEFAULT_DENSITY = 0.7, 870.0  # of an orifice; of oil [kg/m3]

@@ -36,8 +36,8 @@ from crane.formats.urdf_output import (
     with_floating_joints,
 )
 from crane.hydraulics import CircuitElement, Cylinder, Hydraulics, Supply, Valve
+from crane.hydraulics.circuit_elements import parameter_names
 from crane.hydraulics.components import COUNTERBALANCE_KEYS
-from crane.hydraulics.parameter_checks import parameter_names
 from crane.machine import Machine
 
 

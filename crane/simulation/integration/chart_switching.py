@@ -21,10 +21,12 @@ from crane.simulation.integration.branch_crossing import (
     extrapolate_states,
     relative_rank,
 )
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.integration_halt import IntegrationHaltError
-from crane.simulation.integration.python_stepper import PythonStepper, StepProgress
-from crane.simulation.integration.state_layouts import row_layout
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.python_stepper import (
+    IntegrationHaltError,
+    PythonStepper,
+    StepProgress,
+)
 
 _LIMIT_RELAXATION = np.array([2.0, 0.1])  # how limits move where nothing is better
 _MAX_RECENT_STATES = 500  # states that are kept
@@ -415,7 +417,7 @@ class ChartSwitchingIntegrator:
             return inverse([], False)
 
         columns = control.references(np.zeros(1)).shape[1]
-        sizes = n, n, self._row_layout.parts["own"], len(control.settings), columns
+        sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
         q_a, v_a, state, settings, reference = (
             tape.load_vector(i, 0, x) for i, x in enumerate(sizes)
         )

@@ -1,13 +1,13 @@
-"""Independent coordinates of a motion: those of the user, or others where these fail.
+"""Independent coordinates of a simulation: those of the user, or others where these fail.
 
-A machine's active coordinates q_A do not describe it everywhere: at a dead centre they turn back
-and gamma = dq/dq_A is infinite, though the motion goes on as if nothing were there. In other
-independent coordinates q_B, with gamma_B = dq/dq_B and C its rows that belong to q_A,
+The active coordinates q_A of a machine are not valid everywhere: at a dead centre they turn back
+and gamma = dq/dq_A is infinite, although the motion is regular. In other independent coordinates
+q_B, with gamma_B = dq/dq_B and C the rows of gamma_B that belong to q_A,
 
     v_A = C v_B,    tau_B = C^T tau_A.
 
-A set of coordinates with an assembly branch around a posture is a chart of the machine's closed
-postures (generalized coordinate partitioning, Wehage and Haug 1982).
+A set of coordinates together with a branch around a configuration is a chart of the closed
+configurations of a machine (generalized coordinate partitioning, Wehage and Haug 1982).
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,20 @@ import numpy as np
 from crane.closure.active_joint_selection import null_space_basis, select_columns
 from crane.closure.constraint_structure import Indices
 from crane.closure.kinematics_formulas import folding_pattern
+from crane.codegen import Layout
 from crane.codegen.symbolic import Scalar, SymbolicExpression, dot
 from crane.common.errors import ClosureError, InputError, MechanismError
 from crane.common.samples import Array
+from crane.control import Controller, ValveDrive
+from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics import Dynamics
-from crane.dynamics.external_forces import ExternalForces, ExternalForceValues, formula_key
+from crane.dynamics.external_forces import (
+    ExternalForces,
+    ExternalForceValues,
+    formula_key,
+    state_count,
+)
+from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.machine import Machine
 from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
@@ -222,3 +231,48 @@ class Chart:
         machine = replace(machine, hydraulics=self.machine.hydraulics)
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
         return Chart(dynamics, self.user_columns, self.stick_slip, self.free_joints)
+
+
+def state_layout(machine: Machine, controller_state_count: int) -> Layout:
+    """What is integrated: q (nv), v_a (n), shear, the controller's own, work, lost [J].
+
+    Shear are the states of forces from outside: how far tyres have given way along the ground.
+    Work is that of the active forces, then of each force from outside.
+    """
+    n, work_count = len(machine.active), 1 + len(machine.external_forces)
+    contact_state_count = state_count(machine.external_forces)
+    return Layout(
+        q=machine.model.nv,
+        v_a=n,
+        contacts=contact_state_count,
+        controller=controller_state_count,
+        work=work_count,
+        dissipated=1,
+    )
+
+
+def output_layout(machine: Machine, control: Controller) -> Layout:
+    """What is observed.
+
+    tau (n), friction (n), kinetic, potential [J], friction of joints at rest that stick, wrench
+    and channels of each force from outside, accelerations of all joints where the machine has
+    supports to carry what they take, channels of circuits.
+    """
+    n, rest = len(machine.active), len(find_stick_slip_columns(machine))
+    channels = len(control.channels) if isinstance(control, ValveDrive) else 0
+    external_force_outputs = sum(
+        len(WRENCH_COMPONENTS) + len(force.channels) for force in machine.external_forces
+    )
+    return Layout(
+        tau=n, friction=n, kinetic=1, potential=1, friction_at_rest=rest,
+        external=external_force_outputs, a=machine.model.nv if machine.supports else 0,
+        channels=channels,
+    )  # fmt: skip
+
+
+def row_layout(machine: Machine, control: Controller, controller_state_count: int) -> Layout:
+    """Both, as they are recorded at an instant."""
+    return Layout(
+        **state_layout(machine, controller_state_count).parts,
+        **output_layout(machine, control).parts,
+    )

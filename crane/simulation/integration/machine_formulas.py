@@ -27,8 +27,7 @@ from crane.control import ControllerInputs, TracedController, ValveDrive
 from crane.dynamics import external_forces
 from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
 from crane.machine import Machine
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state_layouts import output_layout, state_layout
+from crane.simulation.integration.charts import Chart, output_layout, state_layout
 
 HELD_INDEX = 5  # of `MachineCodeStepper.bounds`, whether joints are at rest
 _AT_REST_SUFFIX = "_rest"
@@ -87,7 +86,7 @@ class MachineFormulas:
             else _raise_undetermined
         )
         return ControllerInputs(
-            self.q_a, self.v_a, self.state_parts.own, settings, reference, inverse, gravity
+            self.q_a, self.v_a, self.state_parts.controller, settings, reference, inverse, gravity
         )
 
     def with_circuit_friction(
@@ -217,7 +216,7 @@ def trace_machine(
         else [dynamics_formulas.rates[i + 1] for i in chart.user_columns]
     )
     applied = external_forces.trace_external_forces(
-        chart.machine, dynamics_formulas, external_references, parts.shear
+        chart.machine, dynamics_formulas, external_references, parts.contacts
     )
     return MachineFormulas(
         chart, dynamics_formulas, parts, [q[i] for i in chart.user_columns], v_a, applied
@@ -239,8 +238,8 @@ class MachineCodeStepper:
             code.
 
     Attributes:
-        bounds: See `CompiledClosure`; where other coordinates are better, see
-            `Chart.chart_limits`; whether joints are at rest.
+        bounds: See `CompiledClosure`; where other coordinates are better, see `Chart.limits`;
+            whether joints are at rest.
         external_callback: What calls those external forces that are functions in Python, if there
             are some.
         state_layout: Parts of the state.
@@ -361,7 +360,7 @@ class MachineCodeStepper:
         return self.closure_code.geometry.constants, self._dynamics_constants, settings
 
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
-        """Outputs (.,) and the transition margin at a time [s] and a state."""
+        """Outputs (.,) at a time [s] and a state, and `StickSlipAccelerations.margin`."""
         reference = reference_samples(self._chart.machine, self._control, np.array([time]))
         if self.external_callback is not None:
             callback_inputs = np.empty(self._program.formula_outputs("asked").size)

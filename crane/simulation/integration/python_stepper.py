@@ -1,20 +1,108 @@
-"""Steps of the classical Runge-Kutta method in Python."""
+"""Observation and steps of a controlled machine in Python, and halts of an integration."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from crane.codegen import LayoutView
-from crane.common.errors import ClosureError, InputError
+from crane.common.errors import ClosureError, InputError, SimulationError
 from crane.common.samples import Array
 from crane.control import Controller, ValveDrive
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.integration_halt import IntegrationHaltError
-from crane.simulation.integration.state_layouts import state_layout
+from crane.machine import Machine
+from crane.motion.limit_violations import limit_tolerances
+from crane.motion.trajectory import Trajectory
+from crane.simulation.integration.charts import Chart, state_layout
 
-_EXTRAPOLATION_TIME = (
-    1e-3  # of `Closure.characteristic_time`: how far a machine is thought on that stops
-)
+
+class IntegrationHaltError(SimulationError):
+    """A step that cannot be taken.
+
+    Args:
+        time: When [s].
+        q_a: (n,) active coordinates there.
+        description: What happened, to be read after the time.
+        default_remedy: What to do where no limit was passed and no shorter step helps.
+
+    Attributes:
+        time: See above.
+        q_a: See above.
+        default_remedy: See above.
+    """
+
+    def __init__(
+        self,
+        time: float,
+        q_a: Array,
+        description: str,
+        default_remedy: str = ", with all active joints within their limits: keep away "
+        "from there, 'crane workspace' shows where the loops close",
+    ):
+        super().__init__(f"at t = {time:.6g} s{description}")
+        self.time, self.q_a, self.default_remedy = time, np.array(q_a), default_remedy
+
+
+def explain_halt(
+    machine: Machine,
+    halt: IntegrationHaltError,
+    times: Array,
+    q_a: Array,
+    reference: Trajectory | None = None,
+    finer_step: float = 0.0,
+) -> SimulationError:
+    """A halt with its cause, as far as it can be told.
+
+    Args:
+        machine: The machine.
+        halt: What happened.
+        times: (N,) of the motion so far [s]; empty where it is not known.
+        q_a: (N, n) active coordinates then.
+        reference: The reference, if there is one.
+        finer_step: A step with which the motion goes on [s]; 0 where that has not been found.
+    """
+    if finer_step:
+        hint = f"; with a step of {finer_step:g} s it goes on: shorten the step"
+        return SimulationError(f"{halt}{hint}")
+    limit_text = _passed_limit_text(machine, halt, times, q_a, reference)
+    return SimulationError(f"{halt}{limit_text or halt.default_remedy}")
+
+
+def _passed_limit_text(
+    machine: Machine,
+    halt: IntegrationHaltError,
+    times: Array,
+    q_a: Array,
+    reference: Trajectory | None,
+) -> str:
+    """The active joint that is farthest beyond its limit, and since when; perhaps nothing."""
+    lower, upper = machine.lower, machine.upper
+    excess = np.maximum(lower - halt.q_a, halt.q_a - upper)
+    active = machine.closure.active
+    span = np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
+    i = int(np.argmax(excess / span))
+    slack = limit_tolerances(machine)[active[i]]
+    if not excess[i] > slack:
+        return ""
+    joint, unit, value = machine.active[i], machine.unit(machine.active[i]), halt.q_a[i]
+    limit = lower[i] if value < lower[i] else upper[i]
+    text = f"; '{joint}' is at {value:.6g} {unit}, beyond its limit {limit:.6g} {unit}"
+    if len(times):
+        outside = (q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)
+        inside = np.flatnonzero(~outside)
+        first = int(inside[-1]) + 1 if len(inside) else 0
+        passed_time = times[first] if first < len(times) else halt.time
+        text += f" since t = {passed_time:.4g} s"
+    has_end_stop = any(stop.joint == joint for stop in machine.end_stops)
+    remedy = "stiffen its end stop" if has_end_stop else "give it an end stop"
+    if reference is not None:
+        reference_value = float(reference.position(halt.time)[i])
+        if not lower[i] - slack <= reference_value <= upper[i] + slack:
+            remedy = (
+                f"keep its reference ({reference_value:.6g} {unit}) within the limits, or {remedy}"
+            )
+    return f"{text}: {remedy}"
+
+
+_EXTRAPOLATION_TIME = 1e-3  # of `Closure.pace`: how far a machine is thought on that stops
 
 StepProgress = Callable[[int], None] | None
 """What is told the number of finished steps."""
@@ -58,7 +146,7 @@ class PythonStepper:
                 tau, _ = self._controller_output(time, at, chart.user_velocities(at.q, at.v_a))
             self._set_circuit_friction(time, at, chart.user_velocities(at.q, at.v_a))
             forces = chart.chart_forces(at.q, tau)
-            forces += chart.external_forces(time, at.q, at.v_a, at.shear).generalized_forces
+            forces += chart.external_forces(time, at.q, at.v_a, at.contacts).generalized_forces
             at.v_a[:] = chart.stick_slip.find_modes(self._dynamics, at.q, at.v_a, forces)
         except ClosureError as error:
             raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
@@ -85,7 +173,7 @@ class PythonStepper:
         """
         rate, tau = self._state_rate(time, state)
         at = self.state_layout.view(state)
-        external_values = self._chart.external_forces(time, at.q, at.v_a, at.shear)
+        external_values = self._chart.external_forces(time, at.q, at.v_a, at.contacts)
         forces = self._chart.chart_forces(at.q, tau) + external_values.generalized_forces
         observation = self._dynamics.evaluate_closed("observation", at.q, at.v_a, forces)
         channels: Array = np.zeros(0)
@@ -97,7 +185,7 @@ class PythonStepper:
         if isinstance(self._control, ValveDrive):
             control = self._control
             v_a = self._chart.user_velocities(at.q, at.v_a)
-            inputs = control.inputs_at(time, self.user_coordinates(state), v_a, at.own)
+            inputs = control.inputs_at(time, self.user_coordinates(state), v_a, at.controller)
             channels = np.array(control.channel_values(inputs), dtype=np.float64)
         return rate, np.concatenate([tau, observation, external_values.outputs, a, channels])
 
@@ -157,7 +245,7 @@ class PythonStepper:
             v_a = chart.user_velocities(at.q, at.v_a)
             tau, controller_rate = self._controller_output(time, at, v_a)
             self._set_circuit_friction(time, at, v_a)
-            external_values = chart.external_forces(time, at.q, at.v_a, at.shear)
+            external_values = chart.external_forces(time, at.q, at.v_a, at.contacts)
             forces = chart.chart_forces(at.q, tau) + external_values.generalized_forces
             rates = self._dynamics.evaluate_closed("rates", at.q, at.v_a, forces)
         except ClosureError as error:
@@ -172,7 +260,9 @@ class PythonStepper:
         """Tell the dynamics what seals and brakes of a circuit add to friction."""
         control = self._control
         if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
-            inputs = control.inputs_at(time, state.q[self._chart.user_columns], v_a, state.own)
+            inputs = control.inputs_at(
+                time, state.q[self._chart.user_columns], v_a, state.controller
+            )
             self._dynamics.set_circuit_friction(
                 np.array(control.circuit_friction(inputs), dtype=np.float64)
             )
@@ -181,11 +271,11 @@ class PythonStepper:
         self, time: float, state: LayoutView, v_a: Array
     ) -> tuple[Array, Array]:
         """What the controller answers, (n,) and (k,)."""
-        tau, rate = self._control(time, state.q[self._chart.user_columns], v_a, state.own)
-        if np.shape(tau) != v_a.shape or np.shape(rate) != state.own.shape:
+        tau, rate = self._control(time, state.q[self._chart.user_columns], v_a, state.controller)
+        if np.shape(tau) != v_a.shape or np.shape(rate) != state.controller.shape:
             raise InputError(
                 f"{type(self._control).__name__} gives forces of the shape {np.shape(tau)} and "
-                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {state.own.shape}: "
+                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {state.controller.shape}: "
                 "one per active joint, one per state"
             )
         if self._chart.free_joints:

@@ -68,8 +68,9 @@ INTERPOLATION_WEIGHTS = np.array(
 STAGES = 3
 ComplexNumber = tuple[Scalar, Scalar]
 """A complex number."""
-# of rad, machine's size, per `Closure.characteristic_time`, by which derivatives are taken
-_DIFFERENCE_STEP = 1e-7
+_DIFFERENCE_STEP = (
+    1e-7  # of rad, machine's size, per `Closure.pace`, by which derivatives are taken
+)
 _MAX_NEWTON_ITERATIONS, _NEWTON_TOLERANCE = (
     8,
     1e-3,
@@ -177,7 +178,7 @@ class RadauStepper(ErrorControlledStepper):
             along += row
         for j in range(self._controller_state_count):
             row = [0.0] * size
-            row[self.state_layout.start_index("own") + j] = tape.load(0, start + 2 * n + j)
+            row[self.state_layout.start_index("controller") + j] = tape.load(0, start + 2 * n + j)
             along += row
         program.add_formula("directions", 1, along)
         tape = Tape()
@@ -222,7 +223,7 @@ class RadauStepper(ErrorControlledStepper):
             by = 1.0 / tape.load(4, start + nudge)
             return [
                 scale_vector(by, subtract_vectors(getattr(there, part), getattr(first, part)))
-                for part in ("q", "v_a", "own")
+                for part in ("q", "v_a", "controller")
             ]
 
         by_v = [slopes(1, j, j) for j in range(n)]
@@ -320,7 +321,7 @@ class RadauStepper(ErrorControlledStepper):
         here = turned([[view.q[i] for i in active] for view in views])
         wanted: list[Scalar] = []
         for view, rho in zip(views, here, strict=True):
-            wanted += add_vectors(list(view.own), matvec(parts["oq"], rho)) if k else []
+            wanted += add_vectors(list(view.controller), matvec(parts["oq"], rho)) if k else []
             wanted += add_vectors(matvec(parts["mass"], view.v_a), matvec(parts["vq"], rho))
         x = lu_solve(factors, wanted)
         m = n + k
@@ -337,7 +338,7 @@ class RadauStepper(ErrorControlledStepper):
             for view, one, other in zip(views, v_a, xi, strict=True)
         ]
         q = turned([list(row) for row in ways])
-        rest = turned([[*view.work, *view.lost] for view in views])
+        rest = turned([[*view.work, *view.dissipated] for view in views])
         return [[*a, *b, *c, *d] for a, b, c, d in zip(q, v_a, own, rest, strict=True)]
 
     def _load_factors(self, tape: Tape, argument: int, real_per_complex: int) -> Matrix:
@@ -511,7 +512,7 @@ class RadauStepper(ErrorControlledStepper):
                     r.tol,
                     jacobian,
                 )
-                r.set(jacobian_time, t)
+                r.assign(jacobian_time, t)
             r.call("real_factors", jacobian, step.length, real)
             r.call("complex_factors", jacobian, step.length, pair)
             r.store(ratio, 0, select(previous_length > 0.0, length / previous_length, 0.0))
@@ -535,21 +536,21 @@ class RadauStepper(ErrorControlledStepper):
                     r.tol,
                     iterate,
                 )
-                r.set(tries, tries + 1)
+                r.assign(tries, tries + 1)
                 last = r.new_variable(norm)
-                r.set(norm, iterate["norm"])
+                r.assign(norm, iterate["norm"])
                 with r.if_then(tries > 1):
-                    r.set(convergence_rate, norm / last)
+                    r.assign(convergence_rate, norm / last)
                     with r.if_then(
                         convergence_rate * norm
                         < (convergence_rate * -1.0 + 1.0) * _NEWTON_TOLERANCE
                     ):
-                        r.set(done, 1)
+                        r.assign(done, 1)
                     with r.if_then(~(convergence_rate < 1.0)):
-                        r.set(done, 0)
-                        r.set(tries, _MAX_NEWTON_ITERATIONS)
+                        r.assign(done, 0)
+                        r.assign(tries, _MAX_NEWTON_ITERATIONS)
                 with r.if_then(norm < 1e-3 * _NEWTON_TOLERANCE):
-                    r.set(done, 1)
+                    r.assign(done, 1)
                 with r.if_then((done > 0) | (tries >= _MAX_NEWTON_ITERATIONS)):
                     r.break_loop()
             Z = iterate.element_pointer("Z")
@@ -564,11 +565,11 @@ class RadauStepper(ErrorControlledStepper):
             with r.if_then(done < 1):
                 r.store(step.step_result.element_pointer("error"), 0, 2.0)
                 r.store(step.step_result.element_pointer("change"), 0, 0.25)
-                r.set(convergence_rate, 1.0)
-                r.set(jacobian_time, select(jacobian_time < t, -np.inf, jacobian_time))
+                r.assign(convergence_rate, 1.0)
+                r.assign(jacobian_time, select(jacobian_time < t, -np.inf, jacobian_time))
             with r.if_else():
                 r.copy(previous_stages, Z, STAGES * size)
-                r.set(previous_length, select(step.step_result["error"] <= 1.0, length, 0.0))
+                r.assign(previous_length, select(step.step_result["error"] <= 1.0, length, 0.0))
 
         def interpolate(t: RoutineValue, length: RoutineValue) -> None:
             r.call("dense", iterate.element_pointer("Z"), step.dense_output)

@@ -63,8 +63,7 @@ _FINAL_WEIGHTS, _EMBEDDED_WEIGHTS = (
 )
 
 ROSENBROCK_TOLERANCE = 1e-8  # error of a step, per size of the state
-# accuracy that matters [rad], [machine's size], that per `Closure.characteristic_time`, and of a
-# law's states
+# accuracy that matters [rad], [machine's size], that per `Closure.pace`, and of a law's states
 _COORDINATE_ACCURACY, _VELOCITY_ACCURACY, _CONTROLLER_ACCURACY = 1e-11, 1e-9, 1e-9
 _MAX_STEP_RATIO, _SAFETY_FACTOR = 6.0, 0.9  # change of the step's length from one to the next
 
@@ -147,7 +146,7 @@ class RosenbrockStepper(ErrorControlledStepper):
         after = add_vectors(state, weighted_sum(tape, 2, size, _FINAL_WEIGHTS))
         error_vector = weighted_sum(tape, 2, size, _FINAL_WEIGHTS - _EMBEDDED_WEIGHTS)
         checked_states, energies = (
-            self.state_layout.start_index("own") + self._stiff_state_count,
+            self.state_layout.start_index("controller") + self._stiff_state_count,
             self.state_layout.start_index("work"),
         )
         relative = tape.load(3, energies)
@@ -215,7 +214,7 @@ class RosenbrockStepper(ErrorControlledStepper):
         step_gamma = GAMMA * tape.load(5, 0)
         unknown = [
             x
-            for x in (*parts.own[:stiff_state_count], *parts.v_a)
+            for x in (*parts.controller[:stiff_state_count], *parts.v_a)
             if isinstance(x, SymbolicExpression)
         ]
         jacobian = differentiate([*own_rate, *machine.forces_without_gravity(tau)], unknown)
@@ -276,7 +275,7 @@ class RosenbrockStepper(ErrorControlledStepper):
             part = self.state_layout.view(right)
             pulls = matvec(there["by_q"], [part.q[column] for column in active])
             wanted = add_vectors(
-                [*part.own[:stiff_state_count], *matvec(there["mass"], part.v_a)], pulls
+                [*part.controller[:stiff_state_count], *matvec(there["mass"], part.v_a)], pulls
             )
             x = lu_solve(there["factors"], [*wanted, *matvec(there["rows"], part.v_a)])
             v_a = [
@@ -285,10 +284,12 @@ class RosenbrockStepper(ErrorControlledStepper):
                     there["free"][0], x[stiff_state_count : stiff_state_count + n], strict=True
                 )
             ]
-            own = [*x[:stiff_state_count], *part.own[stiff_state_count:]]
+            own = [*x[:stiff_state_count], *part.controller[stiff_state_count:]]
             q = add_vectors(part.q, matvec(there["ways"], v_a))
             program.add_formula(
-                f"solve{i}{suffix}", 4, [*q, *v_a, *part.shear, *own, *part.work, *part.lost]
+                f"solve{i}{suffix}",
+                4,
+                [*q, *v_a, *part.contacts, *own, *part.work, *part.dissipated],
             )
 
     def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:

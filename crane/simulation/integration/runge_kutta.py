@@ -1,5 +1,7 @@
 """Steps of the classical Runge-Kutta method in machine code."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from crane.closure.kinematics_formulas import largest_scaled_value
@@ -7,13 +9,14 @@ from crane.codegen import Program, Tape, max_abs, maximum
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
 from crane.control import TracedController
+from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_formulas import (
     MachineCodeStepper,
     exceeds_chart_limits,
+    reference_samples,
     wrap_rotations,
 )
-from crane.simulation.integration.step_blocks import run_in_blocks
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 
 
@@ -83,10 +86,10 @@ class RungeKuttaStepper(MachineCodeStepper):
             k1 = r.local_array("k1", program.formula_outputs("observe"))
             k2, k3, k4 = (r.local_array(f"k{i}", size) for i in (2, 3, 4))
             result = r.local_array("result", self.closure_code.formula_outputs("newton"))
-            machine, half = (r.geometry, r.numbers, r.control), r.h.at(1)
+            machine, half = (r.geometry, r.numbers, r.control), r.h.element_pointer(1)
             with r.loop(r.steps) as i:
                 first = r.refs.row_pointer(i, 2 * columns)
-                middle, last = first.at(columns), first.at(2 * columns)
+                middle, last = first.element_pointer(columns), first.element_pointer(2 * columns)
                 self.call_formula(r, "observe", *machine, first, r.state, k1)
                 if self.has_stick_slip:
                     with r.if_then(k1["margin"] < -EVENT_TOLERANCE):
@@ -94,7 +97,7 @@ class RungeKuttaStepper(MachineCodeStepper):
                         r.return_value(i)
                 row = r.out.row_pointer(i, size + seen)
                 r.copy(row, r.state, size)
-                r.copy(row.at(size), k1.element_pointer("seen"), seen)
+                r.copy(row.element_pointer(size), k1.element_pointer("seen"), seen)
                 r.call("blend", r.state, k1, half, following)
                 self.call_formula(r, "rate", *machine, middle, following, k2)
                 r.call("blend", r.state, k2, half, following)
@@ -161,3 +164,44 @@ class RungeKuttaStepper(MachineCodeStepper):
         # the others count only so far as that NaN and infinity anywhere show
         largest_move = h * maximum(share, max_abs(scale_vector(1e-30, mean)))
         program.add_formula("finish", 7, {"state": after, "move": [largest_move]})
+
+
+_BLOCK_STEPS = (
+    1000  # steps of a call: their rows stay in the cache until they are where they belong
+)
+
+
+def run_in_blocks(
+    call: Callable[[int, Array, Array], int],
+    machine: Machine,
+    control: TracedController,
+    times: Array,
+    step: float,
+    rows: Array,
+) -> int:
+    """Steps from the first of `times` on, one row before each.
+
+    Args:
+        call: (count, references (2 count + 1, c), out (count, .)) -> how many steps were done.
+        machine: What has references of forces from outside.
+        control: What has the others.
+        times: (steps,) [s].
+        step: [s].
+        rows: (steps, .) in any order, filled.
+
+    Returns:
+        How many steps were done; the one after them needs a closer look.
+    """
+    length = min(_BLOCK_STEPS, len(times))
+    half_step_times = times[::length, None] + 0.5 * step * np.arange(2 * length + 1)
+    block_starts = range(0, len(times), length)
+    instants = half_step_times.ravel()[: 2 * len(times) + len(block_starts)]
+    references = reference_samples(machine, control, instants)
+    out = np.empty((length, rows.shape[1]))
+    for i, first in enumerate(block_starts):
+        count = min(length, len(times) - first)
+        done = call(count, references[i * half_step_times.shape[1] :], out)
+        rows[first : first + done] = out[:done]
+        if done < count:
+            return first + done
+    return len(times)

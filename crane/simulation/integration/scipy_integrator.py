@@ -10,13 +10,11 @@ from crane.common.errors import ClosureError
 from crane.common.samples import Array
 from crane.control import Controller
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.integration_halt import IntegrationHaltError
-from crane.simulation.integration.python_stepper import StepProgress
-from crane.simulation.integration.stick_slip_integrator import StickSlipIntegrator
+from crane.simulation.integration.integrators import StickSlipIntegrator
+from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
 
-# of a passive joint in rad and shares of the machine's size per `Closure.characteristic_time`:
-# where the branch
+# of a passive joint in rad and shares of the machine's size per `Closure.pace`: where the branch
 # ends they grow beyond bounds
 _MAX_PASSIVE_VELOCITY = 300.0
 SCIPY_TOLERANCE = 1e-9  # error of a step, per size of the state

@@ -12,7 +12,7 @@ from crane.common.samples import Array
 from crane.control import ControllerInputs, ValveDrive, ValveSignals
 from crane.dynamics import Dynamics, JointForces
 from crane.dynamics.force_law_formulas import friction_sign
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.integration.machine_formulas import controller_settings
@@ -46,8 +46,8 @@ class LinearizedDrive:
             for joint, driven in zip(machine.active, machine.is_driven, strict=True)
             if driven
         }
-        self.seen: dict[str, str] = {}
-        self.own, self.u = np.zeros(0), np.zeros(len(self.input_units))
+        self.output_units: dict[str, str] = {}
+        self.initial_states, self.initial_inputs = np.zeros(0), np.zeros(len(self.input_units))
         self.scales, self._vapour_pressure, self._engine_droop = np.zeros(0), 0.0, 0.0
         self._valve_drive: ValveDrive | None = None
         self._input_matrix = np.eye(n)[:, machine.is_driven]
@@ -74,12 +74,12 @@ class LinearizedDrive:
                 for name in list(self.state_units)[first:last]
             }
             self.input_units = {f"voltage_{name}": "V" for name in circuit.spools}
-            self.seen = dict(control.channels) | {
+            self.output_units = dict(control.channels) | {
                 f"{joint}_force": FORCE_UNITS[machine.unit(joint)] for joint in circuit.joints
             }
             self._active_indices = [machine.active.index(joint) for joint in circuit.joints]
-            self.own = control.start_closed(dynamics, q)[: self._state_count]
-            self.u = control.references(np.zeros(1))[0]
+            self.initial_states = control.start_closed(dynamics, q)[: self._state_count]
+            self.initial_inputs = control.references(np.zeros(1))[0]
             self._program = self._build_program(machine)
 
     def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
@@ -117,7 +117,7 @@ class LinearizedDrive:
         assert self._valve_drive is not None
         hydraulics, names = self._valve_drive.circuit.hydraulics, list(self.state_units)
         supply, k = hydraulics.supply, len(names)
-        z = np.concatenate([self.own, self.u])
+        z = np.concatenate([self.initial_states, self.initial_inputs])
         directions: list[Array] = []
         bounds: list[tuple[float, float]] = []
 
@@ -141,12 +141,22 @@ class LinearizedDrive:
             if f"share_{name}" in names:
                 free(f"share_{name}", 0.5, 0.0, 1.0)
         for name in hydraulics.lines:
-            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            free(
+                f"pressure_{name}",
+                self.initial_states[names.index(f"pressure_{name}")],
+                0.0,
+                np.inf,
+            )
         for name in hydraulics.accumulators:
-            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            free(
+                f"pressure_{name}",
+                self.initial_states[names.index(f"pressure_{name}")],
+                0.0,
+                np.inf,
+            )
             if f"oil_{name}" in names:
                 at = names.index(f"oil_{name}")
-                free(f"oil_{name}", self.own[at], -np.inf, np.inf)
+                free(f"oil_{name}", self.initial_states[at], -np.inf, np.inf)
         if "engine" in names:
             free("engine", 1.0 + 0.5 * self._engine_droop, 1.0, 1.0 + self._engine_droop)
         for i, (joint, valve) in enumerate(hydraulics.valves.items()):

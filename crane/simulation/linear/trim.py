@@ -54,7 +54,7 @@ def find_trim(
         raise SimulationError(
             "the machine cannot be trimmed there: no pressures and signals keep these velocities"
         )
-    return drive.own, forces[machine.is_driven]
+    return drive.initial_states, forces[machine.is_driven]
 
 
 def _check_free_joints(
@@ -128,13 +128,13 @@ class _TrimEquations:
         self._equation_rows = np.concatenate(
             [np.arange(n), n + np.flatnonzero(spring | moving[:k])]
         )
-        self._variable_scales = np.concatenate([scales, np.ones(len(drive.u))])
+        self._variable_scales = np.concatenate([scales, np.ones(len(drive.initial_inputs))])
         # pressures of bars within tenths of a second are as much as such accelerations
         accelerations = closure.units[closure.active] / closure.characteristic_time**2
         self._equation_scales = np.concatenate([accelerations, scales / _TIME_SCALE])[
             self._equation_rows
         ]
-        self.start = np.concatenate([drive.own, drive.u])
+        self.start = np.concatenate([drive.initial_states, drive.initial_inputs])
 
     def state_rates(self, z: Array) -> Array:
         """(k,) of the states."""

@@ -22,9 +22,8 @@ import numpy as np
 
 from crane.closure.constraint_structure import Indices
 from crane.common.samples import Array
-from crane.simulation.sensitivity.forward_derivatives import ForwardDerivatives
+from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives, ReverseDerivatives
 from crane.simulation.sensitivity.rate_formulas import report_long_formulas
-from crane.simulation.sensitivity.reverse_derivatives import ReverseDerivatives
 from crane.simulation.sensitivity.simulated_motion import (
     MAX_REFINEMENTS,
     MotionNodes,
@@ -33,13 +32,14 @@ from crane.simulation.sensitivity.simulated_motion import (
     TransitionJump,
 )
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
-from crane.simulation.sensitivity.variational_equations import (
+from crane.simulation.sensitivity.variational_integration import (
     FOURTH_DIFFERENCE_WEIGHTS,
+    MIN_RELATIVE_CHANGE,
+    STEP_ACCURACY,
     TransposedPairMaps,
     interpolation_errors,
     transposed_pair_maps,
 )
-from crane.simulation.sensitivity.variational_integration import MIN_RELATIVE_CHANGE, STEP_ACCURACY
 
 
 class AdjointIntegrator:
@@ -257,7 +257,7 @@ class AdjointIntegrator:
     def _gradients_at_nodes(
         self, nodes: MotionNodes, node_indices: Indices, weights: Array
     ) -> Array:
-        """See `ReverseDerivatives.gradients`, at some of the nodes."""
+        """See `ReverseDerivatives.against`, at some of the nodes."""
         numbers = self._motion.constants_at(self._nominal_constants, nodes)
         numbers = numbers._replace(references=numbers.references[node_indices])
         return self._reverse_derivatives.gradients(
@@ -303,7 +303,7 @@ class AdjointIntegrator:
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:
-        """Adjoint before joints start or stop, from the adjoint after it."""
+        """Lambda before joints start or stop, from that behind; see `SimulatedMotion.leap`."""
         track, nodes = self._motion, self._motion.nodes_at_transition(jump.transition)
         by_state, leap = track.sensitivity_jump(
             self._forward_derivatives, self._nominal_constants, jump

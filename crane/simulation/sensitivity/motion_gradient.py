@@ -17,11 +17,11 @@ from crane.control import Controller, ValveCommand
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.machine import Machine
 from crane.recordings.recording import Recording
+from crane.simulation.recorded_run import read_simulation
 from crane.simulation.sensitivity.adjoint_integration import AdjointIntegrator
-from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
+from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
 from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
-from crane.simulation.simulated_readings import read_simulation
 from crane.simulation.simulation_run import Force, Progress
 
 Functional = Callable[[Array, Array], tuple[ArrayLike, ArrayLike]]

@@ -1,19 +1,21 @@
-"""How a simulated motion depends on numbers of the machine and on its start."""
+"""Sensitivities of a simulated motion by parameters of the machine."""
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import LayoutView
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.control import Controller, ValveCommand
+from crane.control import Controller, TracedController, ValveCommand, ValveDrive
 from crane.description.sensors import (
     FORCE_SUFFIX,
     FORCE_UNITS,
@@ -21,15 +23,83 @@ from crane.description.sensors import (
     VELOCITY_SUFFIX,
     VELOCITY_UNITS,
 )
+from crane.dynamics import Dynamics
+from crane.formats import load
 from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table
-from crane.simulation.sensitivity.parameter_directions import START_PREFIX
-from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
-from crane.simulation.sensitivity.simulation_constants import SimulationConstants
+from crane.simulation.recorded_run import record_run
+from crane.simulation.sensitivity.rate_formulas import observed_frames
+from crane.simulation.sensitivity.simulated_motion import SimulationProblem
+from crane.simulation.sensitivity.simulation_constants import (
+    START_PREFIX,
+    ParameterDirections,
+    SimulationConstants,
+)
 from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
-from crane.simulation.simulation_run import Force, Progress
+from crane.simulation.simulation_run import (
+    Force,
+    Progress,
+    count_steps,
+    initial_motion,
+    resolve_controller,
+)
+
+
+class SensitivityProblem(NamedTuple):
+    """What is simulated and observed, and what it depends on.
+
+    Attributes:
+        simulation: What is simulated.
+        outputs: Names of what is observed.
+        directions: What it depends on.
+    """
+
+    simulation: SimulationProblem
+    outputs: tuple[str, ...]
+    directions: ParameterDirections
+
+    @classmethod
+    def from_arguments(
+        cls,
+        machine: Machine | str | Path,
+        controller: Controller | ValveCommand | Force | None,
+        initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
+        duration: float | None,
+        step: float,
+        outputs: Sequence[str] | None,
+        method: str | None,
+        tolerance: float | None,
+    ) -> "SensitivityProblem":
+        """From what `sensitivities` takes; see there for arguments and errors."""
+        if not isinstance(machine, Machine):
+            machine = load(machine)
+        control = resolve_controller(controller, machine)
+        count = count_steps(control, duration, step)
+        start = initial_motion(machine, initial, control)
+        is_sampled = isinstance(control, ValveDrive) and control.period
+        if is_sampled or not isinstance(control, TracedController):
+            raise InputError(
+                "a controller in Python has no formulas, write it as a crane.control.Law"
+            )
+        dynamics = Dynamics(machine)
+        names = tuple(_default_outputs(machine) if outputs is None else outputs)
+        links = [link for link, _ in observed_frames(machine, names)]
+        motion = SimulationProblem(dynamics, control, start, count, step, method, tolerance)
+        return cls(motion, names, ParameterDirections(dynamics, control, start, links))
+
+    def record_motion(self, time: Array, parts: LayoutView) -> Recording:
+        """The motion, of its rows; see `integrate`."""
+        return record_run(
+            self.simulation.dynamics.machine, self.simulation.control, time, parts, ""
+        )
+
+
+def _default_outputs(machine: Machine) -> list[str]:
+    joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
+    return [*machine.active, *(f"pressure_{joint}_{side}" for joint in joints for side in "ab")]
+
 
 ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
 
@@ -156,7 +226,7 @@ def sensitivities(
         duration: See `simulate`.
         step: See `simulate`.
         parameters: Numbers of the machine as `crane.description.parameters` lists them, such as
-            "payload.mass" or "oil.bulk_modulus", and `start.JOINT`, `start.JOINT_velocity`
+            "payload.mass" or "oil.bulk_modulus", and `start.JOINT_MARKER`, `start.JOINT_velocity`
             of active joints.
         outputs: Names of joints, `JOINT_velocity`, `JOINT_force` of active ones, channels of the
             circuit such as `pressure_JOINT_a`, "kinetic", "potential", `tip_x`,

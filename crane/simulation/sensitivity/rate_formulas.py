@@ -24,7 +24,7 @@ from crane.control import TracedController, ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.external_forces import reference_counts as counts_of
 from crane.machine import Machine
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import (
     MachineFormulas,
     controller_formula_key,
@@ -32,7 +32,6 @@ from crane.simulation.integration.machine_formulas import (
     reference_count,
     trace_machine,
 )  # fmt: skip
-from crane.simulation.integration.state_layouts import state_layout
 from crane.simulation.sensitivity.simulation_constants import FRAME_SIZE, SimulationConstants
 
 _AT_REST_SUFFIX = "_rest"
@@ -157,8 +156,8 @@ class RateProgram:
         """The rate (m,) of the minimal state.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see
-                `Dynamics.set_stick_slip_modes`) and one row of references.
+            constants: The simulation's numbers, with what sticks (see `Dynamics.set_modes`) and
+                one row of references.
             state: As it is integrated.
             has_joints_at_rest: Whether some joint is at rest.
         """

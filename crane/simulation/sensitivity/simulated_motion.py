@@ -11,10 +11,9 @@ from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state_layouts import row_layout
+from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.stick_slip_modes import StickSlipTransition
-from crane.simulation.sensitivity.forward_derivatives import ForwardDerivatives
+from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 from crane.simulation.simulation_run import integrate, integrator_factory
 
@@ -180,7 +179,7 @@ class SimulatedMotion:
         time, parts, self.notes = run.time, run.rows, run.notes
         self.time, self.controller_state_count, self._step, self.has_joints_at_rest = (
             time,
-            parts.own.shape[1],
+            parts.controller.shape[1],
             step,
             False,
         )
@@ -200,7 +199,9 @@ class SimulatedMotion:
         self.switches: list[StickSlipTransition] = self.chart.stick_slip.transitions
         self.chart.stick_slip.transitions = None  # parts that are simulated anew are no news
         seen, closure = self.chart.user_columns, machine.closure
-        minimal = np.hstack([parts.q[:, seen], parts.v_a, parts.own[:, : self.stiff_state_count]])
+        minimal = np.hstack(
+            [parts.q[:, seen], parts.v_a, parts.controller[:, : self.stiff_state_count]]
+        )
         units = np.concatenate(
             [closure.units[seen], closure.units[seen] / closure.characteristic_time]
         )

@@ -1,17 +1,19 @@
-"""How the rate of a simulated machine changes with its state and with all its numbers.
+"""Forward and reverse derivatives of the state rate of a simulated machine.
 
-The state of a motion is s = (q_A, v_A, o): active coordinates, their velocities, the states o of
-the controller or circuit that act back; c are all numbers of the simulation, see
-`SimulationConstants`. The rate r(s, c) = s' is differentiated operation by operation along a
-direction (ds, dc), through the closed loops phi(q, c) = 0:
+The state of a motion is s = (q_A, v_A, o): active coordinates, their velocities, and the states o
+of the controller or circuit on which the rates depend; c are all constants of the simulation, see
+`SimulationConstants`. The rate r(s, c) = s' is differentiated operation by operation, along a
+direction (ds, dc) or backwards for weighted sums, through the closed loops phi(q, c) = 0:
 
     J_P dq_P = -(J_A dq_A + dphi/dc dc).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from crane.codegen import Program, Scalar
-from crane.codegen.differentiation import directional_derivative
+from crane.codegen import Program, Scalar, SymbolicExpression
+from crane.codegen.differentiation import directional_derivative, weighted_gradient
 from crane.common.samples import Array
 from crane.simulation.sensitivity.rate_formulas import (
     DifferentiatedFormulas,
@@ -34,8 +36,8 @@ class ForwardDerivatives(RateProgram):
         """Derivatives at states of one motion.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see
-                `Dynamics.set_stick_slip_modes`) and references (N, c) of the states.
+            constants: The simulation's numbers, with what sticks (see `Dynamics.set_modes`) and
+                references (N, c) of the states.
             states: (N, .) as they are integrated.
             directions: p directions of the numbers, each part with a leading axis.
             has_joints_at_rest: Whether some joint is at rest.
@@ -118,7 +120,7 @@ class ForwardDerivatives(RateProgram):
         )
         seeds |= dict(
             zip(
-                map(operation_index, parts.own[: self._stiff_state_count]),
+                map(operation_index, parts.controller[: self._stiff_state_count]),
                 state_changes,
                 strict=True,
             )
@@ -140,19 +142,105 @@ class ForwardDerivatives(RateProgram):
             with r.loop(r.count) as i, r.loop(r.directions) as j:
                 at_both = i * r.directions + j
                 r.call(
-                    "tangent" + suffix,
+                    "tangent" + suffix, r.geometry, r.numbers, r.settings, r.frames,
+                    r.references.row_pointer(i, columns), r.states.row_pointer(i, self._state_layout.size),
+                    r.geometries.row_pointer(j, sizes[0]), r.numbered.row_pointer(j, sizes[1]),
+                    r.settled.row_pointer(j, sizes[2]), r.framed.row_pointer(j, sizes[3]),
+                    r.referred.row_pointer(at_both, columns), r.inputs.row_pointer(j, m),
+                    r.out.row_pointer(at_both, width),
+                )  # fmt: skip
+            r.return_value(r.count)
+
+
+class ReverseDerivatives(RateProgram):
+    """Gradients of a machine's rate and outputs by all numbers that move; see `Rate`."""
+
+    def gradients(
+        self,
+        constants: SimulationConstants,
+        states: Array,
+        weights: Array,
+        has_joints_at_rest: bool,
+    ) -> Array:
+        """Gradients at states of one motion.
+
+        Args:
+            constants: See `ForwardDerivatives.along`.
+            states: (N, .) as they are integrated.
+            weights: (N, K, m + k + 1) of rate, outputs and margin.
+            has_joints_at_rest: Whether some joint is at rest.
+
+        Returns:
+            (N, K, l) by the numbers that move: of geometry, numbers, settings, frames.
+        """
+        count, sum_count, _ = weights.shape
+        out = np.empty((count, sum_count, self._program.formula_outputs("cotangent").size))
+        self._call(
+            "against",
+            has_joints_at_rest,
+            count,
+            sum_count,
+            constants.geometry,
+            constants.dynamics_constants,
+            constants.settings,
+            constants.frames,
+            np.ascontiguousarray(constants.references),
+            np.ascontiguousarray(states),
+            np.ascontiguousarray(weights),
+            out,
+        )
+        return out
+
+    def _add_derivatives(
+        self, program: Program, suffix: str, formulas: DifferentiatedFormulas
+    ) -> None:
+        """cotangent(geometry, numbers, settings, frames, references, state, weights)."""
+        tape, sweep, moved = (
+            formulas.tape,
+            formulas.machine.dynamics_formulas,
+            self._variable_constants,
+        )
+        is_variable = moved.geometry, moved.dynamics_constants, moved.settings, moved.frames
+        numbers = [
+            tape.load(array, i)
+            for array, mask in enumerate(is_variable)
+            for i in np.flatnonzero(mask).tolist()
+        ]
+        weights = tape.load_vector(6, 0, len(formulas.all_values))
+        for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
+            weights[k] = factor * weights[k]
+        loops = sweep.loops
+        passive = [
+            SymbolicExpression(tape, operation_index(sweep.q[i - 1])) for i in loops.passive_joints
+        ]
+        found = weighted_gradient(formulas.all_values, weights, [*numbers, *passive])
+        out: Sequence[Scalar] = found[: len(numbers)]
+        if loops.rows:
+            # q_P moves linearly with how far loops are opened, by numbers that cancel out
+            gaps = [tape.load(7, r) for r in range(len(loops.rows))]
+            active_rows: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
+            moving, _ = loops.solve_passive(active_rows, [[-1.0 * x] for x in gaps])
+            passive_directions = [moving[i][0] for i in loops.passive_joints]
+            z = weighted_gradient(passive_directions, found[len(numbers) :], gaps)
+            by_loops = weighted_gradient([row.phi for row in loops.rows], z, numbers)
+            out = [one + other for one, other in zip(out, by_loops, strict=True)]
+        program.add_formula("cotangent" + suffix, 7, out)
+        names = (
+            "geometry", "numbers", "settings", "frames", "references", "states", "weights", "out",
+        )  # fmt: skip
+        counts, width = ("count", "several"), len(out)
+        with program.add_routine("against" + suffix, counts=counts, arrays=names) as r:
+            with r.loop(r.count) as i, r.loop(r.several) as j:
+                at_both = i * r.several + j
+                r.call(
+                    "cotangent" + suffix,
                     r.geometry,
                     r.numbers,
                     r.settings,
                     r.frames,
-                    r.references.row_pointer(i, columns),
+                    r.references.row_pointer(i, self._reference_columns),
                     r.states.row_pointer(i, self._state_layout.size),
-                    r.geometries.row_pointer(j, sizes[0]),
-                    r.numbered.row_pointer(j, sizes[1]),
-                    r.settled.row_pointer(j, sizes[2]),
-                    r.framed.row_pointer(j, sizes[3]),
-                    r.referred.row_pointer(at_both, columns),
-                    r.inputs.row_pointer(j, m),
+                    r.weights.row_pointer(at_both, len(weights)),
                     r.out.row_pointer(at_both, width),
                 )
             r.return_value(r.count)
