@@ -131,7 +131,9 @@ class StepLoop:
             self._reference,
         )
         if stepper.external_callback is not None:
-            self._callback_inputs = routine.local_array("asked", program.formula_outputs("asked"))
+            self._callback_inputs = routine.local_array(
+                "callback_inputs", program.formula_outputs("callback_inputs")
+            )
             self._callback_results = self._reference.element_pointer(stepper.controller_columns)
         self._output_interval, self._reference_spacing, self._end_time = (
             routine.new_variable(routine.h[0]),
@@ -148,7 +150,7 @@ class StepLoop:
             routine.new_variable(0),
             routine.new_variable(self._time),
         )
-        self._event_distance_count = program.formula_outputs("rate").parts["edges"]
+        self._event_distance_count = program.formula_outputs("rate").parts["event_distances"]
 
     def write(
         self, make_step: Callable[[Program, StepCode], tuple[StepWriter, StepWriter]]
@@ -187,11 +189,11 @@ class StepLoop:
         )
         self._trial_count = r.new_variable(0)
         self._event_signs, self._signed_distance = (
-            r.local_array("sides", max(1, self._event_distance_count)),
-            r.local_array("crossed", 1),
+            r.local_array("event_signs", max(1, self._event_distance_count)),
+            r.local_array("least_distance", 1),
         )
         if self._event_distance_count:
-            r.call("sides", self._start_rate, self._event_signs)
+            r.call("event_signs", self._start_rate, self._event_signs)
         if self._has_stick_slip:
             r.assign(self._margin_before, self._start_rate["margin"])
             with r.if_then(self._margin_before < -EVENT_TOLERANCE):
@@ -302,7 +304,7 @@ class StepLoop:
             with r.if_then(least_margin < -EVENT_TOLERANCE):
                 r.assign(event, 1)
         if self._event_distance_count:
-            r.call("crossed", self._end_rate, self._event_signs, self._signed_distance)
+            r.call("least_distance", self._end_rate, self._event_signs, self._signed_distance)
             with r.if_then(self._signed_distance[0] < least_margin):
                 r.assign(least_margin, self._signed_distance[0])
         if self._has_stick_slip or self._event_distance_count:
@@ -382,7 +384,7 @@ class StepLoop:
             r.assign(time_to_event, time_to_event - step.length)
             r.assign(self._margin_before, least_margin)
         if self._event_distance_count:
-            r.call("sides", self._end_rate, self._event_signs)
+            r.call("event_signs", self._end_rate, self._event_signs)
             with r.if_then(least_margin < -EVENT_TOLERANCE):  # an edge, behind which it goes on
                 r.assign(time_to_event, 0.0)
                 r.assign(self._trial_count, 0)
@@ -423,8 +425,8 @@ class StepLoop:
         if self._columns:
             self._interpolate_references(time)
         if self._stepper.external_callback is not None:
-            r.call("asked", *self._machine_arguments, arrays[0], self._callback_inputs)
-            r.call("answer", self._callback_inputs, self._callback_results)
+            r.call("callback_inputs", *self._machine_arguments, arrays[0], self._callback_inputs)
+            r.call("callback", self._callback_inputs, self._callback_results)
         self._stepper.call_formula(r, formula, *self._machine_arguments, *arrays)
 
     def _write_return(self) -> None:
