@@ -1,7 +1,5 @@
 """Compiled steps of ROS34PW2, a Rosenbrock method of order 3 for stiff machines and circuits."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from crane.codegen import Program, RoutineValue, Scalar, SymbolicExpression, Tape, max_abs, maximum
@@ -30,7 +28,6 @@ from crane.simulation.integration.error_controlled_stepper import (
     characteristic_energy,
     weighted_sum,
 )
-from crane.simulation.integration.machine_formulas import MachineFormulas
 from crane.simulation.integration.step_loop import StepCode, StepWriter
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
@@ -186,10 +183,15 @@ class RosenbrockStepper(ErrorControlledStepper):
         """
         tape = Tape()
         machine, _, tau, controller_rate = self._trace_controlled_machine(tape)
-        step_gamma, k = GAMMA * tape.load(5, 0), self._stiff_state_count
         dynamics, n = machine.dynamics_formulas, len(machine.state_parts.v_a)
+        mass, k = dynamics.mass_matrix, self._stiff_state_count
+        step_gamma = GAMMA * tape.load(5, 0)
         rates = list(controller_rate[:k])
-        matrix = self._system_matrix(machine, rates, tau, step_gamma)
+        parts = machine.state_parts
+        variables = [
+            x for x in (*parts.controller[:k], *parts.v_a) if isinstance(x, SymbolicExpression)
+        ]
+        jacobian = differentiate([*rates, *machine.forces_without_gravity(tau)], variables)
         # the balances of oil and strokes stay exact where J has derivatives of neither
         by_coordinates: Matrix = [[0.0] * n for _ in range(k + n)]
         coordinate_directions: Matrix = [[0.0] * n for _ in machine.state_parts.q]
@@ -200,15 +202,13 @@ class RosenbrockStepper(ErrorControlledStepper):
             coordinate_directions = [
                 scale_vector(step_gamma, row) for row in dynamics.rate_jacobian
             ]
-        for row, derivatives in zip(matrix, by_coordinates, strict=True):
-            for j, derivative in enumerate(derivatives):
-                row[k + j] = row[k + j] - step_gamma * derivative
+        matrix = self._system_matrix(jacobian, by_coordinates, mass, step_gamma)
         constraints = dynamics.stick_slip_rows if with_joints_at_rest else []
         constraint_rows = [scale_vector(held, row) for held, row in constraints]
         _append_constraints(matrix, k, constraint_rows, [held - 1.0 for held, _ in constraints])
         tables: dict[str, Matrix] = {
             "factors": lu_factorize(matrix),
-            "mass": dynamics.mass_matrix,
+            "mass": mass,
             "rows": constraint_rows,
             "by_coordinates": by_coordinates,
             "directions": coordinate_directions,
@@ -220,26 +220,18 @@ class RosenbrockStepper(ErrorControlledStepper):
             self._add_stage_solver(program, i, suffix, tables)
 
     def _system_matrix(
-        self,
-        machine: MachineFormulas,
-        controller_rate: list[Scalar],
-        tau: Sequence[Scalar],
-        step_gamma: Scalar,
+        self, jacobian: Matrix, by_coordinates: Matrix, mass: Matrix, step_gamma: Scalar
     ) -> Matrix:
         """1 - h gamma J of stiff controller states and velocities, the latter times M_A."""
-        k, parts = self._stiff_state_count, machine.state_parts
-        variables = [
-            x for x in (*parts.controller[:k], *parts.v_a) if isinstance(x, SymbolicExpression)
-        ]
-        jacobian = differentiate(
-            [*controller_rate, *machine.forces_without_gravity(tau)], variables
-        )
+        k = self._stiff_state_count
         matrix = [scale_vector(-1.0 * step_gamma, row) for row in jacobian]
         for i in range(k):
             matrix[i][i] = matrix[i][i] + 1.0
-        for row, mass_row in zip(matrix[k:], machine.dynamics_formulas.mass_matrix, strict=True):
-            for j, mass in enumerate(mass_row):
-                row[k + j] = row[k + j] + mass
+        for row, mass_row in zip(matrix[k:], mass, strict=True):
+            row[k:] = add_vectors(row[k:], mass_row)
+        for row, derivatives in zip(matrix, by_coordinates, strict=True):
+            for j, derivative in enumerate(derivatives):
+                row[k + j] = row[k + j] - step_gamma * derivative
         return matrix
 
     def _add_stage_solver(
@@ -259,9 +251,9 @@ class RosenbrockStepper(ErrorControlledStepper):
             name: load_matrix(table, tape, 2, starts.start_index(name))
             for name, table in tables.items()
         }
+        by_coordinates = matvec(loaded["by_coordinates"], [part.q[i] for i in active])
         right_side = add_vectors(
-            [*part.controller[:k], *matvec(loaded["mass"], part.v_a)],
-            matvec(loaded["by_coordinates"], [part.q[column] for column in active]),
+            [*part.controller[:k], *matvec(loaded["mass"], part.v_a)], by_coordinates
         )
         solution = lu_solve(loaded["factors"], [*right_side, *matvec(loaded["rows"], part.v_a)])
         free = loaded["free"][0]
