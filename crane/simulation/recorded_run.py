@@ -38,15 +38,15 @@ ChannelColumn = tuple[str, Array, str]  # name, values, unit
 
 
 class IntegrationResult(NamedTuple):
-    """What an integration leaves.
+    """Result of an integration.
 
     Attributes:
-        time: (N,) [s].
+        time: (N,) instants [s].
         array: (N, .) rows at these instants.
-        layout: Of a row, see `crane.simulation.integration.row_layout`.
-        notes: What is to be said of the motion.
-        start_text: How it starts, where that is not what the file says.
-        stop: What ended it before its time, if something did.
+        layout: Layout of a row, see `row_layout`.
+        notes: Notes for the user about the motion.
+        start_text: Note about an initial state that differs from home.
+        stop: The exception that stopped it, or None.
     """
 
     time: Array
@@ -58,19 +58,19 @@ class IntegrationResult(NamedTuple):
 
     @property
     def rows(self) -> LayoutView:
-        """The rows part by part, (N, .) each."""
+        """The parts of the rows, (N, .) each."""
         return self.layout.view(self.array)
 
     def first_instants(self, count: int, stop: BaseException | None) -> "IntegrationResult":
-        """The first instants of it, and what ended it there."""
+        """The first instants of the result, with the exception that stopped it there."""
         return self._replace(time=self.time[:count], array=self.array[:count], stop=stop)
 
 
 class InterruptedRun(KeyboardInterrupt):
-    """A run that was interrupted.
+    """Interrupt of a run.
 
     Attributes:
-        recording: What there is of it, whose `stop_with_recording` says where it ended.
+        recording: The recording up to the interrupt; its `stopped` says where it ended.
     """
 
     def __init__(self, recording: Recording):
@@ -81,14 +81,14 @@ class InterruptedRun(KeyboardInterrupt):
 def stop_with_recording(
     machine: Machine, control: Controller, run: IntegrationResult, task: str, end_time: float
 ) -> BaseException:
-    """What stopped a run, which has what there is of it as its `recording`.
+    """The exception that stopped a run, with the recording up to there as its `recording`.
 
     Args:
         machine: The machine.
-        control: What drove it.
-        run: What was integrated.
-        task: Name to put into the recording.
-        end_time: When it should have ended [s].
+        control: Its controller.
+        run: Result of the integration.
+        task: Name of the motion.
+        end_time: Intended end [s].
     """
     assert (stop := run.stop) is not None
     if not len(run.time):
@@ -96,7 +96,7 @@ def stop_with_recording(
     largest_values = scratch_arrays.compute_in_blocks(
         lambda part: np.abs(run.array[part]).max(axis=1, keepdims=True), len(run.time)
     )
-    # what has exploded is no motion
+    # values that diverged are removed
     run = run.first_instants(int(np.append(largest_values < MAX_QUANTITY, False).argmin()), stop)
     if not len(run.time):
         return stop
@@ -106,7 +106,7 @@ def stop_with_recording(
         text = f"at t = {run.time[-1]:g} s of {end_time:g} s: interrupted"
     elif not text.startswith("at t = "):
         text = f"at t = {run.time[-1]:g} s: {text}"
-    with suppress(CraneError):  # channels that cannot be computed there hide no error
+    with suppress(CraneError):  # an error of the channels must not hide that of the run
         recording = record_run(machine, control, run.time, run.rows, task, text)
         if interrupted:
             return InterruptedRun(recording)
@@ -123,16 +123,16 @@ def record_run(
     stopped: str = "",
     start_text: str = "",
 ) -> Recording:
-    """What the integration left as a recording.
+    """The recording of a run.
 
     Args:
         machine: The machine.
-        control: What drove it.
-        time: (N,) [s].
-        rows: See `integrate`.
-        task: Name to put into it.
-        stopped: When and why it ended before its time.
-        start_text: How it starts, where that is not what the file says.
+        control: Its controller.
+        time: (N,) instants [s].
+        rows: Parts of the rows, see `integrate`.
+        task: Name of the motion.
+        stopped: When and why the run was stopped.
+        start_text: Note about an initial state that differs from home.
     """
     active = machine.closure.active
     q_a = scratch_arrays.compute_in_blocks(lambda part: rows.q[part][:, active], len(time))
@@ -164,7 +164,7 @@ def record_run(
 def _channel_columns(
     machine: Machine, control: Controller, time: Array, rows: LayoutView
 ) -> Iterator[ChannelColumn]:
-    """What is recorded beside the active joints."""
+    """Channels besides the active joints."""
     for column in machine.closure.passive:
         joint = machine.joints[column]
         yield joint, rows.q[:, column], machine.unit(joint)
@@ -202,7 +202,7 @@ def _channel_columns(
         integrals = rows.controller[:, -len(BALANCE_UNITS) :]
         units = [*control.channels, *BALANCE_UNITS.items()]
         delayed_signals: dict[str, Array] = {}
-        if control.delays.any():  # a log has what was commanded, not what arrives
+        if control.delays.any():  # a log has the commanded signals
             spools = (f"voltage_{name}" for name in control.circuit.spools)
             commanded = scratch_arrays.compute_in_blocks(
                 lambda part: control.commanded_signals(time[part]), len(time)
@@ -213,7 +213,7 @@ def _channel_columns(
 
 
 def _external_force_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
-    """What acts from outside, in the world's axes at the origins of frames, and its work."""
+    """External forces in the axes of the world at the origins of their frames, and their work."""
     columns = iter(rows.external.T)
     for k, force in enumerate(machine.external_forces):
         for part, values in zip(WRENCH_COMPONENTS, columns, strict=False):
@@ -225,7 +225,7 @@ def _external_force_columns(machine: Machine, rows: LayoutView) -> Iterator[Chan
 
 
 def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
-    """What supports carry, and how far it is from tipping."""
+    """Forces of supports, and stability margins."""
     if not has_supports(machine):
         return
     stability = TippingStability(machine)
@@ -258,7 +258,7 @@ def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelCo
 def _reference_columns(
     machine: Machine, reference: Trajectory, time: Array
 ) -> Iterator[ChannelColumn]:
-    """What a reference asks of the joints, and of the tip where it was given there."""
+    """The reference of the joints, and of the tip if it is a trajectory of the tip."""
     q = scratch_arrays.compute_in_blocks(lambda part: reference.position(time[part]), len(time))
     v = scratch_arrays.compute_in_blocks(lambda part: reference.velocity(time[part]), len(time))
     for i in np.flatnonzero(machine.is_driven):
@@ -289,19 +289,19 @@ _INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)
 
 
 def simulated_columns(machine: Machine, table: Table) -> list[str]:
-    """Columns of a measured table that a simulation of its inputs says something of.
+    """Columns of a measured table that a simulation of its inputs has.
 
     Joints, their velocities and forces, pressures, channels of the circuit, the tip, and
     inclinations of links, `inclination_LINK` and `inclination_LINK_velocity`.
 
     Raises:
-        RecordingError: A column is in a unit of something else, or of no link.
+        RecordingError: A column has the unit of another quantity, or belongs to no link.
     """
     return _select_columns(machine, table, simulated_units(machine))
 
 
 def recorded_columns(machine: Machine, table: Table, recording: Recording) -> list[str]:
-    """Columns of a measured table that a recording of a simulation says something of.
+    """Columns of a measured table that the recording of a simulation has.
 
     Raises:
         RecordingError: As for `simulated_columns`.
@@ -314,7 +314,7 @@ def recorded_columns(machine: Machine, table: Table, recording: Recording) -> li
 
 
 def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
-    """Columns, but for the inputs, that have one of these units by name, or are inclinations."""
+    """Columns, without the inputs, whose names have units, or that are inclinations."""
     columns = []
     for name, unit in table.units.items():
         if name == TIME:
@@ -336,7 +336,7 @@ def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) ->
 
 
 def simulated_units(machine: Machine) -> dict[str, str]:
-    """By column, of what a simulation on valves records."""
+    """Units of the columns that a simulation with valves records, by name."""
     joint_units = {joint: machine.unit(joint) for joint in machine.joints}
     units = dict(joint_units)
     units |= {
@@ -353,11 +353,11 @@ def simulated_units(machine: Machine) -> dict[str, str]:
 
 
 def read_simulation(machine: Machine, recording: Recording, names: list[str]) -> Array:
-    """What ideal sensors say (N, k) at the recorded instants, SI units.
+    """Readings (N, k) of ideal sensors at the recorded instants, SI units.
 
     Args:
-        machine: The machine that was simulated.
-        recording: Its simulation.
+        machine: The simulated machine.
+        recording: Its recording.
         names: See `simulated_columns`.
     """
     columns = recording.columns()

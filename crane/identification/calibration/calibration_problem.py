@@ -34,7 +34,8 @@ from crane.simulation.sensitivity.simulation_constants import (
     simulation_constants_of,
 )
 from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
-from crane.simulation.simulation_run import initial_motion, simulate
+from crane.simulation.simulation_run import simulate
+from crane.simulation.simulation_setup import initial_motion
 
 DERIVATIVE_TOLERANCE = 1e-4  # error of derivatives
 _DIFFERENCE_STEP = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation

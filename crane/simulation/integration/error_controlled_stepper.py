@@ -28,11 +28,8 @@ from crane.control import TracedController, ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.machine_formulas import (
-    MachineCodeStepper,
-    reference_samples,
-    wrap_rotations,
-)
+from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
+from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
 from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepCode, StepLoop, StepWriter
 
 MAX_REFERENCE_SPACING = 5e-4  # largest interval between the samples of references [s]

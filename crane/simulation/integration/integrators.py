@@ -1,4 +1,4 @@
-"""Integrators in one chart that locate stick-slip transitions: fixed steps, error-controlled steps."""
+"""Integrators in one chart that locate stick-slip transitions, with fixed or controlled steps."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,42 +23,42 @@ from crane.simulation.integration.python_stepper import (
 from crane.simulation.integration.runge_kutta import RungeKuttaStepper
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
 
-_TIME_TOLERANCE = 1e-9  # of a recorded step, between instants that are one
-_MAX_TRANSITIONS = 2000  # starts and stops within a recorded step
+_TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
+_MAX_TRANSITIONS = 2000  # stick-slip transitions within an output interval
 
 
 class CompiledMethod(Protocol):
-    """A method in machine code."""
+    """A compiled method."""
 
     bounds: Array
 
     @property
     def event(self) -> float:
-        """Not 0 where a joint has started or stopped."""
+        """Not 0 at a stick-slip transition."""
 
     def adopt_modes(self) -> None:
-        """See `Stepper.adopt_modes`."""
+        """See `MachineCodeStepper.adopt_modes`."""
 
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
-        """See `Stepper.observe`."""
+        """See `MachineCodeStepper.observe`."""
 
 
 class StickSlipIntegrator:
-    """What all methods have in common.
+    """Base class of integrators in one chart.
 
-    A method that makes steps of a given length writes `_make_step`.
+    A method with steps of a given size implements `_make_step`.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
-        compiled_method: The method in machine code, if it is.
+        controller_state_count: Number of states of the controller.
+        compiled_method: The compiled method, or None.
 
     Attributes:
-        python_stepper: Observes, and makes a step with care, or says why it cannot.
-        done: Number of instants that have their row, after a run or where it halted.
-        next_instant: The first instant that is not before the state.
-        offset: When the state is, after the next instant without a row [s].
+        python_stepper: Observes states, makes single steps, and explains halts.
+        done: Number of instants with a row, after a run or a halt.
+        next_instant: Index of the first instant that is not before the state.
+        offset: Time of the state after the next instant without a row [s].
     """
 
     _max_transitions = _MAX_TRANSITIONS
@@ -77,45 +77,45 @@ class StickSlipIntegrator:
         self._dynamics, self._transition_count, self._count_start_time = chart.dynamics, 0, -np.inf
 
     def set_chart_limits(self, limits: Array) -> None:
-        """Look for other coordinates from there on, see `Chart.limits`."""
+        """Set the limits of the chart, see `Chart.chart_limits`."""
         self.python_stepper.chart_limits = limits
         if self._compiled_method is not None:
             self._compiled_method.bounds[3:5] = limits
 
     def final_row(self, time: float, state: Array) -> Array:
-        """A row without a step after it.
+        """The row of a state.
 
         Args:
             time: [s].
-            state: There.
+            state: State at this time.
 
         Raises:
-            HaltedError: It cannot be observed.
+            IntegrationHaltError: The outputs cannot be computed.
         """
         return np.concatenate([state, self._outputs_and_margin(time, state)[0]])
 
     def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
-        """A step [s] with which the motion goes on where it halted; 0 if none was found.
+        """A step size [s] with which the motion continues after a halt; 0 if none is found.
 
-        Arguments as those of the run that halted. A method that chooses its steps has found none.
+        The arguments are those of the run. Methods with step-size control return 0.
         """
         return 0.0
 
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """The state after one step of some length, and the margin there.
+        """State and margin after one step of a given size.
 
-        Not needed of methods that find events within their steps.
+        Methods that locate events within their steps do not need it.
         """
         raise NotImplementedError
 
     def _outputs_and_margin(self, time: float, state: Array) -> tuple[Array, float]:
-        """What is seen at a state, and its margin."""
+        """Outputs and margin at a state."""
         if self._compiled_method is not None:
             return self._compiled_method.observe(time, state)
         return self.python_stepper.observe(time, state)[1], self.python_stepper.transition_margin
 
     def _prepare_modes(self, time: float, state: Array) -> None:
-        """Know what sticks before the first step, and in a chart that was left meanwhile."""
+        """Set the stick-slip modes before the first step, and after a change of the chart."""
         if not self._stick_slip.columns:
             return
         if not self._stick_slip.has_modes:
@@ -126,7 +126,7 @@ class StickSlipIntegrator:
             self._compiled_method.adopt_modes()
 
     def _find_modes(self, time: float, state: Array) -> None:
-        """Find anew what sticks at a state."""
+        """Determine the stick-slip modes at a state."""
         if self._compiled_method is None:
             self.python_stepper.find_modes(time, state)
         else:
@@ -140,19 +140,19 @@ class StickSlipIntegrator:
     def _advance_to_transition(
         self, time: float, state: Array, length: float, step: float
     ) -> float:
-        """Go on to where a joint starts or stops within a step.
+        """Integrate to a stick-slip transition within a step.
 
         Args:
             time: [s].
-            state: Then; replaced by that at the event, with the joints' new modes.
-            length: Of the step [s].
-            step: Between instants [s].
+            state: State at this time, replaced by that at the transition with the new modes.
+            length: Step size [s].
+            step: Output interval [s].
 
         Returns:
-            How much later that is [s].
+            Time from the start of the step to the transition [s].
 
         Raises:
-            HaltedError: Joints start and stop without end.
+            IntegrationHaltError: There are too many transitions.
         """
         self._count_transition(time, state, step)
         margin_before, (_, margin_behind) = (
@@ -172,10 +172,10 @@ class StickSlipIntegrator:
         return time_offset
 
     def _count_transition(self, time: float, state: Array, step: float) -> None:
-        """Count a joint that starts or stops.
+        """Count a stick-slip transition.
 
         Raises:
-            HaltedError: Joints start and stop without end.
+            IntegrationHaltError: There are too many within an output interval.
         """
         if time > self._count_start_time + step:
             self._count_start_time, self._transition_count = time, 0
@@ -190,16 +190,16 @@ class StickSlipIntegrator:
             )
 
     def _rounded_offset(self, offset: float, step: float) -> float:
-        """An offset, zero if it is next to nothing."""
+        """An offset, 0 if it is within rounding errors."""
         return offset if offset < -_TIME_TOLERANCE * step else 0.0
 
     def _advance_to_instant(self, now: float, state: Array, step: float) -> None:
-        """Go on to the next instant, or to where a joint starts or stops before it.
+        """Integrate to the next instant, or to a stick-slip transition before it.
 
         Args:
             now: The next instant [s].
-            state: At `offset`.
-            step: Between instants [s].
+            state: State at `offset`.
+            step: Output interval [s].
         """
         after, margin = self._make_step(now + self.offset, state, -self.offset)
         if margin >= -EVENT_TOLERANCE:
@@ -209,24 +209,20 @@ class StickSlipIntegrator:
         self.offset = self._rounded_offset(self.offset + time_offset, step)
 
 
-_STEPS_PER_REPORT = 5000  # steps between reports of progress
-_STEPS_BEFORE_HALT, _STEPS_AFTER_HALT = (
-    40,
-    20,
-)  # steps before and after a halt that are done anew with finer ones
-_REFINEMENT_FACTORS = (2, 8)  # how much finer
-_MAX_TRANSITIONS_IN_FINER_STEP = (
-    100  # starts and stops within a finer step: one that needs more is no remedy
-)
+_STEPS_PER_REPORT = 5000  # between reports of progress
+# steps before and after a halt that are repeated with finer steps
+_STEPS_BEFORE_HALT, _STEPS_AFTER_HALT = 40, 20
+_REFINEMENT_FACTORS = (2, 8)  # of finer steps
+_MAX_TRANSITIONS_IN_FINER_STEP = 100  # a step size with more transitions is no remedy
 
 
 class FixedStepIntegrator(StickSlipIntegrator):
-    """Runge-Kutta steps in machine code, with care where that stops.
+    """Fixed steps of the classical Runge-Kutta method, compiled where possible.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
+        controller_state_count: Number of states of the controller.
     """
 
     def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
@@ -245,20 +241,20 @@ class FixedStepIntegrator(StickSlipIntegrator):
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
     ) -> int:
-        """Integrate from each of the times to the next, while the coordinates are good ones.
+        """Integrate from each of the times to the next, while the chart is regular.
 
         Args:
             times: (N,) instants [s].
-            state: At the first, or `offset` after it; replaced by that where it has got to.
-            step: [s].
-            rows: (N, .) in any order, filled with state and observations at the instants.
+            state: State at the first instant or `offset` after it, replaced by the final one.
+            step: Interval of the instants [s].
+            rows: (N, row size) in any memory order, filled with state and outputs.
             progress: Called with the number of finished steps.
 
         Returns:
-            How many steps were made.
+            Number of steps.
 
         Raises:
-            HaltedError: A step cannot be taken.
+            IntegrationHaltError: A step fails.
         """
         first = times[0] if len(times) else self._next_time
         self.done = self.next_instant = 0
@@ -276,10 +272,10 @@ class FixedStepIntegrator(StickSlipIntegrator):
         return self.next_instant
 
     def _make_steps(self, times: Array, state: Array, step: float, rows: Array) -> bool:
-        """Make some steps, or go on to where a joint starts or stops.
+        """Make some steps, or integrate to a stick-slip transition.
 
         Returns:
-            False where other coordinates are better.
+            False where another chart is needed.
         """
         size, i = len(state), self.done
         chunk_end, event = min(i + _STEPS_PER_REPORT, len(times)), 0.0
@@ -287,7 +283,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
             i += self._compiled_stepper.run(times[i:chunk_end], state, step, rows[i:])
             self.done = self.next_instant = i
             event = self._compiled_stepper.event
-        if i < chunk_end and not event:  # it stopped, or there is none
+        if i < chunk_end and not event:  # the compiled stepper stopped, or there is none
             if self.python_stepper.exceeds_chart_limits(state):
                 return False
             rate, seen = self.python_stepper.observe(times[i], state)
@@ -298,7 +294,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
                 self.done = i + 1
                 state[:] = self.python_stepper.advance(times[i], state, rate, step)
                 i = self.next_instant = i + 1
-        if not event and i == len(times) and self._stick_slip.columns:  # nobody looks behind it
+        if not event and i == len(times) and self._stick_slip.columns:  # no step follows
             event = step * (
                 self._outputs_and_margin(times[-1] + step, state)[1] < -EVENT_TOLERANCE
             )
@@ -351,21 +347,20 @@ class FixedStepIntegrator(StickSlipIntegrator):
         return 0.0
 
 
-_INSTANTS_PER_REPORT = 1000  # instants between reports of progress
-_TIME_TOLERANCE = 1e-9  # of a step, between times that are one
+_INSTANTS_PER_REPORT = 1000  # between reports of progress
 
 
 class ErrorControlledIntegrator(StickSlipIntegrator):
-    """A `ErrorControlledStepper`, with a program of the valves where there is one.
+    """Compiled method with step-size control, with a sampled valve command where there is one.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
-        stepper_factory: The method.
+        controller_state_count: Number of states of the controller.
+        stepper_factory: Creates the compiled method.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: The formulas are too long to be compiled.
     """
 
     def __init__(
@@ -388,8 +383,8 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         """See `FixedStepIntegrator.run`.
 
         Raises:
-            InputError: The valves' program has a period that is no whole number of steps.
-            HaltedError: The machine cannot go on.
+            InputError: The period of the valve command is no whole number of steps.
+            IntegrationHaltError: A step fails.
         """
         period = self._period_in_steps(step)
         first = times[0] if len(times) else self._next_time
@@ -411,7 +406,7 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
             self._next_time = first + step * self.done
             if self._stepper.event:
                 self._count_transition(self._next_time + self.offset, state, step)
-                # what refers to time is asked behind a jump, as steps that begin there do
+                # references are those after a jump, as for steps that start there
                 self._find_modes(
                     self._next_time
                     + self.offset
@@ -428,7 +423,7 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         return self.done
 
     def _period_in_steps(self, step: float) -> int:
-        """Steps in a period of the valves' program, 0 without one."""
+        """Number of steps in a period of the sampled valve command; 0 without one."""
         if self._sampled_drive is None:
             return 0
         period_time = self._sampled_drive.period
@@ -436,13 +431,12 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         if abs(period * step - period_time) > _TIME_TOLERANCE * period_time:
             raise InputError(
                 f"the period {period_time:g} s of the valves' program is no whole number of "
-                f"steps of "
-                f"{step:g} s, change one"
+                f"steps of {step:g} s, change one"
             )
         return period
 
     def _update_command(self, time: float, state: Array) -> None:
-        """Let a program look at the machine, which may ask where no posture is."""
+        """Sample the valve command."""
         at = self.python_stepper.state_layout.view(state)
         assert self._sampled_drive is not None
         try:

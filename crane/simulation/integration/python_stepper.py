@@ -15,18 +15,18 @@ from crane.simulation.integration.charts import Chart, state_layout
 
 
 class IntegrationHaltError(SimulationError):
-    """A step that cannot be taken.
+    """A halt: the integration cannot continue.
 
     Args:
-        time: When [s].
-        q_a: (n,) active coordinates there.
-        description: What happened, to be read after the time.
-        default_remedy: What to do where no limit was passed and no shorter step helps.
+        time: Time of the halt [s].
+        q_a: (n,) active coordinates of the user.
+        description: The cause, a continuation of the message after the time.
+        default_remedy: Remedy if no joint passed a limit and no shorter step helps.
 
     Attributes:
-        time: See above.
-        q_a: See above.
-        default_remedy: See above.
+        time: Time of the halt [s].
+        q_a: (n,) active coordinates of the user.
+        default_remedy: See the arguments.
     """
 
     def __init__(
@@ -49,15 +49,15 @@ def explain_halt(
     reference: Trajectory | None = None,
     finer_step: float = 0.0,
 ) -> SimulationError:
-    """A halt with its cause, as far as it can be told.
+    """Error of a run that halted, with the probable cause and a remedy.
 
     Args:
         machine: The machine.
-        halt: What happened.
-        times: (N,) of the motion so far [s]; empty where it is not known.
-        q_a: (N, n) active coordinates then.
-        reference: The reference, if there is one.
-        finer_step: A step with which the motion goes on [s]; 0 where that has not been found.
+        halt: The halt.
+        times: (N,) instants of the motion up to the halt [s]; may be empty.
+        q_a: (N, n) active coordinates at these instants.
+        reference: The reference trajectory, or None.
+        finer_step: A step size with which the motion continues [s]; 0 if unknown.
     """
     if finer_step:
         hint = f"; with a step of {finer_step:g} s it goes on: shorten the step"
@@ -73,7 +73,7 @@ def _passed_limit_text(
     q_a: Array,
     reference: Trajectory | None,
 ) -> str:
-    """The active joint that is farthest beyond its limit, and since when; perhaps nothing."""
+    """Text about the active joint farthest beyond its limit; empty if none is."""
     lower, upper = machine.lower, machine.upper
     excess = np.maximum(lower - halt.q_a, halt.q_a - upper)
     active = machine.closure.active
@@ -102,23 +102,23 @@ def _passed_limit_text(
     return f"{text}: {remedy}"
 
 
-_EXTRAPOLATION_TIME = 1e-3  # of `Closure.pace`: how far a machine is thought on that stops
+_EXTRAPOLATION_TIME = 1e-3  # extrapolation of a halted motion [characteristic times]
 
 StepProgress = Callable[[int], None] | None
-"""What is told the number of finished steps."""
+"""Called with the number of finished steps."""
 
 
 class PythonStepper:
-    """One step at a time, for any controller and on any backend of `Dynamics`.
+    """Single steps in Python, for any controller and any backend of `Dynamics`.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
+        controller_state_count: Number of states of the controller.
 
     Attributes:
-        state_layout: Parts of the state.
-        chart_limits: Where other coordinates are looked for, see `Chart.chart_limits`.
+        state_layout: Layout of the state.
+        chart_limits: See `Chart.chart_limits`.
         transition_margin: See `StickSlipAccelerations.transition_margin`, at the state whose rate
             was computed last.
     """
@@ -129,15 +129,15 @@ class PythonStepper:
         self.chart_limits, self.transition_margin = chart.chart_limits, 1.0
 
     def find_modes(self, time: float, state: Array, outputs: Array | None = None) -> None:
-        """Find which joints stick at a state, whose velocities are made those of rest.
+        """Determine the stick-slip modes at a state; sets the velocities of joints at rest to 0.
 
         Args:
             time: [s].
-            state: Then.
-            outputs: What is observed there, if that is known.
+            state: State at this time.
+            outputs: Its outputs, if they are known.
 
         Raises:
-            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
         """
         at, chart = self.state_layout.view(state), self._chart
         try:
@@ -152,7 +152,7 @@ class PythonStepper:
             raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
 
     def exceeds_chart_limits(self, state: Array) -> bool:
-        """Whether a state is beyond the limits."""
+        """Whether a state is outside of the limits of the chart."""
         closure, q = self._chart.machine.closure, self.state_layout.view(state).q
         if self._chart.largest_gamma_entry(q) > self.chart_limits[0]:
             return True
@@ -162,14 +162,14 @@ class PythonStepper:
         )
 
     def user_coordinates(self, state: Array) -> Array:
-        """(n,) coordinates of the user's."""
+        """(n,) active coordinates of the user."""
         return self.state_layout.view(state).q[self._chart.user_columns]
 
     def observe(self, time: float, state: Array) -> tuple[Array, Array]:
-        """Rate of the state, and [tau, friction, kinetic, potential, its channels].
+        """Rate of the state, and outputs (see `output_layout`).
 
         Raises:
-            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
         """
         rate, tau = self._state_rate(time, state)
         at = self.state_layout.view(state)
@@ -190,10 +190,16 @@ class PythonStepper:
         return rate, np.concatenate([tau, observation, external_values.outputs, a, channels])
 
     def advance(self, time: float, state: Array, start_rate: Array, step: float) -> Array:
-        """The state one step later, its rate at the start given.
+        """The state after one step of the classical Runge-Kutta method.
+
+        Args:
+            time: [s].
+            state: State at this time.
+            start_rate: Its rate.
+            step: Step size [s].
 
         Raises:
-            HaltedError: The motion explodes, or the loops cannot be closed any more.
+            IntegrationHaltError: The motion diverges, or the loops do not close.
         """
         rate_sum = rate = start_rate
         units = self._dynamics.machine.closure.units
@@ -222,7 +228,7 @@ class PythonStepper:
         return after
 
     def halt_error(self, time: float, state: Array) -> IntegrationHaltError:
-        """Why the machine cannot go on, whatever the step."""
+        """The halt of a machine that cannot continue with any step size."""
         at, closure = self.state_layout.view(state), self._chart.machine.closure
         try:
             closure.solve(
@@ -257,7 +263,7 @@ class PythonStepper:
         ), tau
 
     def _set_circuit_friction(self, time: float, state: LayoutView, v_a: Array) -> None:
-        """Tell the dynamics what seals and brakes of a circuit add to friction."""
+        """Set the circuit friction of the dynamics."""
         control = self._control
         if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
             inputs = control.inputs_at(
@@ -270,13 +276,13 @@ class PythonStepper:
     def _controller_output(
         self, time: float, state: LayoutView, v_a: Array
     ) -> tuple[Array, Array]:
-        """What the controller answers, (n,) and (k,)."""
+        """Forces (n,) and state rates (k,) of the controller."""
         tau, rate = self._control(time, state.q[self._chart.user_columns], v_a, state.controller)
         if np.shape(tau) != v_a.shape or np.shape(rate) != state.controller.shape:
             raise InputError(
                 f"{type(self._control).__name__} gives forces of the shape {np.shape(tau)} and "
-                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {state.controller.shape}: "
-                "one per active joint, one per state"
+                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and "
+                f"{state.controller.shape}: one per active joint, one per state"
             )
         if self._chart.free_joints:
             self._chart.check_free_joints(np.asarray(tau).tolist(), f" at t = {time:g} s")

@@ -9,12 +9,11 @@ from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.machine_formulas import (
+from crane.simulation.integration.machine_code_stepper import (
     MachineCodeStepper,
     exceeds_chart_limits,
-    reference_samples,
-    wrap_rotations,
 )
+from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 
 _BLOCK_STEPS = 1000  # steps of a call, whose rows stay in the cache until they are copied

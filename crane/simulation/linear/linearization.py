@@ -22,13 +22,13 @@ from crane.simulation.linear.linear_drive import LinearizedDrive
 from crane.simulation.linear.linear_model import LinearModel
 from crane.simulation.linear.trim import find_trim
 
-_DIFFERENCE_STEP = 2e-4  # of the machine's units of strokes and angles: nine digits are left
+_DIFFERENCE_STEP = 2e-4  # in coordinate units: nine digits remain
 
 
 class LinearizedExternalForces:
-    """A machine's external forces along its active joints, as they are at time 0.
+    """External forces of a machine along its active joints at time 0.
 
-    Those that remember something (`ExternalForce.states`) are left out, with a warning.
+    Forces with states (`ExternalForce.state_count`) are left out, with a warning.
 
     Args:
         machine: The machine.
@@ -63,17 +63,17 @@ class LinearizedExternalForces:
         )
 
     def jacobian(self, q_a: Array, v_a: Array) -> Array:
-        """Its derivatives (n, 2 n) by q_A and v_A, by differences of fourth order."""
+        """Derivatives (n, 2 n) by q_A and v_A, by differences of fourth order."""
         n, x = len(q_a), np.concatenate([q_a, v_a])
         derivatives = np.zeros((n, 2 * n))
         for i, step in enumerate(self._steps if self._has_forces else ()):
             displacement = step * np.eye(2 * n)[i]
 
-            def away(steps: int, way: Array = displacement) -> Array:
-                there = x + steps * way
-                return self.active_forces(there[:n], there[n:])
+            def force(steps: int, displacement: Array = displacement) -> Array:
+                displaced = x + steps * displacement
+                return self.active_forces(displaced[:n], displaced[n:])
 
-            derivatives[:, i] = (8 * (away(1) - away(-1)) - (away(2) - away(-2))) / (12 * step)
+            derivatives[:, i] = (8 * (force(1) - force(-1)) - (force(2) - force(-2))) / (12 * step)
         return derivatives
 
 
@@ -86,22 +86,22 @@ def linearize(
     outputs: Sequence[str] | None = None,
     pressures: Mapping[str, tuple[float, float]] | None = None,
 ) -> LinearModel:
-    """A machine in small motion about an operating point: x' = A x + B u, y = C x + D u.
+    """Linear model of a machine about an operating point: x' = A x + B u, y = C x + D u.
 
-    The operating point is trimmed: forces, or pressures and valve signals, are those at which the
-    velocities stay what they are. Matrices are exact derivatives through the closed loops
-    (`Dynamics.derivatives`), the circuit's by its formulas; those of forces from outside, which
+    The operating point is trimmed: forces, or pressures and valve signals, keep the velocities
+    constant. Matrices are exact derivatives through the closed loops
+    (`Dynamics.derivatives`), the circuit's by its formulas; those of external forces, which
     act as at time 0, by differences. Friction that sticks is that of small
     motions which have begun: at rest its viscous part alone, in motion the side that it is on.
     What the circuit only counts, such as the oil drawn, is no state.
 
     Args:
-        machine: The machine, or what `crane.load` takes.
+        machine: The machine, or an argument of `crane.load`.
         operating_point: Active coordinates [m], [rad], by joint or (n,); home for those that are
             not named.
         velocity: Their velocities [m/s], [rad/s], likewise; at rest if not given.
         drive: "valves" or "forces"; valves if not given where the machine has any.
-        outputs: Names of joints, `JOINT_velocity` of active ones, `tip_x`, `JOINT_force`, and
+        outputs: Names of outputs: joints, `JOINT_velocity` of active ones, `tip_x`, `JOINT_force`, and
             channels of the circuit such as `pressure_JOINT_a`; if not given, the active joints,
             the tip, and with valves the chambers' pressures.
         pressures: Of the chambers A and B [Pa] by joint, of which that of the loaded side is

@@ -22,7 +22,8 @@ from crane.simulation.sensitivity.adjoint_integration import AdjointIntegrator
 from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
 from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
-from crane.simulation.simulation_run import Force, Progress
+from crane.simulation.simulation_run import Progress
+from crane.simulation.simulation_setup import Force
 
 Functional = Callable[[Array, Array], tuple[ArrayLike, ArrayLike]]
 """Times (N + 1,), outputs (N + 1, k) -> J, dJ/dy (N + 1, k); of several, with an axis first."""

@@ -38,9 +38,9 @@ from crane.simulation.sensitivity.simulation_constants import (
     SimulationConstants,
 )
 from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
-from crane.simulation.simulation_run import (
+from crane.simulation.simulation_run import Progress
+from crane.simulation.simulation_setup import (
     Force,
-    Progress,
     count_steps,
     initial_motion,
     resolve_controller,

@@ -22,10 +22,11 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
-from crane.dynamics.external_forces import reference_counts as counts_of
+from crane.dynamics.external_forces import reference_counts
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import (
+    AT_REST_SUFFIX,
     MachineFormulas,
     controller_formula_key,
     machine_program,
@@ -33,8 +34,6 @@ from crane.simulation.integration.machine_formulas import (
     trace_machine,
 )  # fmt: skip
 from crane.simulation.sensitivity.simulation_constants import FRAME_SIZE, SimulationConstants
-
-_AT_REST_SUFFIX = "_rest"
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class RateProgram:
         outputs: What is observed.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: The formulas are too long to be compiled.
         InputError: An output that is not there.
     """
 
@@ -106,7 +105,7 @@ class RateProgram:
         )
         self._controller_columns = reference_count(control)
         self._reference_columns = self._controller_columns + sum(
-            counts_of(machine.external_forces)
+            reference_counts(machine.external_forces)
         )
         self._frames = observed_frames(machine, outputs)
         self._folded_constants = (
@@ -163,7 +162,7 @@ class RateProgram:
         """
         out = np.empty(self.state_size)
         self._program.call(
-            "rate" + _AT_REST_SUFFIX * has_joints_at_rest,
+            "rate" + AT_REST_SUFFIX * has_joints_at_rest,
             constants.geometry,
             constants.dynamics_constants,
             constants.settings,
@@ -175,7 +174,7 @@ class RateProgram:
         return out
 
     def _call(self, routine: str, has_joints_at_rest: bool, *arguments: "int | Array") -> None:
-        self._program.call(routine + _AT_REST_SUFFIX * has_joints_at_rest, *arguments)
+        self._program.call(routine + AT_REST_SUFFIX * has_joints_at_rest, *arguments)
 
     def _add_derivatives(
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
@@ -183,7 +182,7 @@ class RateProgram:
         raise NotImplementedError
 
     def _build(self, program: Program) -> None:
-        for added, rest in (("", False), (_AT_REST_SUFFIX, True)):
+        for added, rest in (("", False), (AT_REST_SUFFIX, True)):
             if rest and not self._chart.stick_slip.columns:
                 continue
             rated = self._trace_formulas(rest)

@@ -128,9 +128,9 @@ class SimulatedMotion:
         progress: See `simulate`.
 
     Attributes:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
+        controller_state_count: Number of states of the controller.
         stiff_state_count: Number of those that act back, the first.
         time: (2 N + 1,) of instants and the middles between them [s].
         rows: (2 N + 1, .) there, see `integrate`.

@@ -104,7 +104,7 @@ def simulation_constants_of(
 
 
 START_PREFIX = "start."
-_DIFFERENCE_STEP = 1e-4  # rad, machine's size, per `Closure.pace`, of starts
+_DIFFERENCE_STEP = 1e-4  # rad, machine's size, per `Closure.characteristic_time`, of starts
 _CENTRAL_DIFFERENCE_WEIGHTS = (
     (1, 8.0 / 12.0),
     (-1, -8.0 / 12.0),
