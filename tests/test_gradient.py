@@ -140,7 +140,7 @@ def both(machine, controller, initial, duration, by, outputs, accuracy):
     )  # fmt: skip
     assert not stacked.references.any()
     parts = np.einsum("Kik,ikp->Kip", weights, forward)
-    return back, parts.sum(1), np.abs(parts).max(axis=1), len(track.switches)
+    return back, parts.sum(1), np.abs(parts).max(axis=1), len(track.transitions)
 
 
 @pytest.mark.slow

@@ -41,8 +41,8 @@ def casadi_function(
 
         d f / d q_A = (df/dq) gamma,    q' = gamma v_A,
 
-    except for a floating base, whose q has a rotation vector. `casadi.rootfinder` computes q_P from
-    q_A by `loops`.
+    except for a floating base, whose q has a rotation vector. `casadi.rootfinder` computes q_P
+    from q_A by `loops`.
 
     | quantity | arguments | result |
     |---|---|---|

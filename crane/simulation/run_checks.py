@@ -226,8 +226,8 @@ def find_stop_energy_gain(
 def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step: float) -> str:
     """Warning about smoothed friction that chatters; empty without any.
 
-    Where a fixed step is too long for the smoothing, friction changes its sign from stage to stage:
-    the dissipation of the step differs from that by its power at both ends.
+    Where a fixed step is too long for the smoothing, friction changes its sign between stages: the
+    dissipation of the step differs from that by its power at both ends.
     """
     laws = machine.friction.items()
     smoothings = {

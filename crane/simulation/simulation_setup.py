@@ -35,7 +35,9 @@ _MAX_FALL_PER_ITERATION = 2e-3  # largest displacement of an iteration [characte
 _MAX_ITERATIONS, _POLISHING_ITERATIONS = 300, 5
 _RANK_TOLERANCE = 1e-6  # share of the largest stiffness below which a direction is singular
 _DIFFERENCE_STEP = 1e-7  # [rad], [characteristic lengths]
-_MAX_DISTANCE_FROM_HOME = 0.1  # [rad], [characteristic lengths]; beyond it a machine is meant to fall
+_MAX_DISTANCE_FROM_HOME = (
+    0.1  # [rad], [characteristic lengths]; beyond it a machine is meant to fall
+)
 
 Force = Callable[[float, Array, Array], Array]
 """(t, q_a, v_a) -> tau_a."""
@@ -210,7 +212,7 @@ def equilibrium_on_contacts(dynamics: Dynamics, q_a: Array) -> tuple[Array, str]
 class StaticEquilibrium:
     """Static equilibrium of the free coordinates that move contacts.
 
-With r the unbalanced generalized forces at rest, K = dr/dq and M the mass matrix,
+    With r the unbalanced generalized forces at rest, K = dr/dq and M the mass matrix,
 
         (K + lambda M) dq = -r
 

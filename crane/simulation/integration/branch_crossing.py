@@ -1,9 +1,9 @@
 """Extrapolation of a motion across a configuration in which branches of motion cross.
 
 Where links become collinear (a folded parallelogram, a slider crank of equal lengths) the loop
-equations lose rank: several branches of motion cross, and no chart is regular. The motion is smooth
-along its own branch, so state and outputs are polynomials of time: their rates at instants before
-the crossing, and then also behind it, are integrated across it.
+equations lose rank: several branches of motion cross, and no chart is regular. The motion is
+smooth along its own branch, so state and outputs are polynomials of time: their rates at instants
+before the crossing, and then also behind it, are integrated across it.
 """
 
 from collections.abc import Callable

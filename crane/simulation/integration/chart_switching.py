@@ -362,7 +362,7 @@ class ChartSwitchingIntegrator:
         return chart_and_integrator
 
     def _orientation_at(self, q: Array) -> float:
-        """Sign of det C at a closed configuration (nq,), which changes at dead centres of the user."""
+        """Sign of det C at a closed configuration (nq,); it changes at dead centres."""
         return (
             1.0
             if self._chart.has_user_coordinates
@@ -398,7 +398,7 @@ class ChartSwitchingIntegrator:
 
     @property
     def _uses_inverse_dynamics(self) -> bool:
-        """Whether the controller uses inverse dynamics or gravity, in the coordinates of the user."""
+        """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
         control, call_count = self._control, 0
         if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
             return False

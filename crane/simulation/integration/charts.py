@@ -224,7 +224,7 @@ class Chart:
         return None
 
     def chart_with_columns(self, q: Array, columns: Indices) -> "Chart | None":
-        """The chart of some coordinates at a closed configuration (nq,); None if it is singular."""
+        """The chart of some coordinates at a configuration (nq,); None if it is singular."""
         names = tuple(self.machine.joints[i] for i in columns)
         try:
             machine = self.machine.with_home_configuration(q, names)

@@ -179,7 +179,7 @@ class ScipyIntegrator(StickSlipIntegrator):
         state: Array,
         rows: Array,
     ) -> None:
-        """Fill the rows of the instants up to a time [s], and set the state to that at the last."""
+        """Fill the rows of the instants up to a time [s]; sets the state to that at the last."""
         for k in range(self.done, len(instants)):
             time = instants[k]
             if time > end_time:

@@ -20,7 +20,7 @@ _SECANT_TRIALS = 8  # trials before bisection
 _END_SHARE = 1.0 - 2.0**-41  # share of the remaining time from which a step ends at its goal
 
 FormulaCaller = Callable[..., None]
-"""Writes the call of a formula by its name, at a time relative to `run`, with a state and arrays."""
+"""Writes the call of a formula by name, at a time relative to `run`, with state and arrays."""
 
 
 StepWriter = Callable[[RoutineValue, RoutineValue], None]

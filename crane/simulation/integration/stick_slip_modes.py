@@ -229,7 +229,7 @@ def _bounded_least_squares(matrix: Array, right_side: Array) -> Array:
 def _independent_columns(columns: Array) -> tuple[Indices, int]:
     """Indices of independent columns, and the rank.
 
-    Columns are compared with their own norm: a breakaway force may be small, as of a released brake.
+    Columns are compared with their own norm: a breakaway force may be small.
     """
     count = columns.shape[1]
     column_norms = np.linalg.norm(columns, axis=0)

@@ -83,7 +83,7 @@ class LinearizedDrive:
             self._program = self._build_program(machine)
 
     def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
-        """(k + m,) whether states and signals belong to moving joints, or to no joint if shared."""
+        """(k + m,) whether states and signals belong to moving joints, or to none if shared."""
         assert self._valve_drive is not None
         joints = self._valve_drive.circuit.joints
         moving = {x for x, i in zip(joints, self._active_indices, strict=True) if v_a[i]}
@@ -111,8 +111,8 @@ class LinearizedDrive:
         """States and signals z with valves open by a share of their stroke.
 
         Returns:
-            z (k + m,); its derivatives (k + m, r) by pressures and openings; lower and upper bounds
-            (r,) of these, which keep valves open and pumps within their droop.
+            z (k + m,); its derivatives (k + m, r) by pressures and openings; lower and upper
+            bounds (r,) of these, which keep valves open and pumps within their droop.
         """
         assert self._valve_drive is not None
         hydraulics, names = self._valve_drive.circuit.hydraulics, list(self.state_units)

@@ -101,9 +101,9 @@ def linearize(
             not named.
         velocity: Their velocities [m/s], [rad/s], likewise; at rest if not given.
         drive: "valves" or "forces"; valves if not given where the machine has any.
-        outputs: Names of outputs: joints, `JOINT_velocity` of active ones, `tip_x`, `JOINT_force`, and
-            channels of the circuit such as `pressure_JOINT_a`; if not given, the active joints,
-            the tip, and with valves the chambers' pressures.
+        outputs: Names of outputs: joints, `JOINT_velocity` of active ones, `tip_x`,
+            `JOINT_force`, and channels of the circuit such as `pressure_JOINT_a`; if not given,
+            the active joints, the tip, and with valves the pressures of the chambers.
         pressures: Of the chambers A and B [Pa] by joint, of which that of the loaded side is
             changed to what holds the machine; if not given, the other side is at the tank's
             pressure, where its valve would begin to let oil in: the model is that of the valve

@@ -48,12 +48,12 @@ from crane.simulation.simulation_setup import (
 
 
 class SensitivityProblem(NamedTuple):
-    """What is simulated and observed, and what it depends on.
+    """A simulation with its outputs and parameters.
 
     Attributes:
-        simulation: What is simulated.
-        outputs: Names of what is observed.
-        directions: What it depends on.
+        simulation: The simulation.
+        outputs: Names of the outputs.
+        directions: Constants and their derivatives by parameters.
     """
 
     simulation: SimulationProblem
@@ -72,7 +72,7 @@ class SensitivityProblem(NamedTuple):
         method: str | None,
         tolerance: float | None,
     ) -> "SensitivityProblem":
-        """From what `sensitivities` takes; see there for arguments and errors."""
+        """The problem from the arguments of `sensitivities`; see there."""
         if not isinstance(machine, Machine):
             machine = load(machine)
         control = resolve_controller(controller, machine)
@@ -90,7 +90,7 @@ class SensitivityProblem(NamedTuple):
         return cls(motion, names, ParameterDirections(dynamics, control, start, links))
 
     def record_motion(self, time: Array, parts: LayoutView) -> Recording:
-        """The motion, of its rows; see `integrate`."""
+        """The recording of the motion, from its rows; see `integrate`."""
         return record_run(
             self.simulation.dynamics.machine, self.simulation.control, time, parts, ""
         )
@@ -106,7 +106,7 @@ ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivities(OneLineRepr):
-    """A motion, and its derivatives by numbers.
+    """A motion and its derivatives by parameters.
 
     Attributes:
         recording: The motion.
@@ -123,11 +123,11 @@ class Sensitivities(OneLineRepr):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Of what, by what."""
+        """Outputs and parameters."""
         return f"Sensitivities of {', '.join(self.outputs)} by {', '.join(self.parameters)}"
 
     def derivative(self, output: str, parameter: str) -> Array:
-        """(N,) d output / d number over time.
+        """Derivative (N,) of an output by a parameter over time.
 
         Raises:
             InputError: There is no such output or number.
@@ -142,7 +142,7 @@ class Sensitivities(OneLineRepr):
 
     @property
     def typical_changes(self) -> Array:
-        """(p,) small changes of the numbers: a hundredth, or a thousandth [SI] of starts and 0."""
+        """(p,) small changes: 1 % of parameters; 0.001 [SI] of zeros and initial values."""
         is_parameter = [not name.startswith(START_PREFIX) for name in self.parameters]
         steps: Array = np.where(
             is_parameter & (self.values != 0), 0.01 * np.abs(self.values), 1e-3
@@ -162,7 +162,7 @@ class Sensitivities(OneLineRepr):
         return ""
 
     def to_text(self) -> str:
-        """A table, Markdown: what a small change of each number does to each output."""
+        """A table in Markdown: effects of a small change of each parameter on each output."""
         effects = self.derivatives * self.typical_changes
         units = [
             display_unit(self.unit(output), float(np.abs(effects[:, k]).max()))
@@ -181,7 +181,7 @@ class Sensitivities(OneLineRepr):
         return "\n".join([*lines, "", "Root mean square of the change over the motion."])
 
     def to_csv(self, path: str | Path) -> None:
-        """Write all derivatives over time, a column "OUTPUT by NUMBER" each.
+        """Write all derivatives over time to a CSV file, in columns "OUTPUT by PARAMETER".
 
         Raises:
             OutputError: It cannot be written.
@@ -207,29 +207,29 @@ def sensitivities(
     tolerance: float | None = None,
     progress: Progress | None = None,
 ) -> Sensitivities:
-    """Simulate a machine, with the exact derivatives of its motion by numbers.
+    """Simulate a machine, with the exact derivatives of its motion by parameters.
 
     With the minimal state s = (q_A, v_A, controller), s' = r(s, t, p), and S = ds/dp,
 
         S' = dr/ds S + dr/dp,    S(0) = ds(0)/dp,
 
-    between the instants at which a joint starts or stops, at which S jumps by (r - r_+) dt/dp; dr
-    is differentiated operation by operation through the closed loops. The equations are solved
-    along the states of the simulation, by Lobatto's method IIIC, extrapolated to order 5, over its
-    recorded steps, which are taken in up to 4,096 parts where something jumps.
+    between stick-slip transitions, at which S jumps by (r - r_+) dt/dp. The rate r is
+    differentiated operation by operation through the closed loops. The equations are solved along
+    the states of the simulation by the method of Lobatto IIIC, extrapolated to order 5, over the
+    recorded steps; these are divided into up to 4,096 parts where the rate is not smooth.
 
     Args:
-        machine: The machine, or what `crane.load` takes.
-        controller: See `simulate`; it stays the same where the machine changes, as do starting
-            coordinates.
+        machine: The machine, or an argument of `crane.load`.
+        controller: See `simulate`; controller and initial coordinates do not depend on the
+            parameters of the machine.
         initial: See `simulate`.
         duration: See `simulate`.
         step: See `simulate`.
-        parameters: Numbers of the machine as `crane.description.parameters` lists them, such as
-            "payload.mass" or "oil.bulk_modulus", and `start.JOINT_MARKER`, `start.JOINT_velocity`
+        parameters: Parameters of the machine as `crane.description.parameters` lists them, such as
+            "payload.mass" or "oil.bulk_modulus", and `start.JOINT`, `start.JOINT_velocity`
             of active joints.
-        outputs: Names of joints, `JOINT_velocity`, `JOINT_force` of active ones, channels of the
-            circuit such as `pressure_JOINT_a`, "kinetic", "potential", `tip_x`,
+        outputs: Names of outputs: joints, `JOINT_velocity`, `JOINT_force` of active ones,
+            channels of the circuit such as `pressure_JOINT_a`, "kinetic", "potential", `tip_x`,
             `inclination_LINK` and `inclination_LINK_velocity`. If not given, the active joints,
             and with valves the chambers' pressures.
         method: See `simulate`.

@@ -24,7 +24,7 @@ from crane.simulation.sensitivity.simulation_constants import SimulationConstant
 
 
 class ForwardDerivatives(RateProgram):
-    """Derivatives of a machine's rate along directions; see `Rate`."""
+    """Derivatives of the rate of a machine along directions; see `RateProgram`."""
 
     def directional_derivatives(
         self,
@@ -36,15 +36,14 @@ class ForwardDerivatives(RateProgram):
         """Derivatives at states of one motion.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see `Dynamics.set_modes`) and
-                references (N, c) of the states.
-            states: (N, .) as they are integrated.
-            directions: p directions of the numbers, each part with a leading axis.
-            has_joints_at_rest: Whether some joint is at rest.
+            constants: Constants of the simulation, with stick-slip modes (see
+                `Dynamics.set_stick_slip_modes`) and references (N, c) at the states.
+            states: (N, .) integrated states.
+            directions: p directions of the constants; each part has a leading axis.
+            has_joints_at_rest: Whether a joint is at rest.
 
         Returns:
-            d r/d s and d r/d c (N, m, m + p); the same of the outputs and the margin (N, k + 1,
-            m + p).
+            dr/ds and dr/dc (N, m, m + p), and the same of outputs and margin (N, k + 1, m + p).
         """
         m, p, count = self.state_size, len(directions.geometry), len(states)
         inputs = np.zeros((m + p, m))
@@ -91,7 +90,7 @@ class ForwardDerivatives(RateProgram):
             formulas.tape,
             formulas.machine.dynamics_formulas,
         )
-        # what tells when joints start or stop changes with time by the references
+        # the margin of transitions depends on time by the references
         varying_references = moved.references + bool(self._chart.stick_slip.columns)
         is_variable = (
             moved.geometry,
@@ -134,19 +133,23 @@ class ForwardDerivatives(RateProgram):
         sizes = [len(mask) for mask in is_variable[:4]]
         width, m, columns = len(derivatives), self.state_size, self._reference_columns
         names = (
-            "geometry", "numbers", "settings", "frames", "references", "states", "geometries",
-            "numbered", "settled", "framed", "referred", "inputs", "out",
+            "geometry", "constants", "settings", "frames", "references", "states",
+            "geometry_changes", "constant_changes", "setting_changes", "frame_changes",
+            "reference_changes", "inputs", "out",
         )  # fmt: skip
         counts = ("count", "directions")
         with program.add_routine("along" + suffix, counts=counts, arrays=names) as r:
             with r.loop(r.count) as i, r.loop(r.directions) as j:
                 at_both = i * r.directions + j
                 r.call(
-                    "tangent" + suffix, r.geometry, r.numbers, r.settings, r.frames,
-                    r.references.row_pointer(i, columns), r.states.row_pointer(i, self._state_layout.size),
-                    r.geometries.row_pointer(j, sizes[0]), r.numbered.row_pointer(j, sizes[1]),
-                    r.settled.row_pointer(j, sizes[2]), r.framed.row_pointer(j, sizes[3]),
-                    r.referred.row_pointer(at_both, columns), r.inputs.row_pointer(j, m),
+                    "tangent" + suffix, r.geometry, r.constants, r.settings, r.frames,
+                    r.references.row_pointer(i, columns),
+                    r.states.row_pointer(i, self._state_layout.size),
+                    r.geometry_changes.row_pointer(j, sizes[0]),
+                    r.constant_changes.row_pointer(j, sizes[1]),
+                    r.setting_changes.row_pointer(j, sizes[2]),
+                    r.frame_changes.row_pointer(j, sizes[3]),
+                    r.reference_changes.row_pointer(at_both, columns), r.inputs.row_pointer(j, m),
                     r.out.row_pointer(at_both, width),
                 )  # fmt: skip
             r.return_value(r.count)
@@ -171,7 +174,7 @@ class ReverseDerivatives(RateProgram):
             has_joints_at_rest: Whether some joint is at rest.
 
         Returns:
-            (N, K, l) by the numbers that move: of geometry, numbers, settings, frames.
+            (N, K, l) derivatives by the constants that change, without references.
         """
         count, sum_count, _ = weights.shape
         out = np.empty((count, sum_count, self._program.formula_outputs("cotangent").size))
@@ -216,7 +219,7 @@ class ReverseDerivatives(RateProgram):
         found = weighted_gradient(formulas.all_values, weights, [*numbers, *passive])
         out: Sequence[Scalar] = found[: len(numbers)]
         if loops.rows:
-            # q_P moves linearly with how far loops are opened, by numbers that cancel out
+            # q_P depends linearly on the gaps of the loops; their values cancel
             gaps = [tape.load(7, r) for r in range(len(loops.rows))]
             active_rows: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
             moving, _ = loops.solve_passive(active_rows, [[-1.0 * x] for x in gaps])
@@ -226,7 +229,8 @@ class ReverseDerivatives(RateProgram):
             out = [one + other for one, other in zip(out, by_loops, strict=True)]
         program.add_formula("cotangent" + suffix, 7, out)
         names = (
-            "geometry", "numbers", "settings", "frames", "references", "states", "weights", "out",
+            "geometry", "constants", "settings", "frames", "references", "states", "weights",
+            "out",
         )  # fmt: skip
         counts, width = ("count", "several"), len(out)
         with program.add_routine("against" + suffix, counts=counts, arrays=names) as r:
@@ -235,7 +239,7 @@ class ReverseDerivatives(RateProgram):
                 r.call(
                     "cotangent" + suffix,
                     r.geometry,
-                    r.numbers,
+                    r.constants,
                     r.settings,
                     r.frames,
                     r.references.row_pointer(i, self._reference_columns),

@@ -1,4 +1,4 @@
-"""The rate of a simulated machine as formulas of its state and of all its numbers."""
+"""State rate of a simulated machine as formulas of its state and of all its constants."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -38,13 +38,14 @@ from crane.simulation.sensitivity.simulation_constants import FRAME_SIZE, Simula
 
 @dataclass(frozen=True)
 class DifferentiatedFormulas:
-    """What is differentiated, on one tape.
+    """Formulas that are differentiated, on one tape.
 
     Attributes:
-        tape: The tape; its arguments are geometry, numbers, settings, frames, references, state.
+        tape: The tape; its arguments are geometry, constants of the dynamics, settings, frames,
+            references, state.
         machine: The machine at the state.
-        rate: (m,) of the minimal state.
-        outputs: What is observed, with a factor of its derivative each.
+        rate: (m,) rate of the minimal state.
+        outputs: Outputs, each with a factor of its derivative.
         transition_margin: See `StickSlipAccelerations.transition_margin`.
     """
 
@@ -56,31 +57,31 @@ class DifferentiatedFormulas:
 
     @property
     def all_values(self) -> list[Scalar]:
-        """Rate, outputs, margin, that derivatives are taken of."""
+        """Rate, outputs and transition margin, which are differentiated."""
         return [*self.rate, *(value for value, _ in self.outputs), self.transition_margin]
 
 
 class RateProgram:
-    """A machine's rate in machine code, and derivatives that a kind of it adds.
+    """Base class of compiled derivatives of the state rate of a machine.
 
-    A kind writes `_add_derivatives`, which adds its formulas and routines to what is at rest or
-    not.
+    A subclass implements `_add_derivatives`, which adds its formulas and routines, with and
+    without joints at rest.
 
     Args:
-        chart: The machine, in its own coordinates.
+        chart: The machine in the coordinates of the user.
         control: Its controller.
-        controller_state_count: Number of all the controller's states.
-        stiff_state_count: Number of those that act back, the first.
-        outputs: What is observed: names, see `sensitivities`.
-        variable_constants: Which numbers change in some direction.
+        controller_state_count: Number of all states of the controller.
+        stiff_state_count: Number of the first ones, on which the rates depend.
+        outputs: Names of the outputs, see `sensitivities`.
+        variable_constants: Nonzero for constants that change.
 
     Attributes:
         state_size: Length of the minimal state.
-        outputs: What is observed.
+        outputs: Names of the outputs.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
-        InputError: An output that is not there.
+        InputError: An output is unknown.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class RateProgram:
                 variable_constants.dynamics_constants != 0, np.nan, chart.dynamics.constant_pattern
             ),
         )
-        # what a circuit has not is 0 among its settings, and no part of the formulas
+        # zeros among the settings are features that a circuit does not have
         self._folded_settings = np.where(
             variable_constants.settings != 0, np.nan, control.settings
         )
@@ -155,10 +156,10 @@ class RateProgram:
         """The rate (m,) of the minimal state.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see `Dynamics.set_modes`) and
-                one row of references.
-            state: As it is integrated.
-            has_joints_at_rest: Whether some joint is at rest.
+            constants: Constants of the simulation, with stick-slip modes (see
+                `Dynamics.set_stick_slip_modes`) and one row of references.
+            state: The integrated state.
+            has_joints_at_rest: Whether a joint is at rest.
         """
         out = np.empty(self.state_size)
         self._program.call(
@@ -230,7 +231,7 @@ class RateProgram:
         tau: Sequence[Scalar],
         channel_formulas: Sequence[Scalar],
     ) -> tuple[Scalar, Scalar]:
-        """What is observed and a factor of its derivative; names as in `sensitivities`."""
+        """An output and a factor of its derivative; for names see `sensitivities`."""
         user_machine, control, sweep = (
             self._chart.machine,
             self._control,
@@ -267,7 +268,7 @@ class RateProgram:
 
 @contextmanager
 def report_long_formulas(machine: Machine) -> Iterator[None]:
-    """Say in one line that formulas are too long.
+    """Report formulas that are too long.
 
     Raises:
         InputError: They are.
@@ -283,7 +284,7 @@ def report_long_formulas(machine: Machine) -> Iterator[None]:
 def _frame_output(
     name: str, machine: MachineFormulas, body: int, frame_constants: Vector
 ) -> tuple[Scalar, Scalar]:
-    """Position of the tip, or inclination of a link's x axis and its rate."""
+    """Position of the tip, or inclination of the x axis of a link and its rate."""
     dynamics_formulas = machine.dynamics_formulas
     kinematics = dynamics_formulas.posture
     if not name.startswith(INCLINATION_PREFIX):
@@ -310,7 +311,7 @@ def _frame_output(
 
 
 def observed_frame(machine: Machine, name: str) -> str:
-    """The link whose place or inclination is observed."""
+    """The link of an output that is a position or inclination."""
     inclined = name.startswith(INCLINATION_PREFIX)
     return (
         name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
@@ -320,10 +321,10 @@ def observed_frame(machine: Machine, name: str) -> str:
 
 
 def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str, int]]:
-    """Links whose place or inclination is observed, and their bodies in the geometry.
+    """Links whose position or inclination is an output, and their bodies.
 
     Raises:
-        InputError: An output that is not there.
+        InputError: An output is unknown.
     """
     found: dict[str, int] = {}
     tips = {f"tip_{axis}" for axis in "xyz"} if machine.tip is not None else set()
@@ -337,6 +338,6 @@ def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str,
 
 
 def operation_index(argument: Scalar) -> int:
-    """Of a number that was loaded."""
+    """Index of the operation that loads a value."""
     assert isinstance(argument, SymbolicExpression)
     return argument.index

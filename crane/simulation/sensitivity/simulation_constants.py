@@ -20,17 +20,17 @@ FRAME_SIZE = 6  # numbers of a frame
 
 
 class SimulationConstants(NamedTuple):
-    """What a simulation depends on.
+    """All constants on which a simulation depends.
 
     Attributes:
-        geometry: Where joints and loops are, see `crane.closure.kinematics_formulas.TreeGeometry`.
-        dynamics_constants: Masses and force laws, see
-            `crane.dynamics.dynamics_formulas.dynamics_constants`, without what joints do whose
-            friction sticks.
-        settings: Of the controller; a circuit's are among them.
-        frames: Per frame that is observed, where it is on its body (3,) and its x axis (3,).
-        references: (N, c) of the controller at N instants.
-        initial_state: (m,) the minimal state at first.
+        geometry: Placements of joints and loops, see
+            `crane.closure.kinematics_formulas.TreeGeometry`.
+        dynamics_constants: Inertias and force laws, see
+            `crane.dynamics.dynamics_formulas.dynamics_constants`, without stick-slip modes.
+        settings: Settings of the controller, with the constants of a circuit.
+        frames: Position (3,) on its body and x axis (3,) of each frame of an output.
+        references: (N, c) references at N instants.
+        initial_state: (m,) initial minimal state.
     """
 
     geometry: Array
@@ -43,7 +43,7 @@ class SimulationConstants(NamedTuple):
     def difference_quotient(
         self, other: "SimulationConstants", interval: float
     ) -> "SimulationConstants":
-        """(self - other) / over."""
+        """(self - other) / interval."""
         return SimulationConstants(
             *((one - two) / interval for one, two in zip(self, other, strict=True))
         )
@@ -57,32 +57,32 @@ def simulation_constants_of(
     times: Array,
     variant: Machine | None = None,
 ) -> SimulationConstants:
-    """The numbers of a simulation.
+    """Constants of a simulation.
 
     Args:
-        dynamics: Of the machine.
+        dynamics: Dynamics of the machine.
         control: Its controller.
-        initial: q_A and v_A at first.
-        frames: Links that are observed.
-        times: (N,) [s].
-        variant: A machine of the same structure whose numbers are asked for, if not the machine's
-            own, with the controller on it.
+        initial: Initial q_A and v_A.
+        frames: Links of outputs.
+        times: (N,) instants of the references [s].
+        variant: A machine of the same structure with its controller, whose constants are computed
+            instead.
     """
     machine = dynamics.machine if variant is None else variant
     constants = dynamics.constants_of(machine)
     geometry, dynamics_constants = np.split(
         constants, [len(dynamics.machine.closure.compiled_closure.geometry.constants)]
     )
-    # what residuals are measured by is no part of the motion
+    # the scale of residuals does not affect the motion
     geometry[-1] = dynamics.machine.closure.compiled_closure.geometry.constants[-1]
     q = machine.closure.solve(initial[0], initial_guess=machine.home)
     controller_state = np.zeros(0)
     if hasattr(control, "start_closed"):
-        # nothing is worth compiling for one posture
+        # compiling does not pay for a single configuration
         controller_state = control.start_closed(Dynamics(machine, backend="pinocchio"), q)
     if isinstance(control, ValveDrive):
         controller_state = controller_state[: control.circuit.stiff_state_count]
-    # of a variant that a circuit grips elsewhere there are more numbers
+    # a variant may have circuit friction at other joints, and more constants
     dynamics_constants[np.flatnonzero(np.isnan(dynamics.constant_pattern))] = 0.0
     frame_constants = [np.zeros(0)]
     body_rotations = tree_geometry(machine.closure.equations).body_rotations
@@ -104,7 +104,7 @@ def simulation_constants_of(
 
 
 START_PREFIX = "start."
-_DIFFERENCE_STEP = 1e-4  # rad, machine's size, per `Closure.characteristic_time`, of starts
+_DIFFERENCE_STEP = 1e-4  # of initial motions [coordinate units], per characteristic time
 _CENTRAL_DIFFERENCE_WEIGHTS = (
     (1, 8.0 / 12.0),
     (-1, -8.0 / 12.0),
@@ -114,13 +114,13 @@ _CENTRAL_DIFFERENCE_WEIGHTS = (
 
 
 class ParameterDirections:
-    """A simulation's numbers, and their derivatives by named ones.
+    """Constants of a simulation, and their derivatives by named parameters.
 
     Args:
-        dynamics: Of the machine.
+        dynamics: Dynamics of the machine.
         control: Its controller.
-        start: q_A and v_A at first.
-        frames: Links that are observed.
+        start: Initial q_A and v_A.
+        frames: Links of outputs.
     """
 
     def __init__(
@@ -138,19 +138,19 @@ class ParameterDirections:
         return ConstantDerivatives(self._dynamics.machine)
 
     def nominal_constants(self, times: Array) -> SimulationConstants:
-        """The numbers, given the times (2 N + 1,) at which references are asked [s]."""
+        """Constants, for the times (2 N + 1,) of the references [s]."""
         return self._constants_of(self._dynamics.machine, self._initial_motion, times)
 
     def derivatives(self, names: Sequence[str], times: Array) -> dict[str, SimulationConstants]:
-        """Derivatives by some numbers; see `nominal_constants`.
+        """Derivatives by parameters; see `nominal_constants`.
 
         Raises:
-            InputError: An unknown name, or a number that no machine can be made with beside it.
+            InputError: A name is unknown, or a parameter cannot be varied.
         """
         return dict(self._iterate_derivatives(names, times, skip_invalid=False))
 
     def all_derivatives(self, times: Array) -> dict[str, SimulationConstants]:
-        """Derivatives by all numbers of the machine that change something and can be varied."""
+        """Derivatives by all parameters of the machine that have an effect and can be varied."""
         every = self._iterate_derivatives(
             self._constant_derivatives.parameter_names, times, skip_invalid=True
         )
@@ -183,21 +183,21 @@ class ParameterDirections:
                 continue
             parts = zip(np.split(derivative, ends), base, strict=True)
             found = SimulationConstants(*(part.reshape(like.shape) for part, like in parts))
-            if not found.references.any():  # which are long
+            if not found.references.any():  # saves memory
                 found = SimulationConstants(*map(np.copy, found))._replace(
                     references=np.broadcast_to(0.0, found.references.shape)
                 )
             yield name, found
 
     def parameter_value(self, name: str) -> float:
-        """A number, or a coordinate or velocity at the start."""
+        """Value of a parameter, or of an initial coordinate or velocity."""
         if name.startswith(START_PREFIX):
             part, i = _parse_start_name(name, self._dynamics.machine)
             return float(self._initial_motion[part][i])
         return self._constant_derivatives.parameter_value(name)
 
     def typical_change(self, name: str) -> float:
-        """By how much a number changes that changes much."""
+        """Size of a large change of a parameter."""
         value = self.parameter_value(name)
         return (
             abs(value) if value and not name.startswith(START_PREFIX) else UNIT_OF_ZERO_PARAMETER
@@ -206,7 +206,7 @@ class ParameterDirections:
     def _constants_of(
         self, machine: Machine, start: tuple[Array, Array], times: Array
     ) -> SimulationConstants:
-        """The numbers of a machine like this one, from a start."""
+        """Constants of a machine of the same structure, from an initial motion."""
         control = self._control
         machine_controller = (
             control.for_machine(machine) if isinstance(control, ValveDrive) else control
@@ -216,7 +216,7 @@ class ParameterDirections:
         )
 
     def _start_derivative(self, name: str, times: Array) -> SimulationConstants:
-        """How the numbers change with a coordinate or velocity at the start."""
+        """Derivatives of the constants by an initial coordinate or velocity."""
         machine = self._dynamics.machine
         part, i = _parse_start_name(name, machine)
         closure = machine.closure
@@ -233,17 +233,17 @@ class ParameterDirections:
                 weight / difference_step * self._constants_of(machine, moved, times).initial_state
             )
             start = start + more if start.size else more
-        base = self.nominal_constants(times)  # nothing else of it depends on where a motion starts
+        base = self.nominal_constants(times)  # no other constant depends on the initial motion
         return SimulationConstants(*(np.broadcast_to(0.0, x.shape) for x in base))._replace(
             initial_state=start
         )
 
 
 def _parse_start_name(name: str, machine: Machine) -> tuple[int, int]:
-    """Which part of the start a name is of, and which joint.
+    """Part of the initial motion of a name (0 for q_A, 1 for v_A), and index of the joint.
 
     Raises:
-        InputError: It is of none.
+        InputError: The joint is no active joint.
     """
     joint = name.removeprefix(START_PREFIX)
     part = int(joint.endswith(VELOCITY_SUFFIX) and joint not in machine.active)

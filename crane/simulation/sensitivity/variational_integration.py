@@ -41,11 +41,11 @@ STAGE_WEIGHTS = np.array([[1.0, -2.0, 1.0], [1.0, 2.5, -0.5], [1.0, 4.0, 1.0]]) 
 
 
 class StepPairMaps(NamedTuple):
-    """What n pairs of steps do to S: Phi and Psi (n, m, m + p).
+    """Maps of S by n pairs of steps: Phi and Psi (n, m, m + p).
 
     Attributes:
-        first: Of the first step.
-        both: Of both, without their error.
+        first: Maps of the first step.
+        both: Maps of both steps, extrapolated.
     """
 
     first: Array
@@ -58,20 +58,19 @@ FOURTH_DIFFERENCE_WEIGHTS = (
 
 
 def interpolation_errors(values: Array) -> Array:
-    """By pair of steps, what parabolas through their nodes leave out of their mean, and more.
+    """Error bounds of parabolic interpolation by pair of steps.
 
-    Fourth differences over 15, of values (4 n + 1, .) at the nodes.
+    Fourth differences over 15 of values (4 n + 1, .) at the nodes.
     """
     count = len(values) - 4
-    out: Array = sum(
+    return sum(
         (share * values[i : count + i : 4] for i, share in enumerate(FOURTH_DIFFERENCE_WEIGHTS)),
         np.zeros(()),
     )
-    return out
 
 
 class TransposedMap(NamedTuple):
-    """The way back: Phi^T (n, m, m), and what gives mu (n, nodes, m, m)."""
+    """Transposed map: Phi^T (n, m, m), and matrices that give mu (n, nodes, m, m)."""
 
     transposed_propagation: Array
     stage_weights: Array
@@ -85,7 +84,7 @@ class TransposedPairMaps(NamedTuple):
 
 
 def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> StepPairMaps:
-    """What pairs of steps do.
+    """Maps of pairs of steps.
 
     Args:
         values: A and B (4 n + 1, m, m + p) at the nodes.
@@ -142,8 +141,7 @@ def step_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array
     Args:
         values: A and B (N, 3, m, m + p) at their stages.
         lengths: (N,) [s].
-        sizes: (m,) of states, in shares of which the equations are solved: a rounded pressure
-            [Pa] is no length [m].
+        sizes: (m,) scales of the states for the solution of the equations.
     """
     count, stages, m, width = values.shape
     by_state, by_number, p = values[..., :m], values[..., m:], width - m
@@ -161,7 +159,7 @@ def step_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array
 
 
 def transposed_step_maps(by_state: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
-    """Phi^T (N, m, m) of steps, and what gives the mu_j of their stages (N, 3, m, m)."""
+    """Phi^T (N, m, m) of steps, and matrices (N, 3, m, m) that give mu_j of their stages."""
     count, stages, m, _ = by_state.shape
     right = np.broadcast_to(np.eye(stages * m)[:, -m:], (count, stages * m, m))
     solution = np.linalg.solve(np.swapaxes(_stage_matrix(by_state, lengths, sizes), 1, 2), right)
@@ -170,29 +168,28 @@ def transposed_step_maps(by_state: Array, lengths: Array, sizes: Array) -> tuple
 
 
 def _stage_matrix(by_state: Array, lengths: Array, sizes: Array) -> Array:
-    """1 - h a (x) A (N, 3 m, 3 m), in shares of sizes of the states."""
+    """1 - h a (x) A (N, 3 m, 3 m), scaled by the sizes of the states."""
     by_state = by_state / sizes[:, None] * sizes
     count, stages, m, _ = by_state.shape
     whole = np.zeros((count, stages, m, stages, m))
     for i in range(stages):
         for j in range(stages):
             whole[:, i, :, j] = -STAGE_WEIGHTS[i, j] * lengths[:, None, None] * by_state[:, j]
-    out: Array = whole.reshape(count, stages * m, stages * m) + np.eye(stages * m)
-    return out
+    return whole.reshape(count, stages * m, stages * m) + np.eye(stages * m)
 
 
-STEP_ACCURACY = 1e-8  # error of a step, per size of what it is of
-MIN_RELATIVE_CHANGE = 1e-6  # of the states, what matters of what a number as a whole changes
+STEP_ACCURACY = 1e-8  # relative error of a step
+MIN_RELATIVE_CHANGE = 1e-6  # least relative change of states by a whole parameter that counts
 
 
 class SensitivitySolution(NamedTuple):
-    """A motion and how it changes.
+    """A motion and its sensitivities.
 
     Attributes:
-        time: (N + 1,) [s].
-        parts: Of the rows (N + 1, .), see `crane.simulation.simulation_run.integrate`.
-        derivatives: (N + 1, k, p) of k outputs in p directions.
-        notes: What is to be said of the motion.
+        time: (N + 1,) instants [s].
+        parts: Parts of the rows (N + 1, .), see `crane.simulation.simulation_run.integrate`.
+        derivatives: (N + 1, k, p) derivatives of k outputs in p directions.
+        notes: Notes for the user about the motion.
     """
 
     time: Array
@@ -209,20 +206,20 @@ def integrate_sensitivities(
     accuracy: float = STEP_ACCURACY,
     progress: Callable[[float], None] | None = None,
 ) -> SensitivitySolution:
-    """Simulate a machine, and how its outputs change in some directions.
+    """Simulate a machine, with derivatives of its outputs along directions.
 
     Args:
-        motion: What is simulated.
-        outputs: What is observed, see `Rate`.
-        make_constants: Numbers of the simulation, and p directions of them with a leading axis
-            each, given the times (2 N + 1,) at which references are asked.
-        typical_changes: (p,) how long directions are that change much.
-        accuracy: Error of a step, per size of what it is of.
+        motion: The simulation.
+        outputs: Names of the outputs, see `sensitivities`.
+        make_constants: Function of the times (2 N + 1,) of the references; returns constants of
+            the simulation, and p directions of them, each part with a leading axis.
+        typical_changes: (p,) sizes of large changes along the directions.
+        accuracy: Relative error of a step.
         progress: See `simulate`.
 
     Raises:
-        InputError: A machine that has no formulas, or floats; an output that is not there.
-        SimulationError: It comes to a dead centre; else as `simulate`.
+        InputError: The machine has no formulas or a floating base, or an output is unknown.
+        SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
     track = SimulatedMotion(motion, progress)
     base, directions = make_constants(track.time)
@@ -243,23 +240,23 @@ def integrate_sensitivities(
 
 
 def _variable_constants(directions: SimulationConstants) -> SimulationConstants:
-    """Which numbers change in some of p directions, 1 or 0."""
+    """Constants that change along any of p directions, as 1 or 0."""
     flat = (np.any(part != 0, axis=tuple(range(part.ndim - 1))) for part in directions)
     return SimulationConstants(*(part.astype(np.float64) for part in flat))
 
 
 class _VariationalIntegrator:
-    """The variational equations along a recorded motion, stretch by stretch.
+    """Integrator of the variational equations along a recorded motion, segment by segment.
 
-    Pairs of steps over which A or B bend too much for the method are taken in parts, along states
-    that are simulated anew: where a valve opens or a compensator closes they jump.
+    Pairs of steps over which A or B are not smooth, as where a valve opens or a compensator
+    closes, are divided and simulated again.
 
     Args:
         motion: The motion.
         forward_derivatives: Derivatives of the rate.
-        nominal_constants: Numbers of the simulation.
+        nominal_constants: Constants of the simulation.
         directions: p directions of them.
-        scale: (m, p) what is taken for no smaller.
+        scale: (m, p) least scales of S.
         accuracy: See `integrate_sensitivities`.
     """
 
@@ -318,7 +315,7 @@ class _VariationalIntegrator:
     def _integrate_segment(
         self, nodes: MotionNodes, sensitivity: Array, depth: int
     ) -> tuple[Array, Array]:
-        """S (n + 1, m, p) at the ends of a stretch's steps, and what is seen at its nodes."""
+        """S (n + 1, m, p) at the ends of the steps, and derivatives of outputs at the nodes."""
         m, (state_jacobian, output_jacobian) = (
             self._forward_derivatives.state_size,
             self._directional_derivatives(nodes),
@@ -355,7 +352,7 @@ class _VariationalIntegrator:
     def _refine_step(
         self, nodes: MotionNodes, step_sensitivities: list[Array], depth: int
     ) -> None:
-        """One more step, in parts."""
+        """Append S after one more step, which is divided."""
         finer = self._motion.nodes_within_step(nodes, len(step_sensitivities) - 1)
         step_sensitivities.append(
             self._integrate_segment(finer, step_sensitivities[-1], depth - 1)[0][-1]
