@@ -120,8 +120,9 @@ def simulate(
         method: "DOP853", explicit of order 8 (`DormandPrinceStepper`); "Radau", implicit of order
             5 for stiff machines (`RadauStepper`); "rosenbrock", of order 3, for circuits
             (`RosenbrockStepper`): these control their step size and record every `step` by dense
-            output. "rk4", of order 4 with fixed steps. "RK23", "RK45", "BDF", "LSODA" are those of scipy, as are DOP853 and Radau for controllers in Python. The
-            default is rosenbrock with valves, DOP853 in machine code, rk4 in Python.
+            output. "rk4", of order 4 with fixed steps. "RK23", "RK45", "BDF", "LSODA" are
+            those of scipy, as are DOP853 and Radau for controllers in Python. The default is
+            rosenbrock with valves, DOP853 in machine code, rk4 in Python.
         tolerance: Error of a step relative to the size of the state; 1e-12 for DOP853, 1e-8 for
             rosenbrock, 1e-9 for others if not given.
         formulation: "exact" or "decoupled", see `Dynamics`.
