@@ -338,7 +338,7 @@ class ValveFeedforward(ValvePD):
         sway, free = Sway(machine), self._free_indices
         configurations = sway.hanging_equilibrium(q_a)
         shifts = sway.pivoting_motions(configurations)
-        roots = np.array([sway.frequency_matrix(posture) for posture in configurations])
+        roots = np.array([sway.frequency_matrix(q) for q in configurations])
         driven = np.flatnonzero(machine.is_driven).tolist()
         driven_indices = [driven.index(i) for i in self._active_indices]
         gains = -2.0 * damping * (shifts @ roots)[:, driven_indices]

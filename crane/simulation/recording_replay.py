@@ -291,11 +291,13 @@ def _initial_pressures(
     pressures: dict[str, tuple[float, float]] = {}
     for joint in joints:
         pair = [f"pressure_{joint}_{side}" for side in "ab"]
-        there = [name for name in pair if name in table.units]
-        if len(there) == 1:
-            missing = pair[pair[0] in there]
-            raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
-        if there:
+        measured = [name for name in pair if name in table.units]
+        if len(measured) == 1:
+            missing = pair[pair[0] in measured]
+            raise RecordingError(
+                f"'{missing}' is missing beside '{measured[0]}', add or remove one"
+            )
+        if measured:
             a, b = (_value_at_first_sample(time, table_column(table, name), 0) for name in pair)
             pressures[joint] = max(a, 0.0), max(b, 0.0)
     return pressures

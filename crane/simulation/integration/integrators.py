@@ -286,11 +286,11 @@ class FixedStepIntegrator(StickSlipIntegrator):
         if i < chunk_end and not event:  # the compiled stepper stopped, or there is none
             if self.python_stepper.exceeds_chart_limits(state):
                 return False
-            rate, seen = self.python_stepper.observe(times[i], state)
+            rate, outputs = self.python_stepper.observe(times[i], state)
             if self.python_stepper.transition_margin < -EVENT_TOLERANCE:
                 event = step
             else:
-                rows[i, :size], rows[i, size:] = state, seen
+                rows[i, :size], rows[i, size:] = state, outputs
                 self.done = i + 1
                 state[:] = self.python_stepper.advance(times[i], state, rate, step)
                 i = self.next_instant = i + 1

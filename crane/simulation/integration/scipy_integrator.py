@@ -112,9 +112,9 @@ class ScipyIntegrator(StickSlipIntegrator):
             dense_output, start = solver.dense_output(), float(solver.t_old)
 
             def trial(part: float, within: Any = dense_output, start: float = start) -> Any:
-                there = within(start + part)
-                rate(start + part, there)
-                return there, self.python_stepper.transition_margin
+                displaced = within(start + part)
+                rate(start + part, displaced)
+                return displaced, self.python_stepper.transition_margin
 
             rate(solver.t, solver.y)
             after, until, event_state = (

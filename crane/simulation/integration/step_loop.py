@@ -74,7 +74,7 @@ class StepLoop:
 
     Elements of its argument h: output interval; step size to try; time of the state, relative to
     the first output instant before, and to the next one behind; spacing of references; end;
-    whether a joint starts or stops there.
+    whether a stick-slip transition is there.
 
     A step that passes an event is rejected. The secant method locates the event; steps that end
     before it are accepted.

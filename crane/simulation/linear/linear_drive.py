@@ -28,7 +28,7 @@ class LinearizedDrive:
         input_units: Names and units of its inputs.
         output_units: Names and units of further outputs.
         initial_states: (k,) states where the machine stands still.
-        initial_inputs: (m,) inputs there.
+        initial_inputs: (m,) inputs where the machine stands still.
     """
 
     def __init__(

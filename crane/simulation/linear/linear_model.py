@@ -63,7 +63,7 @@ class LinearModel(OneLineRepr):
         x: (k,) operating point.
         u: (m,).
         y: (p,).
-        rate: (k,) x' there, 0 of an equilibrium.
+        rate: (k,) x' at the operating point, 0 for an equilibrium.
         machine: The machine.
         configuration: (nq,) configuration of the operating point.
         gamma: (nq, n) its derivatives by q_A.

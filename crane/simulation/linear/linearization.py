@@ -93,7 +93,7 @@ def linearize(
     (`Dynamics.derivatives`), the circuit's by its formulas; those of external forces, which
     act as at time 0, by differences. Friction that sticks is that of small
     motions which have begun: at rest its viscous part alone, in motion the side that it is on.
-    What the circuit only counts, such as the oil drawn, is no state.
+    The integrals of a circuit, such as the pumped oil, are no states.
 
     Args:
         machine: The machine, or an argument of `crane.load`.
@@ -113,9 +113,10 @@ def linearize(
         Matrices with the names of states, inputs and outputs, the operating point, and the modes.
 
     Raises:
-        InputError: Unknown names, a posture beyond the limits, or a drive that is not there.
-        ClosureError: The loops do not close there.
-        SimulationError: The machine cannot be trimmed there.
+        InputError: A name is unknown, the operating point is outside of the limits, or the drive
+            does not exist.
+        ClosureError: The loops do not close at the operating point.
+        SimulationError: The machine cannot be trimmed at the operating point.
     """
     if not isinstance(machine, Machine):
         machine = load(machine)
@@ -244,11 +245,11 @@ class _OutputRows:
 
     Args:
         machine: The machine.
-        drive: What acts on it.
-        q: (nq,) posture.
+        drive: Its drive.
+        q: (nq,) configuration.
         gamma: (nq, n) dq/dq_A.
         motion: q_A and v_A.
-        drive_values: What the drive does, see `Drive.at`.
+        drive_values: Values and derivatives of the drive, see `LinearizedDrive.evaluate`.
     """
 
     def __init__(

@@ -110,7 +110,7 @@ class Sensitivities(OneLineRepr):
 
     Attributes:
         recording: The motion.
-        outputs: Names (k,) of what is observed.
+        outputs: Names (k,) of the outputs.
         parameters: Names (p,) of the numbers.
         values: (p,) of these.
         derivatives: (N, k, p) derivatives of the outputs, SI units.

@@ -84,19 +84,19 @@ class ForwardDerivatives(RateProgram):
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
     ) -> None:
         """tangent(geometry, numbers, settings, frames, references, state, their changes, ds)."""
-        n, moved, tape, sweep = (
+        n, variable, tape, dynamics = (
             self._mobility,
             self._variable_constants,
             formulas.tape,
             formulas.machine.dynamics_formulas,
         )
         # the margin of transitions depends on time by the references
-        varying_references = moved.references + bool(self._chart.stick_slip.columns)
+        varying_references = variable.references + bool(self._chart.stick_slip.columns)
         is_variable = (
-            moved.geometry,
-            moved.dynamics_constants,
-            moved.settings,
-            moved.frames,
+            variable.geometry,
+            variable.dynamics_constants,
+            variable.settings,
+            variable.frames,
             varying_references,
         )
         seeds: dict[int, Scalar] = {}
@@ -107,12 +107,12 @@ class ForwardDerivatives(RateProgram):
 
         seed(0, is_variable[0])
         changed = [tape.load_vector(11, part * n, n) for part in range(2)]
-        gap_changes = directional_derivative([row.phi for row in sweep.loops.rows], seeds)
-        joints = sweep.loops.active_joints
+        gap_changes = directional_derivative([row.phi for row in dynamics.loops.rows], seeds)
+        joints = dynamics.loops.active_joints
         active_rows = {joint: [change] for joint, change in zip(joints, changed[0], strict=True)}
-        moving, _ = sweep.loops.solve_passive(active_rows, [[-1.0 * x] for x in gap_changes])
-        seeds |= {operation_index(sweep.q[i - 1]): change for i, (change,) in moving.items()}
-        seeds |= dict(zip(map(operation_index, sweep.v_a), changed[1], strict=True))
+        moving, _ = dynamics.loops.solve_passive(active_rows, [[-1.0 * x] for x in gap_changes])
+        seeds |= {operation_index(dynamics.q[i - 1]): change for i, (change,) in moving.items()}
+        seeds |= dict(zip(map(operation_index, dynamics.v_a), changed[1], strict=True))
         state_changes, parts = (
             tape.load_vector(11, 2 * n, self._stiff_state_count),
             formulas.machine.state_parts,
@@ -198,12 +198,17 @@ class ReverseDerivatives(RateProgram):
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
     ) -> None:
         """cotangent(geometry, numbers, settings, frames, references, state, weights)."""
-        tape, sweep, moved = (
+        tape, dynamics, variable = (
             formulas.tape,
             formulas.machine.dynamics_formulas,
             self._variable_constants,
         )
-        is_variable = moved.geometry, moved.dynamics_constants, moved.settings, moved.frames
+        is_variable = (
+            variable.geometry,
+            variable.dynamics_constants,
+            variable.settings,
+            variable.frames,
+        )
         numbers = [
             tape.load(array, i)
             for array, mask in enumerate(is_variable)
@@ -212,9 +217,10 @@ class ReverseDerivatives(RateProgram):
         weights = tape.load_vector(6, 0, len(formulas.all_values))
         for k, (_, factor) in enumerate(formulas.outputs, start=len(formulas.rate)):
             weights[k] = factor * weights[k]
-        loops = sweep.loops
+        loops = dynamics.loops
         passive = [
-            SymbolicExpression(tape, operation_index(sweep.q[i - 1])) for i in loops.passive_joints
+            SymbolicExpression(tape, operation_index(dynamics.q[i - 1]))
+            for i in loops.passive_joints
         ]
         found = weighted_gradient(formulas.all_values, weights, [*numbers, *passive])
         out: Sequence[Scalar] = found[: len(numbers)]

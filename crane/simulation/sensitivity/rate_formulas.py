@@ -232,17 +232,17 @@ class RateProgram:
         channel_formulas: Sequence[Scalar],
     ) -> tuple[Scalar, Scalar]:
         """An output and a factor of its derivative; for names see `sensitivities`."""
-        user_machine, control, sweep = (
+        user_machine, control, dynamics = (
             self._chart.machine,
             self._control,
             machine.dynamics_formulas,
         )
         columns = {joint: i for i, joint in enumerate(user_machine.joints)}
         if name in columns:
-            return sweep.q[columns[name]], 1.0
+            return dynamics.q[columns[name]], 1.0
         joint = name.removesuffix(VELOCITY_SUFFIX)
         if joint in columns:
-            return sweep.rates[columns[joint] + 1], 1.0
+            return dynamics.rates[columns[joint] + 1], 1.0
         joint = name.removesuffix(FORCE_SUFFIX)
         if joint in user_machine.active:
             return tau[user_machine.active.index(joint)], 1.0
@@ -251,7 +251,7 @@ class RateProgram:
             if name in channels:
                 return channel_formulas[channels.index(name)], 1.0
         if name in ("kinetic", "potential"):
-            return getattr(sweep, name), 1.0
+            return getattr(dynamics, name), 1.0
         links = [link for link, _ in self._frames]
         if (
             not name.startswith((INCLINATION_PREFIX, "tip_"))

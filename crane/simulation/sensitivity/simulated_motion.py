@@ -197,12 +197,12 @@ class SimulatedMotion:
         self._integrator = make(self.chart)
         self.transitions: list[StickSlipTransition] = self.chart.stick_slip.transitions
         self.chart.stick_slip.transitions = None  # repeated parts are not recorded
-        seen, closure = self.chart.user_columns, machine.closure
+        columns, closure = self.chart.user_columns, machine.closure
         minimal = np.hstack(
-            [parts.q[:, seen], parts.v_a, parts.controller[:, : self.stiff_state_count]]
+            [parts.q[:, columns], parts.v_a, parts.controller[:, : self.stiff_state_count]]
         )
         units = np.concatenate(
-            [closure.units[seen], closure.units[seen] / closure.characteristic_time]
+            [closure.units[columns], closure.units[columns] / closure.characteristic_time]
         )
         self.largest_states: Array = np.abs(minimal).max(axis=0)
         self.largest_states[self.largest_states == 0.0] = 1.0
@@ -364,8 +364,8 @@ class SimulatedMotion:
 def _check_dead_centres(chart: Chart, time: Array, q: Array) -> None:
     """Check that configurations (N, nq) are not near dead centres."""
     stride = max(1, len(q) // _MAX_CHECKED_SAMPLES)
-    for at, posture in zip(time[::stride], q[::stride], strict=True):
-        if chart.largest_gamma_entry(posture) > chart.chart_limits[0]:
+    for at, configuration in zip(time[::stride], q[::stride], strict=True):
+        if chart.largest_gamma_entry(configuration) > chart.chart_limits[0]:
             raise SimulationError(
                 f"at t = {at:.4g} s the active coordinates come near a dead centre, where nothing "
                 "depends on them smoothly: drive other joints, or end before"

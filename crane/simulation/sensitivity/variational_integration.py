@@ -292,10 +292,10 @@ class _VariationalIntegrator:
                     track.resimulated_nodes(*segment[1:]), sensitivity, MAX_REFINEMENTS - 1
                 )[0][-1]
             else:
-                every, seen = self._integrate_segment(
+                every, node_outputs = self._integrate_segment(
                     track.recorded_nodes(segment), sensitivity, MAX_REFINEMENTS
                 )
-                at = seen[::2, :k]
+                at = node_outputs[::2, :k]
                 output_derivatives[segment.first_instant : segment.last_instant + 1] = (
                     at[..., :m] @ every + at[..., m:]
                 )
