@@ -187,21 +187,21 @@ def linear_models(
     drive: str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[tuple[dict[str, float], LinearModel]]:
-    """Linear models over postures and numbers of a machine, at rest.
+    """Linear models over configurations and parameters of a machine, at rest.
 
     Args:
         machine: See `linearize`.
-        vary: Values by name of an active joint, or of a number of the machine as
-            `crane.description.parameters` lists them; all combinations are taken.
-        operating_point: Active coordinates [m], [rad] that are the same in all.
+        vary: Values by the name of an active joint or of a parameter, see
+            `crane.description.parameters`; all combinations are computed.
+        operating_point: Active coordinates [m], [rad] that are the same in all models.
         drive: See `linearize`.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
-        For each combination the values and the model, the last name varying fastest.
+        Values and model of each combination; the last name varies fastest.
 
     Raises:
-        InputError: See `linearize`; an unknown name.
+        InputError: As `linearize`, or a name is unknown.
     """
     progress = progress_reporter(progress)
     if not isinstance(machine, Machine):
@@ -217,17 +217,15 @@ def linear_models(
     combinations = list(itertools.product(*(x.tolist() for x in values.values())))
     drift_warnings = []
     for i, row in enumerate(combinations):
-        values_here = dict(zip(values, row, strict=True))
-        changes = {
-            name: value for name, value in values_here.items() if name not in machine.active
-        }
-        joints = {name: value for name, value in values_here.items() if name in machine.active}
+        variation = dict(zip(values, row, strict=True))
+        changes = {name: value for name, value in variation.items() if name not in machine.active}
+        joints = {name: value for name, value in variation.items() if name in machine.active}
         variant = variants.machine(changes) if changes else machine
         with warnings.catch_warnings(record=True) as caught_warnings:
             warnings.simplefilter("always")
             found.append(
                 (
-                    values_here,
+                    variation,
                     linearize(variant, dict(operating_point or {}) | joints, drive=drive),
                 )
             )

@@ -200,10 +200,10 @@ def _largest_changes(
 def _functional_and_weights(
     functional: Functional | ArrayLike, time: Array, output_values: Array
 ) -> tuple[Array, Array]:
-    """J and dJ/dy (N + 1, k), or several.
+    """J and dJ/dy (N + 1, k); of several functionals with a leading axis.
 
     Raises:
-        InputError: They are of another shape, or not finite.
+        InputError: They have a wrong shape, or are not finite.
     """
     if callable(functional):
         total, weights = (np.asarray(x, dtype=np.float64) for x in functional(time, output_values))

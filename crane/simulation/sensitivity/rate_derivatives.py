@@ -168,10 +168,10 @@ class ReverseDerivatives(RateProgram):
         """Gradients at states of one motion.
 
         Args:
-            constants: See `ForwardDerivatives.along`.
-            states: (N, .) as they are integrated.
-            weights: (N, K, m + k + 1) of rate, outputs and margin.
-            has_joints_at_rest: Whether some joint is at rest.
+            constants: See `ForwardDerivatives.directional_derivatives`.
+            states: (N, .) integrated states.
+            weights: (N, K, m + k + 1) weights of rate, outputs and margin.
+            has_joints_at_rest: Whether a joint is at rest.
 
         Returns:
             (N, K, l) derivatives by the constants that change, without references.

@@ -271,7 +271,7 @@ def report_long_formulas(machine: Machine) -> Iterator[None]:
     """Report formulas that are too long.
 
     Raises:
-        InputError: They are.
+        InputError: The formulas are too long.
     """
     try:
         yield
