@@ -156,7 +156,7 @@ class ForwardDerivatives(RateProgram):
 
 
 class ReverseDerivatives(RateProgram):
-    """Gradients of a machine's rate and outputs by all numbers that move; see `Rate`."""
+    """Gradients of rate and outputs by all constants that change; see `RateProgram`."""
 
     def gradients(
         self,
