@@ -4,9 +4,15 @@ from dataclasses import replace
 
 from hydraulic_rig import AREA_A, AREA_B, HOSE, rig
 
-from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
-from crane.hydraulics.components import CounterbalanceValve, Cylinder, Hydraulics, Oil, Valve
-from crane.hydraulics.supply_and_engine import Engine, Supply
+from crane.hydraulics.circuit_elements import (
+    Accumulator,
+    CircuitElement,
+    CircuitLine,
+    Engine,
+    Supply,
+)
+from crane.hydraulics.components import CounterbalanceValve, Cylinder, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics, Oil
 
 SENSING = Supply(
     2.8e7, flow=3e-3, control="load-sensing", margin=2e6, standby=2.5e6, relief=3.2e7, power=9e4

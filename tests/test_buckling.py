@@ -13,8 +13,9 @@ from crane import Buckling, Dynamics
 from crane.common.errors import CraneError, InputError
 from crane.dynamics.buckling import YOUNGS_MODULUS_STEEL, CylinderColumn
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.hydraulics.components import Cylinder, Hydraulics, Oil, Valve
-from crane.hydraulics.supply_and_engine import Supply
+from crane.hydraulics.circuit_elements import Supply
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics, Oil
 
 SHAPE = {
     "joint": "x",

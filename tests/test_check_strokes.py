@@ -8,7 +8,7 @@ import pytest
 
 import crane
 from crane.common.errors import SimulationError
-from crane.control.lever_phases import LeverPhases
+from crane.control.levers import LeverPhases
 from crane.description import bundled_machines
 from crane.description.task_phases import Phase
 from crane.formats.check import check

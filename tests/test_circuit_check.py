@@ -21,15 +21,21 @@ from crane.common.plausible_ranges import (
 from crane.description.circuit_schema import MOTOR
 from crane.description.key_types import component_name
 from crane.formats.check import check
-from crane.hydraulics.circuit_connectivity import (
+from crane.hydraulics.circuit_elements import (
+    Accumulator,
+    CircuitElement,
+    CircuitLine,
+    Engine,
+    Supply,
+    parameter_names,
+)
+from crane.hydraulics.components import CounterbalanceValve, Cylinder, Valve
+from crane.hydraulics.hydraulic_circuit import (
+    Oil,
     connected_nodes,
     nodes_draining_to_tank,
     nodes_fed_by_pumps,
 )
-from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
-from crane.hydraulics.components import CounterbalanceValve, Cylinder, Oil, Valve
-from crane.hydraulics.parameter_checks import parameter_names
-from crane.hydraulics.supply_and_engine import Engine, Supply
 
 SENSING = {"control": "load-sensing", "flow": 3e-3, "pressure": 2.8e7, "margin": 2e6}
 SECOND = {"pressure": 2e7, "flow": 2e-3}

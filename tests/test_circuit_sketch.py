@@ -12,7 +12,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import InputError
-from crane.hydraulics.supply_and_engine import TANK_NODE
+from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.view.sketch.circuit import circuit_figure
 from crane.view.sketch.circuit.format_quantities import (
     format_displacement,

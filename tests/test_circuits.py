@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 import crane
 from crane.control import ValveSignals
-from crane.hydraulics.orifice_flow import series_coefficient, signed_square_root
+from crane.hydraulics.flow_equations import series_coefficient, signed_square_root
 
 TANK = 1e5
 SENSING = {

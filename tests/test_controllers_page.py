@@ -45,7 +45,7 @@ def test_the_program_of_a_control_unit_holds_its_signals(page):
     """A period's signal is what the program says of the recorded state at its first instant."""
     run, crane_, lift = page["raised"], page["log_crane"], page["lift"]
     assert run["X_lift"][0] < 0.15 and run["X_lift"][-1] == pytest.approx(0.2, abs=2e-3)
-    assert run.controller == "Sampled" and run.time[1] == pytest.approx(1e-3)
+    assert run.controller == "SampledCommand" and run.time[1] == pytest.approx(1e-3)
     rows = range(0, len(run.time) - 1, 10)
     pressures = np.stack(
         [

@@ -10,7 +10,7 @@ from crane.common.errors import CraneError
 from crane.formats.machine_loading import MachineVariants
 from crane.simulation.sensitivity import adjoint_integration, variational_integration
 from crane.simulation.sensitivity.motion_gradient import _largest_changes
-from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
+from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
 from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 
@@ -140,7 +140,7 @@ def both(machine, controller, initial, duration, by, outputs, accuracy):
     )  # fmt: skip
     assert not stacked.references.any()
     parts = np.einsum("Kik,ikp->Kip", weights, forward)
-    return back, parts.sum(1), np.abs(parts).max(axis=1), len(track.switches)
+    return back, parts.sum(1), np.abs(parts).max(axis=1), len(track.transitions)
 
 
 @pytest.mark.slow

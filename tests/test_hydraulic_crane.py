@@ -7,7 +7,7 @@ import pytest
 
 import crane
 from crane.control import SampledCommand, TipVelocity, ValveDrive, ValvePD, ValveSignals, joystick
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.motion.task_trajectories import task_trajectory
 
 LOAD = {"payload.mass": 211.4}

@@ -8,7 +8,7 @@ from scipy.integrate import quad, solve_ivp
 import crane
 from crane.control import ValveDrive, ValveSignals
 from crane.hydraulics import CircuitEquations
-from crane.hydraulics.orifice_flow import (
+from crane.hydraulics.flow_equations import (
     LAMINAR_PRESSURE_DROP,
     series_coefficient,
     signed_square_root,
@@ -282,7 +282,7 @@ def test_series_spring_gives_way_by_force_over_stiffness(tmp_path):
     # at rest: the chamber's volume is that of the stroke and of what the spring gives way
     circuit = CircuitEquations(machine.hydraulics, [STROKE])
     weight = 2000 * G
-    start = circuit.initial_state(np.array([0.2]), np.array([weight]), {}, np.array([0.0]), 1e5)
+    start = circuit.initial_state(np.array([weight]), {}, np.array([0.0]), 1e5)
     assert start[2] == pytest.approx(weight / 5e6, rel=1e-12)
     assert recording.q[-1] == pytest.approx(0.2, abs=1e-9)
 
@@ -303,8 +303,8 @@ def test_no_void_is_measured(tmp_path):
     """A measured pressure below that of vapour is vapour's, as one at it is."""
     machine = rig(tmp_path)
     circuit = CircuitEquations(machine.hydraulics, [STROKE])
-    one, none = np.array([0.2]), np.array([0.0])
-    start = circuit.initial_state(one, none, {"x": (0.0, 1e3)}, none, 1e5)
+    none = np.array([0.0])
+    start = circuit.initial_state(none, {"x": (0.0, 1e3)}, none, 1e5)
     np.testing.assert_array_equal(start[:2], [0.0, 0.0])
 
 

@@ -215,9 +215,7 @@ def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
     whole = simulate(forwarder, control, duration=0.253)
     assert steps["python"] == 0
     for chunk in (1, 7, 11, 252, 253, 254):
-        monkeypatch.setattr(
-            "crane.simulation.integration.fixed_step_integrator._STEPS_PER_REPORT", chunk
-        )
+        monkeypatch.setattr("crane.simulation.integration.integrators._STEPS_PER_REPORT", chunk)
         shares = []
         parts = simulate(forwarder, control, duration=0.253, progress=shares.append)
         assert off(parts, whole) < 1e-12
@@ -314,9 +312,7 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
     wanted = failing(steps, forwarder, control, **settings, backend="pinocchio")
     before = round(float(wanted.split()[3]) / 5e-3)  # "at t = 0.088 s: .."
     for chunk in (1, 2, 3, before - 1, before):
-        monkeypatch.setattr(
-            "crane.simulation.integration.fixed_step_integrator._STEPS_PER_REPORT", chunk
-        )
+        monkeypatch.setattr("crane.simulation.integration.integrators._STEPS_PER_REPORT", chunk)
         found = failing(steps, forwarder, control, **settings)
         assert found[:50] == wanted[:50]
 

@@ -8,8 +8,8 @@ from hydraulic_rig import rig
 from scipy.integrate import solve_ivp
 
 import crane
-from crane.hydraulics.load_sensing_stability import least_sensing_ratio, unstable_frequency_range
-from crane.hydraulics.supply_and_engine import Supply
+from crane.hydraulics.circuit_elements import Supply
+from crane.hydraulics.pump_equations import least_sensing_ratio, unstable_frequency_range
 from crane.recordings.limit_cycles import limit_cycles, ringing, sustained
 from crane.recordings.recording_summary import summarize
 

@@ -9,7 +9,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.simulation.linear.external_force_derivatives import LinearizedExternalForces
+from crane.simulation.linear.linearization import LinearizedExternalForces
 
 
 def quiet(call, *args, **options):

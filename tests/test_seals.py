@@ -16,7 +16,9 @@ from crane.description.parameter_units import parameter_unit
 from crane.dynamics import Dynamics
 from crane.dynamics.joint_forces import MIN_COULOMB_FRICTION, find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
-from crane.hydraulics.components import Cylinder, Hydraulics, Oil, Supply, Valve
+from crane.hydraulics.circuit_elements import Supply
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics, Oil
 from crane.hydraulics.valve_cylinder_equations import ValveCylinderEquations
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.recordings import timeseries
@@ -285,12 +287,12 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
         at = slow.state_layout.view(state)
         at.q[:] = machine.closure.solve(recording.q[i])
         at.v_a[:] = recording.v[i]
-        at.own[:] = drive.start(recording.q[i])
+        at.controller[:] = drive.start(recording.q[i])
         for joint, start in zip(
             drive.circuit.joints, drive.circuit.cylinder_state_starts, strict=True
         ):
             for k, side in enumerate("ab"):
-                at.own[start + k] = recording.channels[f"pressure_{joint}_{side}"][i] - 1e3
+                at.controller[start + k] = recording.channels[f"pressure_{joint}_{side}"][i] - 1e3
         slow.find_modes(time, state)
         other = state.copy()
         checked.find_modes(time, other)

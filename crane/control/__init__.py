@@ -1,6 +1,8 @@
-"""Controllers: forces of the active joints, or signals of valves, from time and motion."""
+"""Controllers: active forces, or signals of valves, from time and motion."""
 
 from crane.control.control_law import (
+    PI,
+    ComputedTorque,
     ControlLaw,
     Controller,
     ControllerInputs,
@@ -10,14 +12,15 @@ from crane.control.control_law import (
     controller_reference,
 )
 from crane.control.controller_registry import CONTROLLERS, default_controller_name, make_controller
-from crane.control.force_controllers import PI, ComputedTorque
-from crane.control.lever_phases import LeverPhases
-from crane.control.lever_signals import joystick
+from crane.control.levers import LeverPhases, joystick
 from crane.control.tip_velocity import TipVelocity
 from crane.control.valve_commands import SampledCommand, ValveCommand, ValvePD, ValveSignals
 from crane.control.valve_drive import ValveDrive
-from crane.control.valve_feedforward import ValveFeedforward
-from crane.control.valve_openings import fastest_trajectory, largest_flow_share
+from crane.control.valve_feedforward import (
+    ValveFeedforward,
+    fastest_trajectory,
+    largest_flow_share,
+)
 
 __all__ = [
     "CONTROLLERS",

@@ -1,32 +1,39 @@
-"""What a controller is: a function, a class with states, or a law that becomes machine code."""
+"""Controllers of the active forces: base class of control laws, PI control, computed torque."""
 
-from collections.abc import Callable, Sequence
+import itertools
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crane.codegen import Scalar
+from crane.codegen.symbolic import subtract_vectors
+from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
-from crane.common.samples import Array, as_sample
+from crane.common.samples import Array, as_number, as_sample
+from crane.description import PIGains
 from crane.dynamics import Dynamics
 from crane.dynamics.external_forces import static_active_forces
+from crane.dynamics.hybrid_dynamics import hybrid_dynamics
 from crane.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 
 
 class Controller(Protocol):
-    """What `simulate` asks of a controller; a plain function (t, q_a, v_a) -> tau_a serves too.
+    """Interface of a controller for `simulate`, which also accepts (t, q_a, v_a) -> tau_a.
 
-    It may have a `reference`, the reference motion, which gives `simulate` start and duration.
+    A controller may have a `reference` trajectory, from which `simulate` takes start and duration.
     """
 
     def start(self, q_a: Array) -> Array:
-        """The controller's own states (k,) at the start, integrated with the machine's."""
+        """Initial controller states (k,), which are integrated with the state of the machine."""
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
-        """Active forces (n,) [N], [N m], and the rate (k,) of the controller's states."""
+        """Active forces (n,) [N], [N m], and rates (k,) of the controller states."""
 
 
 class InverseDynamicsFunction(Protocol):
@@ -37,23 +44,23 @@ class InverseDynamicsFunction(Protocol):
 
 
 class GravityFunction(Protocol):
-    """Weight at an instant."""
+    """Gravity force at an instant."""
 
     def __call__(self) -> list[Scalar]:
-        """Active forces (n,) [N], [N m] that hold the weight alone, see `Dynamics.gravity`."""
+        """Active forces (n,) [N], [N m] that balance gravity, see `Dynamics.gravity`."""
 
 
 class ControllerInputs(NamedTuple):
-    """What a law sees at an instant: floats, or formulas while it becomes machine code.
+    """Inputs of a control law at an instant: floats, or formulas while it is traced.
 
     Attributes:
         q_a: (n,) active coordinates [m], [rad].
-        v_a: (n,) their velocities [m/s], [rad/s].
-        state: (k,) the law's own states.
+        v_a: (n,) active velocities [m/s], [rad/s].
+        state: (k,) states of the controller.
         settings: (s,) its `settings`.
-        reference: (c,) its row of `references`.
-        inverse: The machine's inverse dynamics here.
-        gravity: What holds its weight here.
+        reference: (c,) its `references` at the instant.
+        inverse: Inverse dynamics of the machine.
+        gravity: Gravity force of the machine.
     """
 
     q_a: list[Scalar]
@@ -67,35 +74,35 @@ class ControllerInputs(NamedTuple):
 
 @runtime_checkable
 class TracedController(Controller, Protocol):
-    """A controller that can become part of the simulation's machine code; `ControlLaw` makes one.
+    """A controller that can be compiled with the simulation; see `ControlLaw` for a base class.
 
     Attributes:
-        settings: (s,) its numbers.
+        settings: (s,) its parameters.
     """
 
     settings: Array
 
     def references(self, times: Array) -> Array:
-        """All that depends on time alone, (N, c) at times (N,) [s]."""
+        """Inputs that depend on time alone, (N, c) at times (N,) [s]."""
 
     def trace(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
-        """`__call__` as formulas."""
+        """The outputs of `__call__` as formulas."""
 
 
 class ControlLaw(OneLineRepr):
-    """A controller whose law is written once, and called in numbers as well as traced.
+    """Base class of controllers whose law is evaluated with floats and traced as formulas.
 
-    A law writes `law`, and `initial_state`, `references`, `settings`, `reference` where it has
-    states, depends on time, has numbers that change from one to the next, follows a motion. The
-    rest follows.
+    A subclass implements `law`. It also implements `initial_state` if it has states, `references`
+    if it depends on time, and sets `settings` if it has parameters and `reference` if it follows a
+    trajectory.
 
     Args:
         machine: The machine.
 
     Attributes:
-        reference: The reference motion, or None.
-        settings: (s,) numbers that machine code is not made anew for when they change. All other
-            numbers of a law become part of the code.
+        reference: The reference trajectory, or None.
+        settings: (s,) parameters that can change without a new compilation. All other constants of
+            a law become part of the machine code.
     """
 
     reference: Trajectory | None = None
@@ -108,65 +115,55 @@ class ControlLaw(OneLineRepr):
         """Active forces (n,) [N], [N m], 0.0 of free joints, and rates (k,) of the states.
 
         Args:
-            inputs: What it sees, floats or formulas: `q_a`, `v_a` (n,), `state` (k,), `settings`
-                (s,), `reference` (c,), and, as `Dynamics` has them, `inverse(a_a, friction)` and
-                `gravity()`.
+            inputs: Floats or formulas: `q_a`, `v_a` (n,), `state` (k,), `settings` (s,),
+                `reference` (c,), and the functions `inverse(a_a, friction)` and `gravity()` of
+                `Dynamics`.
         """
         raise NotImplementedError
 
     def select_driven(self, values: Sequence[Scalar]) -> list[Scalar]:
-        """Those of all active joints (n,) that belong to the driven ones."""
-        return [
-            value for value, moved in zip(values, self.machine.is_driven, strict=True) if moved
-        ]
+        """Values of the driven joints, from those of all active joints (n,)."""
+        return list(itertools.compress(values, self.machine.is_driven))
 
     def expand_driven(self, forces: Sequence[Scalar]) -> list[Scalar]:
-        """Forces (n,) of all active joints from those of the driven ones."""
-        given = iter(forces)
-        return [next(given) if moved else 0.0 for moved in self.machine.is_driven]
+        """Forces (n,) of all active joints, from those of the driven joints."""
+        remaining = iter(forces)
+        return [next(remaining) if driven else 0.0 for driven in self.machine.is_driven]
 
     def initial_state(self, inputs: ControllerInputs) -> Sequence[Scalar]:
-        """The law's own states (k,) at the start, seen in numbers and at rest; none yet.
+        """Initial states (k,) of the controller for a machine at rest; empty by default.
 
-        What the drives have to give then, `inputs.inverse`, is less by what forces from outside do
-        at time 0: a machine that carries a load hangs as still as one with a payload.
+        Args:
+            inputs: Floats. `inputs.inverse` is less the external forces at time 0, so that a
+                machine with a load is held still like one with a payload.
         """
         return ()
 
     def references(self, times: Array) -> Array:
-        """All that depends on time alone, (N, c) at times (N,) [s]; none yet."""
+        """Inputs that depend on time alone, (N, c) at times (N,) [s]; none by default."""
         return np.zeros((len(times), 0))
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
-        # nothing is worth compiling for one posture
+        # compiling does not pay for a single configuration
         dynamics = Dynamics(self.machine, backend="pinocchio")
         return self.start_closed(dynamics, self.machine.closure.solve(q_a))
 
     def start_closed(self, dynamics: Dynamics, q: Array) -> Array:
-        """`start` at a posture (nq,) that is closed already, of an exact `Dynamics`."""
+        """`start` at a closed configuration (nq,), with exact dynamics."""
         q_a = q[self.machine.closure.active]
-        zero_velocity = np.zeros_like(q_a)
-        static_forces = static_active_forces(
-            dynamics.machine, q
-        )  # a run's may carry more than the law's
+        zeros, evaluate = np.zeros_like(q_a), dynamics.tree_dynamics.evaluate
+        # the machine of a run may have more external forces than that of the law
+        static_forces = static_active_forces(dynamics.machine, q)
 
         def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
             quantity = "inverse with friction" if friction else "inverse"
-            needed = (
-                dynamics.tree_dynamics.evaluate(quantity, q, zero_velocity, np.array(a_a))
-                - static_forces
-            )
-            found: list[Scalar] = needed.tolist()
-            return found
+            return (evaluate(quantity, q, zeros, np.array(a_a)) - static_forces).tolist()
 
         def gravity() -> list[Scalar]:
-            found: list[Scalar] = dynamics.tree_dynamics.evaluate(
-                "gravity", q, zero_velocity, zero_velocity
-            ).tolist()
-            return found
+            return evaluate("gravity", q, zeros, zeros).tolist()
 
-        inputs = self._numeric_inputs(0.0, q_a, zero_velocity, np.zeros(0), inverse, gravity)
+        inputs = self._numeric_inputs(0.0, q_a, zeros, np.zeros(0), inverse, gravity)
         return np.array(self.initial_state(inputs), dtype=np.float64)
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
@@ -175,20 +172,18 @@ class ControlLaw(OneLineRepr):
         return np.array(tau, dtype=np.float64), np.array(rate, dtype=np.float64)
 
     def trace(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
-        """What `law` gives, as formulas."""
+        """The outputs of `law` as formulas."""
         return self.law(inputs)
 
     def inputs_at(self, time: float, q_a: Array, v_a: Array, state: Array) -> ControllerInputs:
-        """What the law sees at a time [s] with (n,), (n,), (k,), in numbers."""
+        """Inputs at a time [s] as floats, from q_a (n,), v_a (n,) and states (k,)."""
 
         def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
-            wanted = np.array(a_a, dtype=np.float64)
-            found: list[Scalar] = self._dynamics.inverse(q_a, v_a, wanted, friction).tolist()
-            return found
+            accelerations = np.array(a_a, dtype=np.float64)
+            return self._dynamics.inverse(q_a, v_a, accelerations, friction).tolist()
 
         def gravity() -> list[Scalar]:
-            found: list[Scalar] = self._dynamics.gravity(q_a).tolist()
-            return found
+            return self._dynamics.gravity(q_a).tolist()
 
         return self._numeric_inputs(time, q_a, v_a, state, inverse, gravity)
 
@@ -201,12 +196,11 @@ class ControlLaw(OneLineRepr):
         inverse: InverseDynamicsFunction,
         gravity: GravityFunction,
     ) -> ControllerInputs:
-        reference = self.references(np.array([time]))[0]
-        vectors = (q_a, v_a, state, self.settings, reference)
-        columns: list[list[Scalar]] = [vector.tolist() for vector in vectors]
+        references = self.references(np.array([time]))[0].tolist()
         return ControllerInputs(
-            columns[0], columns[1], columns[2], columns[3], columns[4], inverse, gravity
-        )
+            q_a.tolist(), v_a.tolist(), state.tolist(), self.settings.tolist(), references,
+            inverse, gravity,
+        )  # fmt: skip
 
     @cached_property
     def _dynamics(self) -> Dynamics:
@@ -214,7 +208,7 @@ class ControlLaw(OneLineRepr):
 
 
 class ZeroForce(ControlLaw):
-    """No active forces."""
+    """A controller without active forces."""
 
     def law(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
         """See `ControlLaw`."""
@@ -222,10 +216,10 @@ class ZeroForce(ControlLaw):
 
 
 class FunctionController:
-    """A plain function of the user as a controller.
+    """A Python function as a controller.
 
     Args:
-        function: (t, q_a, v_a) -> tau_a, of all active joints or of the driven ones alone.
+        function: (t, q_a, v_a) -> tau_a, of all active joints or of the driven joints.
         machine: The machine.
     """
 
@@ -246,6 +240,166 @@ class FunctionController:
 
 
 def controller_reference(controller: Controller, machine: Machine) -> Trajectory | None:
-    """The reference motion of a controller, if it has one, of all active joints."""
+    """The reference of a controller for all active joints; None if it has none."""
     reference = getattr(controller, "reference", None)
     return None if reference is None else add_free_joints(machine, reference)
+
+
+class PI(ControlLaw):
+    """One PI controller per driven joint, equation (7) of the reduced-scale forwarder paper.
+
+    tau = K_p e + K_i int e dt, e = q_ref(t) - q_A. Free joints get no force.
+
+    Args:
+        machine: The machine.
+        reference: Trajectory of the driven joints, see `add_free_joints`.
+        gains: `PIGains` by driven joint, as {"X1": crane.PIGains(kp, ki)}; those of the machine
+            file if not given.
+        integral: (k,) initial values of int e dt of the driven joints [m s], [rad s]. By default
+            they balance gravity, as those of a controlled machine that stands still. With zeros
+            the machine falls until the integrals have grown.
+
+    Raises:
+        InputError: A joint has no gains, or they are no `PIGains`.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        reference: Trajectory,
+        gains: Mapping[str, PIGains] | None = None,
+        integral: ArrayLike | None = None,
+    ):
+        gains = machine.control if gains is None else gains
+        if not isinstance(gains, Mapping):
+            raise InputError(
+                f"gains are a {type(gains).__name__}, give them by joint: "
+                f"{_gains_example('JOINT')}"
+            )
+        driven = machine.driven_joints
+        for joint in driven:
+            if joint not in gains:
+                raise InputError(
+                    f"no PI gains for driven joint '{joint}' of '{machine.name}', give kp and ki "
+                    f"under 'control' of the machine file, or in Python {_gains_example(joint)}"
+                )
+            if not isinstance(gains[joint], PIGains):
+                raise InputError(
+                    f"gains of '{joint}' are a {type(gains[joint]).__name__}, give "
+                    f"{_gains_example(joint)}"
+                )
+        super().__init__(machine)
+        self.reference: Trajectory = add_free_joints(machine, reference)
+        self._initial_integral = (
+            None if integral is None else as_sample(integral, len(driven), "integral", driven)
+        )
+        self.settings = np.array(
+            [*(gains[joint].kp for joint in driven), *(gains[joint].ki for joint in driven)],
+            dtype=np.float64,
+        )
+
+    def initial_state(self, inputs: ControllerInputs) -> Sequence[Scalar]:
+        """See `ControlLaw`."""
+        if self._initial_integral is not None:
+            return list(self._initial_integral)
+        holding_forces = np.array(
+            self.select_driven(inputs.inverse([0.0] * len(inputs.q_a), friction=True))
+        )
+        kp, ki = np.array(self._gains(inputs))
+        has_integral_gain = ki > 0
+        integral_forces = np.where(
+            has_integral_gain, holding_forces - kp * np.array(self._error(inputs)), 0.0
+        )
+        return list(integral_forces / np.where(has_integral_gain, ki, 1.0))
+
+    def references(self, times: Array) -> Array:
+        """See `ControlLaw`."""
+        return self.reference.position(times)[:, self.machine.is_driven]
+
+    def law(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """See `ControlLaw`; the states are the integrals of the errors."""
+        error = self._error(inputs)
+        kp, ki = self._gains(inputs)
+        forces = [p * e + i * z for p, i, e, z in zip(kp, ki, error, inputs.state, strict=True)]
+        return self.expand_driven(forces), error
+
+    def _error(self, inputs: ControllerInputs) -> list[Scalar]:
+        return subtract_vectors(inputs.reference, self.select_driven(inputs.q_a))
+
+    def _gains(self, inputs: ControllerInputs) -> tuple[list[Scalar], list[Scalar]]:
+        k = len(inputs.reference)
+        return inputs.settings[:k], inputs.settings[k : 2 * k]
+
+
+class ComputedTorque(ControlLaw):
+    """Inverse dynamics with a critically damped error: e'' + 2 w e' + w^2 e = 0.
+
+    tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
+
+    Free joints get no force and follow no reference; the forces of driven joints are then those
+    of `Dynamics.hybrid`. If an active joint has no drive in the description
+    (`Machine.undriven_joints`), a warning names it and its largest force along the reference.
+
+    Args:
+        machine: The machine.
+        reference: Trajectory of the driven joints, see `add_free_joints`.
+        bandwidth: w [rad/s].
+    """
+
+    def __init__(self, machine: Machine, reference: Trajectory, bandwidth: float = 20.0):
+        super().__init__(machine)
+        self.reference: Trajectory = add_free_joints(machine, reference)
+        self.settings = np.array([as_number(bandwidth, "the bandwidth", "rad/s", greater_than=0)])
+        if machine.undriven_joints:
+            warnings.warn(self._undriven_joints_text(machine), CraneWarning, stacklevel=2)
+
+    def _undriven_joints_text(self, machine: Machine) -> str:
+        """Warning about joints that are controlled although they have no drive."""
+        reference = self.reference
+        try:
+            peaks = np.abs(
+                self._dynamics.inverse(
+                    *reference(np.linspace(0.0, reference.duration, 201)), friction=True
+                )
+            ).max(axis=0)
+        except ClosureError:  # the simulation reports where
+            peaks = np.full(len(machine.active), np.nan)
+        words = []
+        for joint in machine.undriven_joints:
+            peak = peaks[machine.active.index(joint)]
+            unit = "N" if machine.unit(joint) == "m" else "N m"
+            words.append(f"'{joint}'" + (f" (up to {peak:.3g} {unit})" if peak == peak else ""))
+        return (
+            f"nothing is said to drive {', '.join(words)} of '{machine.name}', computed torque "
+            "does so all the same: write an effort above 0 into the <limit> of what is driven, or "
+            "describe its cylinder or gains, and lock what is not"
+        )
+
+    def references(self, times: Array) -> Array:
+        """See `ControlLaw`."""
+        return np.concatenate(
+            [x[:, self.machine.is_driven] for x in self.reference(times)], axis=1
+        )
+
+    def law(self, inputs: ControllerInputs) -> tuple[Sequence[Scalar], Sequence[Scalar]]:
+        """See `ControlLaw`."""
+        w, k = inputs.settings[0], int(self.machine.is_driven.sum())
+        reference_motion = (inputs.reference[i * k : (i + 1) * k] for i in range(3))
+        accelerations: list[Scalar] = [
+            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - q)
+            for q_ref, v_ref, a_ref, q, v in zip(
+                *reference_motion,
+                self.select_driven(inputs.q_a),
+                self.select_driven(inputs.v_a),
+                strict=True,
+            )
+        ]
+        tau, _ = hybrid_dynamics(
+            inputs.inverse, self.machine.is_driven.tolist(), accelerations, friction=True
+        )
+        return self.expand_driven(tau), ()
+
+
+def _gains_example(joint: str) -> str:
+    """Example of the argument `gains`."""
+    return f"gains={{'{joint}': crane.PIGains(kp, ki)}}"

@@ -1,10 +1,9 @@
-"""Controllers by name."""
+"""Built-in controllers by name."""
 
 from collections.abc import Callable, Mapping
 
 from crane.common.errors import InputError, suggest_names
-from crane.control.control_law import Controller
-from crane.control.force_controllers import PI, ComputedTorque
+from crane.control.control_law import PI, ComputedTorque, Controller
 from crane.control.tip_velocity import TipVelocity
 from crane.control.valve_commands import ValveCommand, ValvePD
 from crane.control.valve_feedforward import ValveFeedforward
@@ -21,7 +20,7 @@ CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | ValveComm
 
 
 def default_controller_name(machine: Machine) -> str:
-    """The controller that follows a machine's tasks if none is named."""
+    """Name of the default controller for the tasks of a machine."""
     if machine.hydraulics is not None and machine.hydraulics.control:
         return "valve-pd"
     return "pi" if machine.control else "computed-torque"
@@ -33,7 +32,7 @@ def make_controller(
     """A built-in controller by name.
 
     Raises:
-        InputError: There is no such controller.
+        InputError: The name is unknown.
     """
     if name not in CONTROLLERS:
         raise InputError(f"controller '{name}' is unknown, {suggest_names(CONTROLLERS, name)}")

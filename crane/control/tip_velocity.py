@@ -1,4 +1,4 @@
-"""Velocity of the boom's tip, commanded through the valves."""
+"""Valve signals that command the velocity of the tip."""
 
 from collections.abc import Callable
 
@@ -12,31 +12,32 @@ from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory
 
-_DEAD_BAND_SMOOTHING = 1e-3  # opening over which the dead band is jumped
-_LIMIT_MARGIN = 1e-3  # of a stroke: a joint so close to its limit goes no further
+_DEAD_BAND_SMOOTHING = 1e-3  # opening over which the signal crosses the dead band
+_LIMIT_MARGIN = 1e-3  # share of the stroke within which a joint is at its limit
+_MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
 
 
 class TipVelocity(SampledCommand):
-    """The tip's velocity is asked for, the valves open as far as the flows need.
+    """Valve command that opens the valves for a velocity of the tip.
 
-    Once per period, with J the reduced Jacobian of the tip and W the strokes squared, joints
-    shared out by the least-norm solution
+    Once per period, with J the reduced Jacobian of the tip and W the squares of the strokes, the
+    joint velocities are the least-norm solution
 
-        v_A = W J^T (J W J^T)^+ x',    Q = A |v_A|,    y = Q / (c sqrt(dp)),
+        v_A = W J^T (J W J^T)^+ x',    Q = A |v_A|,    y = Q / (c sqrt(dp)).
 
-    dp the compensator's margin at the inlet or what the supply leaves of it, and at the outlet,
-    where the load drives the cylinder and thereby sets its speed, the pressure that the load
-    makes. The dead band is jumped. There is no feedback of the tip's position: the operator
-    closes that loop. Joints at their limits are left out, and all slow down together where a
-    valve is asked for more than it has.
+    At the inlet, dp is the margin of the compensator, or what the supply leaves of it. At the
+    outlet, which sets the speed where the load drives the cylinder, it is the pressure of the
+    load. The signals jump over the dead band. The position of the tip is not fed back: the
+    operator closes that loop. Joints at their limits are not used, and all velocities are reduced
+    where a valve would have to open more than fully.
 
     Args:
-        machine: The machine, its tip given.
-        velocity: (t) -> (3,) of the tip in the world [m/s], or a trajectory of the tip.
-        period: [s].
+        machine: A machine with a tip.
+        velocity: (t) -> (3,) velocity of the tip in the world [m/s], or a trajectory of the tip.
+        period: Sampling period [s].
 
     Raises:
-        InputError: No tip, no valves, or a trajectory that was not given for the tip.
+        InputError: No tip, no valves, or a trajectory of joints.
     """
 
     def __init__(
@@ -60,11 +61,11 @@ class TipVelocity(SampledCommand):
         self._joint_ranges = machine.upper - machine.lower
 
     def joint_velocities(self, q_a: Array, tip_velocity: Array) -> Array:
-        """Active velocities (n,) for one of the tip (3,), as far as joints within limits give it.
+        """Active velocities (n,) for a velocity of the tip, by the joints within their limits.
 
         Args:
-            q_a: (n,) [m], [rad].
-            tip_velocity: (3,) [m/s].
+            q_a: (n,) active coordinates [m], [rad].
+            tip_velocity: (3,) velocity of the tip [m/s].
         """
         jacobian = self._kinematics.jacobian(q_a)
         is_usable = np.zeros(len(q_a), dtype=bool)
@@ -92,33 +93,16 @@ class TipVelocity(SampledCommand):
             valve, cylinder = self._circuit.valves[joint], self._circuit.cylinders[joint]
             a, b = pressures[i]
             force = cylinder.area_a * a - cylinder.area_b * b
-            if v[i] > 0:
-                inlet, inlet_area, outlet, outlet_area = (
-                    valve.c1,
-                    cylinder.area_a,
-                    valve.c2,
-                    cylinder.area_b,
-                )
-                inlet_pressure_drop = supply.pressure - a
-            else:
-                inlet, inlet_area, outlet, outlet_area = (
-                    valve.c4,
-                    cylinder.area_b,
-                    valve.c3,
-                    cylinder.area_a,
-                )
-                inlet_pressure_drop = supply.pressure - b
-            drop = max(
-                min(inlet_pressure_drop, valve.margin) if valve.margin else inlet_pressure_drop,
-                1e5,
-            )
-            opening_size = inlet_area * abs(v[i]) / (inlet * np.sqrt(drop))
+            areas, pressure = (cylinder.area_a, cylinder.area_b), a
+            inlet, outlet = valve.c1, valve.c2
+            if v[i] <= 0:
+                areas, pressure, inlet, outlet = areas[::-1], b, valve.c4, valve.c3
+            drop = min(supply.pressure - pressure, valve.margin or np.inf)
+            size = areas[0] * abs(v[i]) / (inlet * np.sqrt(max(drop, _MIN_PRESSURE_DROP)))
             if force * v[i] < 0:
-                load = max(abs(force) / outlet_area, 1e5)
-                opening_size = min(
-                    opening_size, outlet_area * abs(v[i]) / (outlet * np.sqrt(load))
-                )
-            opening[i] = np.copysign(opening_size, v[i]) if v[i] else 0.0
+                load = max(abs(force) / areas[1], _MIN_PRESSURE_DROP)
+                size = min(size, areas[1] * abs(v[i]) / (outlet * np.sqrt(load)))
+            opening[i] = np.copysign(size, v[i]) if v[i] else 0.0
         opening /= max(1.0, np.abs(opening).max())
         openings = dict(zip(self._circuit.joints, opening, strict=True))
         signals = []

@@ -1,4 +1,4 @@
-"""Signals of valves: from a controller, a joystick, or a recording."""
+"""Sources of valve signals: given over time, PD control, functions in Python."""
 
 import threading
 from bisect import bisect_left, bisect_right
@@ -21,37 +21,32 @@ from crane.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 
-_MAX_LOG_INTERVAL = 0.02  # [s] between samples of a log, at most
-_SLOPE_TOLERANCE = (
-    1e-12  # of a signal, that slopes differ by over its shortest step where it goes on
-)
-_TIME_TOLERANCE = 1e-9  # of a period, between instants that are one
-_DEAD_BAND_SMOOTHING = (
-    0.01  # of the spool's stroke, over which the feedforward jumps the dead band
-)
+_MAX_LOG_INTERVAL = 0.02  # largest mean interval between the samples of a log [s]
+_SLOPE_TOLERANCE = 1e-12  # share of a signal: difference of equal slopes over the shortest step
+_TIME_TOLERANCE = 1e-9  # share of a period: difference of equal instants
+_DEAD_BAND_SMOOTHING = 0.01  # share of the stroke over which signals cross the dead band
 
 
 @runtime_checkable
 class ValveCommand(Protocol):
-    """Where the signals of m spools come from, one per valve and one more per second spool.
+    """Source of the signals of m spools: one per valve and one more per second spool.
 
-    What is written here is what those have that say nothing else. A valve with dead time gets the
-    signal of an earlier instant: `ValveDrive` asks for it.
+    The values below are the defaults. `ValveDrive` delays the signals of valves with a dead time.
 
     Attributes:
-        reference: The reference motion, or None.
-        initial_coordinates: (n,) active coordinates that it begins at, None for home or the
-            reference's start.
+        reference: The reference trajectory, or None.
+        initial_coordinates: (n,) initial active coordinates; None for home or the start of the
+            reference.
         has_measured_pressures: Whether the last two references are the pressures of supply and
             tank.
-        settings: (s,) its numbers.
-        period: Time between calls of `update` [s]; 0 if it wants none.
-        is_open_loop: Whether the first m references are the signals, whatever the machine does,
-            and those of instants that have passed are remembered.
-        duration: How long it takes, at most [s]; 0 where it does not know.
-        is_finished: Whether it has no more to do: a run that was given no duration ends then.
-        channels: Names and units of what its references have behind the signals, to be recorded.
-        clock: Tells its phase (N,) at times (N,) [s]; None where it has none.
+        settings: (s,) its parameters.
+        period: Time between calls of `update` [s]; 0 for no calls.
+        is_open_loop: Whether the first m references are the signals, independently of the machine,
+            and available for past instants.
+        duration: Largest duration [s]; 0 if unknown.
+        is_finished: Whether the command has ended; a run without a given duration ends then.
+        channels: Names and units of the references behind the signals, which are recorded.
+        clock: Function that returns phases (N,) at times (N,) [s]; None without phases.
     """
 
     reference: Trajectory | None = None
@@ -66,15 +61,22 @@ class ValveCommand(Protocol):
     clock: Callable[[Array], Array] | None = None
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
-        """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
+        """Compute the signals of the next period.
+
+        Args:
+            time: [s].
+            q: (nq,) configuration.
+            v_a: (n,) active velocities.
+            pressures: (cylinders, 2) pressures in A and B [Pa].
+        """
         return
 
     def references(self, times: Array) -> Array:
-        """All that depends on time alone, (N, c) at times (N,) [s]; nothing yet."""
+        """Inputs that depend on time alone, (N, c) at times (N,) [s]; none by default."""
         return np.zeros((len(times), 0))
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
-        """Signals (m,) [V], from floats or as formulas; what it sees are its own settings."""
+        """Signals (m,) [V], floats or formulas; `inputs.settings` are those of the command."""
         raise NotImplementedError
 
 
@@ -93,28 +95,28 @@ def require_circuit(machine: Machine) -> Hydraulics:
 
 
 def lever_signals(spool: Valve | Spool, lever: Array) -> Array:
-    """Signals of a spool (.,) [V] for a lever (.,) from -1 to 1, a share of its valve's flow.
+    """Signals of a spool (N,) [V] for lever positions (N,) from -1 to 1, shares of the flow.
 
-    Beyond zero it jumps over the dead band, as the electronics of such machines do.
+    The signal jumps over the dead band at zero, as that of the electronics of such machines.
     """
     u = lever * (1.0 - spool.dead_band) + spool.dead_band * np.sign(lever)
     return np.asarray(spool.neutral + (spool.full - spool.neutral) * u)
 
 
 class ValveSignals(ValveCommand, OneLineRepr):
-    """Signals given in time, straight between the instants and constant beyond them.
+    """Signals over time, linear between the given instants and constant outside of them.
 
     Args:
         machine: The machine.
         time: Instants (N,) [s], increasing.
-        signals: [V] (N,) by joint, and by JOINT_b of second spools, which get that of the first
-            one if they are not named; valves that are not named stay neutral.
-        supply: Measured pressure of the supply (N,) [Pa], if it is to be used.
+        signals: Signals (N,) [V] by joint, and by JOINT_b for second spools, whose default is the
+            signal of the first spool. Other valves stay neutral.
+        supply: Measured pressure of the supply (N,) [Pa]; that of the circuit if not given.
         tank: Measured pressure of the tank (N,) [Pa]; that of the machine file if not given.
 
     Attributes:
-        title: What they come from, in words; recordings name their controller by it.
-        duration: From zero to the last instant [s].
+        title: Name of the controller in recordings.
+        duration: Time of the last instant [s].
 
     Raises:
         InputError: Unknown joints, wrong lengths, or times that do not increase.
@@ -169,7 +171,7 @@ class ValveSignals(ValveCommand, OneLineRepr):
                         "vacuum and cannot be negative: add 1e5 to gauge pressures"
                     )
             highest = float(columns[-2].max())
-            if 0 < highest < columns[-1].min() / 2:  # also of a pump that rests the line has more
+            if 0 < highest < columns[-1].min() / 2:  # the line of an idle pump has more pressure
                 raise InputError(
                     f"pressure of the supply is {highest:g} Pa at most, far below the tank's"
                     + (
@@ -185,22 +187,18 @@ class ValveSignals(ValveCommand, OneLineRepr):
         return as_sample(values, len(self._instants), label)
 
     def breaks(self) -> Array:
-        """Times (k,) [s] at which signals turn; none of a log, whose samples are close."""
-        if len(self._instants) > 1 and self.duration - self._instants[0] < _MAX_LOG_INTERVAL * len(
-            self._instants
-        ):
-            return np.zeros(0)
-        return self._instants
+        """Times (k,) [s] at which slopes change; none for a log, whose samples are close."""
+        count, length = len(self._instants), self.duration - self._instants[0]
+        return np.zeros(0) if count > 1 and length < _MAX_LOG_INTERVAL * count else self._instants
 
     def slope_changes(self, spool_index: int) -> Array:
-        """Times (k,) [s] at which the signal of a spool turns."""
+        """Times (k,) [s] at which the slope of the signal of a spool changes."""
         time, values = self._instants, self._columns[:, spool_index]
         if len(time) < 2:
             return time
         slopes = np.concatenate([[0.0], np.diff(values) / np.diff(time), [0.0]])
         slope_tolerance = _SLOPE_TOLERANCE * np.abs(values).max() / np.diff(time).min()
-        corner_times: Array = time[np.abs(np.diff(slopes)) > slope_tolerance]
-        return corner_times
+        return time[np.abs(np.diff(slopes)) > slope_tolerance]
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`."""
@@ -214,14 +212,13 @@ class ValveSignals(ValveCommand, OneLineRepr):
 class ValvePD(ValveCommand, OneLineRepr):
     """One PD controller per spool, equation (37) of the electro-hydraulic forwarder paper.
 
-    u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f, with the feedforward F_f that jumps over the
-    dead band d: F_f = d tanh(w / 0.01), w the sum of the other terms. q are the active joints'
-    own coordinates.
+    u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f. The feedforward F_f = d tanh(w / 0.01), with w
+    the sum of the other terms, jumps over the dead band d. q are the active coordinates.
 
     Args:
         machine: The machine.
-        reference: Reference of the active joints.
-        gains: By joint; those of the machine file if not given.
+        reference: Trajectory of the active joints.
+        gains: Gains by joint; those of the machine file if not given.
 
     Raises:
         InputError: No valves, or no gains for one.
@@ -242,13 +239,13 @@ class ValvePD(ValveCommand, OneLineRepr):
         spools = circuit.spools.values()
         self._active_indices = [machine.active.index(spool.joint) for spool in spools]
         settings = [
-            [gains[spool.joint].kp for spool in spools],
-            [gains[spool.joint].kd for spool in spools],
-            [spool.dead_band for spool in spools],
-            [spool.neutral for spool in spools],
-            [spool.full - spool.neutral for spool in spools],
-        ]
-        self.settings = np.array(settings, dtype=np.float64).ravel()
+            (
+                gains[spool.joint].kp, gains[spool.joint].kd, spool.dead_band, spool.neutral,
+                spool.full - spool.neutral,
+            )
+            for spool in spools
+        ]  # fmt: skip
+        self.settings = np.array(settings, dtype=np.float64).T.ravel()
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`."""
@@ -275,11 +272,11 @@ class ValvePD(ValveCommand, OneLineRepr):
 
 
 class _HeldSignals(threading.local):
-    """Signals (s,) that the valves keep until they are set again, in every thread its own.
+    """Signals (s,) that are held until the next sample, separate in each thread.
 
     Attributes:
-        signals: All of them.
-        set_times: When each of them was set [s].
+        signals: The signals of all samples.
+        set_times: Times of the samples [s].
     """
 
     def __init__(self, signals: Array):
@@ -287,14 +284,14 @@ class _HeldSignals(threading.local):
 
 
 class SampledCommand(ValveCommand, OneLineRepr):
-    """A program of the user that sets the valves once per period, as a control unit does.
+    """A Python function that sets the valve signals once per period, as a control unit does.
 
     Args:
-        function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.spools`,
-            which are its joints where no valve has two; t [s], q_a and v_a (n,), pressures (m, 2)
+        function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.spools`
+            (its joints where no valve has two spools); t [s], q_a and v_a (n,), pressures (m, 2)
             of A and B by joint [Pa], signals (s,) [V].
         machine: The machine.
-        period: [s], a whole number of steps of the simulation.
+        period: Sampling period [s], a whole number of steps of the simulation.
     """
 
     is_open_loop = True
@@ -313,28 +310,25 @@ class SampledCommand(ValveCommand, OneLineRepr):
         self._active_columns = machine.closure.active
         self.period = as_number(period, "the period", "s", greater_than=0)
         neutral = np.array([spool.neutral for spool in circuit.spools.values()])
-        self._held_signals = _HeldSignals(neutral)  # by a run, which is one thread's
+        self._held_signals = _HeldSignals(neutral)  # a run is in one thread
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `ValveCommand`."""
         signals = self._function(time, q[self._active_columns].copy(), v_a.copy(), pressures)
         label = f"the signals at t = {time:g} s"
         held = self._held_signals
-        kept_count = bisect_left(
-            held.set_times, time - _TIME_TOLERANCE * self.period
-        )  # what is later is of before
-        held.set_times[kept_count:] = [time]
-        held.signals[kept_count:] = [
+        # later samples are those of an earlier run
+        count = bisect_left(held.set_times, time - _TIME_TOLERANCE * self.period)
+        held.set_times[count:] = [time]
+        held.signals[count:] = [
             as_sample(signals, len(self._spool_names), label, self._spool_names)
         ]
 
     def references(self, times: Array) -> Array:
-        """See `ValveCommand`; between two jumps, at which steps end, it holds one signal."""
+        """See `ValveCommand`; all times are between two samples, at which steps end."""
         mid_time = 0.5 * (times[0] + times[-1]) + _TIME_TOLERANCE * self.period
-        held = self._held_signals.signals[
-            max(bisect_right(self._held_signals.set_times, mid_time) - 1, 0)
-        ]
-        return np.tile(held, (len(times), 1))
+        i = max(bisect_right(self._held_signals.set_times, mid_time) - 1, 0)
+        return np.tile(self._held_signals.signals[i], (len(times), 1))
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ValveCommand`."""

@@ -1,4 +1,4 @@
-"""A hydraulic circuit and what commands its valves, as the controller of a machine's forces."""
+"""A hydraulic circuit with its valve commands as a controller of the active forces."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,33 +19,34 @@ from crane.hydraulics import CircuitEquations
 from crane.hydraulics.circuit_equations import CircuitValues
 from crane.machine import Machine
 
-_SAMPLING_PERIOD = 1e-3  # [s] between questions of a control unit
-_RECORDED_STATE_PREFIXES = (
-    "spring_",
-    "oil_",
-)  # states of the circuit that are recorded: compressions, oil under gas
+_SAMPLING_PERIOD = 1e-3  # sampling period of a law with delayed valves [s]
+# states of the circuit that are recorded: compressions of springs, oil in accumulators
+_RECORDED_STATE_PREFIXES = ("spring_", "oil_")
 
 
 class ValveDrive(ControlLaw):
-    """The circuit between the valves' signals and the active forces.
+    """Control law whose forces are those of a hydraulic circuit with commanded valves.
 
-    Its states are those of `CircuitEquations`. Active joints without a cylinder are free.
+    Its states are those of `CircuitStates`. Active joints without a cylinder are free.
 
-    A spool with dead time gets the signal of t - delay, and until then the first one. What goes by
-    time alone is asked for earlier instants; a law that looks at the machine is asked once per
-    millisecond then, and held, as in a control unit.
+    A spool with a dead time gets the signal of the time t - delay, and before that the first
+    signal. An open-loop command is evaluated at earlier instants; another command is then sampled
+    once per millisecond and held, as in a control unit.
 
     Args:
         machine: The machine.
-        command: Where the signals come from.
-        pressures: Of A and B at the start [Pa] by joint, where they are known; else what holds
-            the machine still, the unloaded side at the tank's pressure.
+        command: Source of the signals.
+        pressures: Initial pressures in A and B [Pa] by joint. By default they hold the machine
+            still, with the tank pressure in the unloaded chamber.
 
     Attributes:
         delays: (s,) dead times of the spools [s].
+        circuit: The equations of the circuit.
+        channels: Names and units of the recorded channels.
+        scales: Required accuracy of the states.
 
     Raises:
-        InputError: The machine has no circuit, a joint no cylinder, or a pressure cannot be.
+        InputError: The machine has no circuit, a joint no cylinder, or a pressure is negative.
     """
 
     def __init__(
@@ -96,10 +97,10 @@ class ValveDrive(ControlLaw):
         self.channels = self._channel_units()
 
     def for_machine(self, machine: Machine) -> "ValveDrive":
-        """The same commands and starting pressures at another machine.
+        """The same command and initial pressures for another machine.
 
         Raises:
-            InputError: Its valves have dead time and a law has not been sampled for that.
+            InputError: Its valves have a dead time, and the law is not sampled.
         """
         drive = ValveDrive(machine, self.command, self._initial_pressures)
         if drive.period != self.period:
@@ -110,7 +111,7 @@ class ValveDrive(ControlLaw):
         return drive
 
     def update(self, time: float, q: Array, v_a: Array, state: Array) -> None:
-        """Let the command look at the machine."""
+        """Sample the command, see `ValveCommand.update`."""
         vapour_pressure = self.circuit.hydraulics.oil.vapour_pressure
         chamber_pressures = np.array(
             [state[start : start + 2] for start in self.circuit.cylinder_state_starts]
@@ -125,9 +126,8 @@ class ValveDrive(ControlLaw):
         holding_forces = np.array(inputs.inverse([0.0] * len(inputs.q_a), friction=False))[
             self._active_indices
         ]
-        x = np.array(inputs.q_a)[self._active_indices] - self._lower_limits
         hydraulics = self.circuit.hydraulics
-        # a program has not been asked yet, and may remember an earlier simulation
+        # a sampled command has no signal yet, except perhaps those of an earlier run
         signals: Sequence[Scalar] = [spool.neutral for spool in hydraulics.spools.values()]
         if not self.command.period:
             signals = self.command.signals(self._command_inputs(inputs))
@@ -137,28 +137,27 @@ class ValveDrive(ControlLaw):
         initial_signals = np.array(signals, dtype=np.float64)
         return list(
             self.circuit.initial_state(
-                x, holding_forces, self._initial_pressures, initial_signals, tank
+                holding_forces, self._initial_pressures, initial_signals, tank
             )
         )
 
     def _command_inputs(self, inputs: ControllerInputs) -> ControllerInputs:
-        """What the command sees at the start."""
+        """Inputs of the command at the start."""
         reference = inputs.reference
         if self._signal_source is not self.command:
             reference = self.command.references(np.zeros(1))[0].tolist()
         return inputs._replace(settings=self.command.settings.tolist(), reference=reference)
 
     def _sample_signals(self, time: float, q_a: Array, v_a: Array, pressures: Array) -> Array:
-        """Signals (s,) of a law that is sampled."""
-        inputs = self.inputs_at(time, q_a, v_a, self._current_state)
-        reference: list[Scalar] = self.command.references(np.array([time]))[0].tolist()
-        command_inputs = inputs._replace(
-            settings=self.command.settings.tolist(), reference=reference
+        """Signals (s,) of a sampled law."""
+        inputs = self.inputs_at(time, q_a, v_a, self._current_state)._replace(
+            settings=self.command.settings.tolist(),
+            reference=self.command.references(np.array([time]))[0].tolist(),
         )
-        return np.array(self.command.signals(command_inputs), dtype=np.float64)
+        return np.array(self.command.signals(inputs), dtype=np.float64)
 
     def references(self, times: Array) -> Array:
-        """See `ControlLaw`; signals are those that reach the spools."""
+        """See `ControlLaw`; the signals are those at the spools, after their dead times."""
         samples = self._signal_source.references(times)
         for delay in np.unique(self.delays[self.delays > 0]):
             delayed = np.flatnonzero(self.delays == delay)
@@ -166,14 +165,14 @@ class ValveDrive(ControlLaw):
         return samples
 
     def commanded_signals(self, times: Array) -> Array:
-        """Signals (N, s) [V] as they were commanded at times (N,), of sources that are `given`."""
+        """Signals (N, s) [V] of an open-loop command at times (N,), before the dead times."""
         if not self.period:
             return self._signal_source.references(times)[:, : len(self.delays)]
         rows = [self._signal_source.references(times[i : i + 1]) for i in range(len(times))]
         return np.vstack(rows)[:, : len(self.delays)]
 
     def breaks(self) -> Array:
-        """Times (k,) [s] at which signals turn, as they are commanded and as they arrive."""
+        """Times (k,) [s] at which slopes of signals change, before and after the dead times."""
         source: Any = self.command
         if not hasattr(source, "breaks"):
             source = self.reference
@@ -184,7 +183,7 @@ class ValveDrive(ControlLaw):
         return np.concatenate([np.zeros(0), *break_lists])
 
     def next_delayed_jump(self, time: float) -> float:
-        """When, behind a time [s], a signal that is held next jumps late."""
+        """Next instant after a time [s] at which a sampled signal jumps after its dead time."""
         earliest = np.inf
         for delay in np.unique(self.delays[self.delays > 0]) if self.period else ():
             count = max(np.floor((time - delay) / self.period) + 1.0, 1.0)
@@ -198,16 +197,16 @@ class ValveDrive(ControlLaw):
         return self._active_forces(circuit_values), circuit_values.state_rates
 
     def circuit_friction(self, inputs: ControllerInputs) -> list[Scalar]:
-        """Coulomb friction [N], [N m] that the circuit adds to its joints."""
+        """Circuit friction of the joints `Hydraulics.circuit_friction_joints` [N], [N m]."""
         friction_joints = self.circuit.hydraulics.circuit_friction_joints
         if not friction_joints:
             return []
         circuit_values, _ = self._evaluate_circuit(inputs)
-        found = zip(self.circuit.joints, circuit_values.circuit_friction, strict=True)
-        return [grip for joint, grip in found if joint in friction_joints]
+        friction = zip(self.circuit.joints, circuit_values.circuit_friction, strict=True)
+        return [force for joint, force in friction if joint in friction_joints]
 
     def channel_values(self, inputs: ControllerInputs) -> list[Scalar]:
-        """What is recorded in `channels`."""
+        """Values of `channels`."""
         circuit_values, signals = self._evaluate_circuit(inputs)
         out: list[Scalar] = []
         signals_and_positions = iter(zip(signals, circuit_values.spool_positions, strict=True))
@@ -218,10 +217,9 @@ class ValveDrive(ControlLaw):
             if valve.spool_b:
                 out += next(signals_and_positions)
         out += [circuit_values.supply_pressure, circuit_values.tank_pressure]
-        circuit_states = dict(zip(self.circuit.state_units, inputs.state, strict=False))
         out += [
-            circuit_states[name]
-            for name in circuit_states
+            value
+            for name, value in zip(self.circuit.state_units, inputs.state, strict=False)
             if name.startswith(_RECORDED_STATE_PREFIXES)
         ]
         out += [circuit_values.pressures[name] for name in self._further_nodes]
@@ -235,7 +233,7 @@ class ValveDrive(ControlLaw):
     def _evaluate_circuit(
         self, inputs: ControllerInputs
     ) -> tuple[CircuitValues, Sequence[Scalar]]:
-        """The circuit, and the signals of its valves."""
+        """The circuit, and the signals at its valves."""
         m, size = len(self._active_indices), len(self.circuit.constants)
         lower = inputs.settings[size : size + m]
         signals = self._signal_source.signals(
@@ -266,9 +264,10 @@ class ValveDrive(ControlLaw):
             if self.circuit.hydraulics.valves[joint].spool_b:
                 channels += [(f"voltage_{joint}_b", "V"), (f"spool_{joint}_b", "")]
         channels += [("pressure_supply", "Pa"), ("pressure_tank", "Pa")]
-        units = self.circuit.state_units
         channels += [
-            (name, units[name]) for name in units if name.startswith(_RECORDED_STATE_PREFIXES)
+            (name, unit)
+            for name, unit in self.circuit.state_units.items()
+            if name.startswith(_RECORDED_STATE_PREFIXES)
         ]
         channels += [(f"pressure_{name}", "Pa") for name in self._further_nodes]
         for name in self.circuit.pumps:
@@ -279,6 +278,6 @@ class ValveDrive(ControlLaw):
 
     @property
     def _further_nodes(self) -> list[str]:
-        """Nodes beside tank, first pump and chambers."""
+        """Nodes except for tank, main pump and chambers."""
         circuit = self.circuit.hydraulics
         return [*circuit.supplies, *circuit.lines, *circuit.accumulators]

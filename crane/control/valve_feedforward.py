@@ -1,6 +1,7 @@
-"""Valves opened as far as a reference's flows need, with feedback of position and of sway."""
+"""Feedforward control of valves, with feedback of position and sway."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,50 +11,254 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValvePD, require_circuit
-from crane.control.valve_openings import check_invertible, openings_per_velocity, required_openings
 from crane.dynamics import Dynamics
 from crane.hydraulics import Hydraulics, PDGains
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.flow_equations import LAMINAR_PRESSURE_DROP
 from crane.machine import Machine
-from crane.motion.sway import Sway, suppress_sway
+from crane.motion.sway import Sway, retime, suppress_sway
+from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 
-_KNOTS_PER_SECOND = 50  # of forces and gains
-_STEPS_PER_SECOND = 1000  # of openings
-_DEAD_BAND_SMOOTHING = 0.003  # of the valve's flow, over which the dead band is jumped
-_REVERSAL_SMOOTHING = 0.02  # likewise, over which openings and friction change with the direction
+_MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
+_PRESSURE_DIFFERENCE = 1e3  # pressure step of difference quotients [Pa]
+_SAMPLES_PER_SECOND = 100  # samples of the flows of a trajectory
+_SHARE_TOLERANCE = 1e-3  # share of the shortest time
+_MAX_ITERATIONS = 30
+
+
+def openings_per_velocity(
+    valve: Valve, cylinder: Cylinder, supply: float, force: Array
+) -> tuple[Array, Array]:
+    """Opening of a valve per velocity, in the positive and in the negative direction.
+
+    The flow through the inlet is Q = c y sqrt(dp), with dp the margin of the compensator or what
+    the supply leaves. Where the load pulls the piston, the outlet sets the velocity.
+
+    Args:
+        valve: The valve.
+        cylinder: Its cylinder.
+        supply: Pressure of the supply [Pa].
+        force: (N,) force of the cylinder [N], [N m].
+
+    Returns:
+        Two arrays (N,) [s/m], [s/rad], both positive.
+    """
+
+    def opening(
+        force: Array, inlet: float, inlet_area: float, outlet: float, outlet_area: float
+    ) -> Array:
+        drop = np.minimum(supply - np.maximum(force, 0.0) / inlet_area, valve.margin or np.inf)
+        by_inlet = inlet_area / (inlet * np.sqrt(np.maximum(drop, _MIN_PRESSURE_DROP)))
+        load_pressure = np.maximum(np.maximum(-force, 0.0) / outlet_area, _MIN_PRESSURE_DROP)
+        by_outlet = outlet_area / (outlet * np.sqrt(load_pressure))
+        return np.where(force < 0, np.minimum(by_inlet, by_outlet), by_inlet)
+
+    return (
+        opening(force, valve.c1, cylinder.area_a, valve.c2, cylinder.area_b),
+        opening(-force, valve.c4, cylinder.area_b, valve.c3, cylinder.area_a),
+    )
+
+
+def check_invertible(circuit: Hydraulics) -> None:
+    """Check that a circuit has components that `required_openings` supports alone.
+
+    Raises:
+        InputError: It has a motor, or a valve with flow sharing, two spools or curves.
+    """
+    for joint, valve in circuit.valves.items():
+        for is_present, component in (
+            (circuit.cylinders[joint].motor, "a motor"),
+            (valve.sharing, "a valve that shares its flow"),
+            (valve.spool_b is not None, "a valve with two spools"),
+            (bool(valve.curves), "a valve with curves"),
+        ):
+            if is_present:
+                raise InputError(
+                    f"the feedforward of valves knows cylinders and valves without curves, "
+                    f"'{joint}' has {component}: take valve-pd"
+                )
+
+
+def required_openings(
+    circuit: Hydraulics, time: Array, x: Array, v: Array, force: Array, strokes: Array
+) -> Array:
+    """Openings of all valves that move their cylinders along a motion with its forces.
+
+    This is the inverse of the circuit. With C = V / K of the chambers, r the flow of suction
+    valves, and Q = q y through the open edges, the third of the equations
+
+        C_a p_a' = q_a y + r_a - A_a v,   C_b p_b' = A_b v - q_b y + r_b,   A_a p_a - A_b p_b = F,
+
+    is differentiated once, which gives y; one pressure is integrated. Where a chamber cavitates,
+    the other one sets the velocity alone. Leakage, cushions, relief and load-holding valves, and
+    the decrease of the supply pressure are neglected.
+
+    Args:
+        circuit: The circuit.
+        time: (N,) instants [s], about a millisecond apart.
+        x: (N, m) strokes above the lower limits [m], [rad].
+        v: (N, m) velocities [m/s], [rad/s].
+        force: (N, m) forces of the cylinders [N], [N m].
+        strokes: (m,) distances between the limits.
+
+    Returns:
+        (N, m) openings y; within -1 and 1 where the valve has that flow.
+    """
+
+    def of(items: Mapping[str, Any], *names: str) -> list[Array]:
+        return [np.array([getattr(items[joint], x) for joint in circuit.joints]) for x in names]
+
+    oil, tank, pump = circuit.oil, circuit.supply.tank, circuit.supply.pressure
+    area_a, area_b, hose_a, hose_b, stiffness = of(
+        circuit.cylinders, "area_a", "area_b", "hose_a", "hose_b", "stiffness"
+    )
+    c1, c2, c3, c4, margin = of(circuit.valves, "c1", "c2", "c3", "c4", "margin")
+    margin = np.where(margin > 0, margin, pump)
+    hose, steel = (1.0 / k if k else 0.0 for k in (oil.hose_modulus, oil.steel_modulus))
+    force_rate = np.gradient(force, time, axis=0)
+    # the spring between cylinder and joint is compressed
+    compliance = np.where(stiffness > 0, 1.0 / np.where(stiffness > 0, stiffness, 1.0), 0.0)
+    x, v = x + compliance * force, v + compliance * force_rate
+    inside_a, inside_b = area_a * x, area_b * (strokes - x)
+    compliance_a = hose_a * hose + inside_a * steel + (hose_a + inside_a) / oil.bulk_modulus
+    compliance_b = hose_b * hose + inside_b * steel + (hose_b + inside_b) / oil.bulk_modulus
+    min_pressure = 0.5 * tank
+
+    def openings_and_rate(i: int, p_b: Array) -> tuple[Array, Array]:
+        """Openings, and the rate of the pressure in B."""
+        f, w, ca, cb = force[i], v[i], compliance_a[i], compliance_b[i]
+        p_a = (f + area_b * p_b) / area_a
+        demand = force_rate[i] + (area_a**2 / ca + area_b**2 / cb) * w
+        out = demand > 0
+        fed_a = c1 * np.sqrt(np.clip(pump - p_a, _MIN_PRESSURE_DROP, margin))
+        fed_b = c4 * np.sqrt(np.clip(pump - p_b, _MIN_PRESSURE_DROP, margin))
+        q_a = np.where(out, fed_a, c3 * np.sqrt(np.maximum(p_a - tank, LAMINAR_PRESSURE_DROP)))
+        q_b = np.where(out, c2 * np.sqrt(np.maximum(p_b - tank, LAMINAR_PRESSURE_DROP)), fed_b)
+        y = demand / (area_a * q_a / ca + area_b * q_b / cb)
+        # a chamber cavitates and is not filled yet: the loaded chamber sets the velocity alone
+        by_b = (area_b * w + cb * force_rate[i] / area_b) / q_b
+        by_a = (area_a * w + ca * force_rate[i] / area_a) / q_a
+        y = np.where(out & (p_a < tank) & (q_a * by_b < area_a * w), by_b, y)
+        y = np.where(~out & (p_b < tank) & (q_b * by_a > area_b * w), by_a, y)
+        return y, (area_b * w - q_b * y) / cb
+
+    openings = np.empty_like(v)
+    holding_force = force[0] - tank * (area_a - area_b)
+    p_b = tank + np.maximum(-holding_force, 0.0) / area_b
+    steps = np.diff(time, append=2.0 * time[-1] - time[-2])
+    for i in range(len(time)):
+        p_b = np.maximum(
+            p_b, np.maximum(min_pressure, (area_a * min_pressure - force[i]) / area_b)
+        )
+        openings[i], pressure_rate = openings_and_rate(i, p_b)
+        _, perturbed_rate = openings_and_rate(i, p_b + _PRESSURE_DIFFERENCE)
+        # linearly implicit Euler method: at low pressures the flow of the outlet is stiff
+        rate_derivative = np.minimum((perturbed_rate - pressure_rate) / _PRESSURE_DIFFERENCE, 0.0)
+        p_b = p_b + steps[i] * pressure_rate / (1.0 - steps[i] * rate_derivative)
+    return openings
+
+
+def largest_flow_share(machine: Machine, reference: Trajectory) -> float:
+    """Largest share of the flow of a valve or of the pump that a trajectory requires.
+
+    For a valve it is A |v| over the flow at full stroke, with A the area of the filled chamber.
+    That flow is c sqrt(margin) of a compensated valve; for others, half of the supply pressure is
+    the drop at either edge. For the pump it is the sum of A |v| over its largest flow, if limited.
+
+    Args:
+        machine: A machine with a circuit.
+        reference: Trajectory of its active joints.
+    """
+    circuit = require_circuit(machine)
+    check_invertible(circuit)
+    time = np.linspace(0.0, reference.duration, int(_SAMPLES_PER_SECOND * reference.duration) + 2)
+    v = reference.velocity(time)
+    largest_share, total_flow = 0.0, np.zeros(len(time))
+    for joint in circuit.joints:
+        cylinder, valve = circuit.cylinders[joint], circuit.valves[joint]
+        rate = v[:, machine.active.index(joint)]
+        drop = valve.margin or 0.5 * (circuit.supply.pressure - circuit.supply.tank)
+        out = np.maximum(rate, 0.0) * cylinder.area_a
+        back = np.maximum(-rate, 0.0) * cylinder.area_b
+        shares = out / valve.c1 + back / valve.c4
+        largest_share = max(largest_share, float(shares.max()) / np.sqrt(drop))
+        total_flow = total_flow + out + back
+    pump = circuit.supply.flow
+    return max(largest_share, float(total_flow.max()) / pump) if pump else largest_share
+
+
+def fastest_trajectory(
+    machine: Machine, reference: Trajectory, method: str = "none"
+) -> Trajectory:
+    """The fastest trajectory along a reference that the flow of valves and pump permits.
+
+    Flows are proportional to 1 / T, so the shortest duration of the reference is T times its
+    `largest_flow_share`. The methods of `suppress_sway` change the trajectory differently for each
+    T, so this is iterated until the share is 1.
+
+    Args:
+        machine: A machine with free joints and a circuit.
+        reference: Trajectory from rest to rest.
+        method: Method of `suppress_sway`.
+
+    Returns:
+        The trajectory of `suppress_sway`.
+
+    Raises:
+        InputError: As `suppress_sway`, or the reference needs no flow.
+    """
+    original = add_free_joints(machine, reference)
+    duration = original.duration * largest_flow_share(machine, original)
+    if duration == 0:
+        raise InputError("the reference moves no cylinder, its time has no least")
+    for _ in range(_MAX_ITERATIONS):
+        trajectory = suppress_sway(machine, retime(original, duration), method)
+        share = largest_flow_share(machine, trajectory)
+        if abs(share - 1.0) < _SHARE_TOLERANCE:
+            break
+        duration *= share
+    return trajectory
+
+
+_KNOTS_PER_SECOND = 50  # knots of forces and gains
+_STEPS_PER_SECOND = 1000  # steps of openings
+_DEAD_BAND_SMOOTHING = 0.003  # share of the flow over which signals cross the dead band
+_REVERSAL_SMOOTHING = 0.02  # share of the flow over which openings and friction reverse
 
 
 class ValveFeedforward(ValvePD):
-    """Valves opened for the reference's velocities, corrected by position and by sway.
+    """Valve command by feedforward of the openings, and feedback of position and sway.
 
-    With y the openings that the reference demands of the circuit (`demanded`), tau the lag
-    2 zeta / omega of the spool, g the opening per velocity of `openings` under the reference's
-    forces,
+    With y the openings that the trajectory requires (`required_openings`), tau = 2 zeta / omega
+    the lag of the spool, and g the opening per velocity (`openings_per_velocity`) under the forces
+    of the trajectory,
 
         w = y + tau y' + K_p (q_ref - q) + K_d (q_ref' - q') + g(v) K theta,
         u = (1 - d) w + d tanh(w / 0.003).
 
-    theta is the sway against the reference's: what two inclinometers on the grapple tell, less
-    what is planned, theta = (q_f - q_f,ref) - E (q_d - q_d,ref) with E as in `crane.motion.sway`.
-    A motion B u of the drives, B of `Sway.pivoting_motions`, makes theta'' + Omega^2 theta = u''.
-    With u'' = -2 zeta Omega theta' all modes have the damping ratio zeta more, and velocities do
-    that:
+    theta is the sway relative to the trajectory, which two inclinometers on the grapple measure:
+    theta = (q_f - q_f,ref) - E (q_d - q_d,ref) with E as in `crane.motion.sway`. A motion B u of
+    the drives, with B of `Sway.pivoting_motions`, gives theta'' + Omega^2 theta = u''. With
+    u'' = -2 zeta Omega theta', zeta is added to the damping ratio of all modes, by the velocities
 
         K = -2 zeta B Omega,    Omega = Phi diag(omega) Phi^T M_ff,
 
-    with the modes Phi of unit modal mass. A spool of 5 Hz delays that by 0.06 s, 10 to 16 degrees
-    of a grapple's sway, and position control counteracts it at frequencies below kp x the speed at
-    full flow. What limits zeta is what gives way between valve and tip: above the sway's frequency
-    the load stands, and the feedback is one of position, with 2 zeta omega more of loop gain.
+    with the modes Phi of unit modal mass. A spool of 5 Hz delays this by 0.06 s, 10 to 16 degrees
+    of the sway of a grapple, and position control counteracts it at frequencies below kp times the
+    velocity at full flow. The compliance between valve and tip limits zeta: above the frequency of
+    the sway the load does not move, and the feedback is that of a position, which increases the
+    loop gain by 2 zeta omega.
 
     Args:
-        machine: The machine, with its payload.
-        reference: Of the driven joints or of all; free joints that it has not hang still.
-        gains: By joint; those of the machine file if not given.
-        sway: Damping ratio zeta that is asked for; 0 for no feedback of sway.
+        machine: The machine with its payload.
+        reference: Trajectory of the driven joints or of all joints; free joints that it does not
+            have hang still.
+        gains: Gains by joint; those of the machine file if not given.
+        sway: Damping ratio zeta; 0 for no feedback of sway.
 
     Raises:
-        InputError: As `ValvePD`; or sway is to be damped, and nothing sways.
+        InputError: As `ValvePD`; or there is no sway to be damped.
     """
 
     def __init__(
@@ -99,7 +304,7 @@ class ValveFeedforward(ValvePD):
             )
 
     def _friction(self, machine: Machine, circuit: Hydraulics, v: Array) -> Array:
-        """Friction (N, m) of the cylinders' joints; dry friction turns smoothly."""
+        """Friction (N, m) of the joints of cylinders, with smoothed Coulomb friction."""
         friction = np.zeros_like(v)
         for i, joint in enumerate(circuit.joints):
             if (law := machine.friction.get(joint)) is not None:
@@ -114,7 +319,7 @@ class ValveFeedforward(ValvePD):
     def _feedforward_openings(
         self, machine: Machine, reference: Trajectory, force: Array
     ) -> tuple[Array, Array]:
-        """Times (N,) and the openings (N, m) that the reference demands."""
+        """Times (N,), and openings (N, m) that the trajectory requires."""
         from scipy.interpolate import make_interp_spline  # slow to import
 
         count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
@@ -129,11 +334,11 @@ class ValveFeedforward(ValvePD):
         )
 
     def _sway_feedback_gains(self, machine: Machine, q_a: Array, damping: float) -> list[Array]:
-        """K (m, f), then E (f, m), as columns (N,)."""
+        """Elements of K (m, f), then of E (f, m), as columns (N,)."""
         sway, free = Sway(machine), self._free_indices
         configurations = sway.hanging_equilibrium(q_a)
         shifts = sway.pivoting_motions(configurations)
-        roots = np.array([sway.frequency_matrix(posture) for posture in configurations])
+        roots = np.array([sway.frequency_matrix(q) for q in configurations])
         driven = np.flatnonzero(machine.is_driven).tolist()
         driven_indices = [driven.index(i) for i in self._active_indices]
         gains = -2.0 * damping * (shifts @ roots)[:, driven_indices]
@@ -143,11 +348,8 @@ class ValveFeedforward(ValvePD):
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`."""
-        q, v, last = (
-            self.planned_trajectory.position(times),
-            self.planned_trajectory.velocity(times),
-            self._knot_times[-1],
-        )
+        q, v = self.planned_trajectory.position(times), self.planned_trajectory.velocity(times)
+        last = self._knot_times[-1]
         opening = _interpolate_even(times, last, self._opening_table)
         opening[(times < 0) | (times > last)] = 0.0
         columns = [q[:, self._active_indices], v[:, self._active_indices], opening]
@@ -179,7 +381,7 @@ class ValveFeedforward(ValvePD):
     def _sway_damping_openings(
         self, inputs: ControllerInputs, error: list[Scalar]
     ) -> list[Scalar]:
-        """What the valves open for the velocity that damps sway (m,)."""
+        """Openings (m,) for the velocities that damp sway."""
         m, f = len(self._active_indices), len(self._free_indices)
         positive_openings, negative_openings = (
             inputs.reference[i * m : (i + 1) * m] for i in (3, 4)
@@ -194,19 +396,16 @@ class ValveFeedforward(ValvePD):
         openings: list[Scalar] = []
         for i in range(m):
             speed = sum(gains[i * f + k] * theta[k] for k in range(f))
-            mean, half = (
-                0.5 * (positive_openings[i] + negative_openings[i]),
-                0.5 * (positive_openings[i] - negative_openings[i]),
-            )
+            mean = 0.5 * (positive_openings[i] + negative_openings[i])
+            half = 0.5 * (positive_openings[i] - negative_openings[i])
             direction = apply_function("tanh", speed * mean * (1.0 / _REVERSAL_SMOOTHING))
             openings.append((mean + half * direction) * speed)
         return openings
 
 
 def _interpolate_even(times: Array, end_time: float, table: Array) -> Array:
-    """Rows (N, c) straight between those of a table, at even times from 0 to the last [s]."""
+    """Rows (N, c), linear between those of a table at equal intervals from 0 to the end time."""
     position = np.clip(times / end_time, 0.0, 1.0) * (len(table) - 1)
     before = np.minimum(position.astype(int), len(table) - 2)
     share = (position - before)[:, None]
-    rows: Array = (1.0 - share) * table[before] + share * table[before + 1]
-    return rows
+    return (1.0 - share) * table[before] + share * table[before + 1]

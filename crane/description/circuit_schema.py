@@ -17,12 +17,15 @@ from crane.description.key_types import (
 from crane.hydraulics.circuit_elements import (
     ELEMENT_KINDS,
     OPENING_SIDES,
+    PUMP_CONTROLS,
     Accumulator,
     CircuitElement,
     CircuitLine,
+    Engine,
+    Supply,
 )
-from crane.hydraulics.components import CounterbalanceValve, Cylinder, Oil, PDGains, Spool, Valve
-from crane.hydraulics.supply_and_engine import PUMP_CONTROLS, Engine, Supply
+from crane.hydraulics.components import CounterbalanceValve, Cylinder, Spool, Valve
+from crane.hydraulics.hydraulic_circuit import Oil, PDGains
 
 VALVE_TYPES = ("orifice", "compensated", "sharing")
 ORIFICE_KEYS = ("c1", "c2", "c3", "c4")

@@ -19,8 +19,8 @@ from crane.description.specification import (
     MachineSpec,
     PIGains,
 )
-from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.parameter_checks import parameter_names
+from crane.hydraulics.circuit_elements import parameter_names
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 
 PAYLOAD_MASS = "payload.mass"
 PINS_PREFIX = "pins."

@@ -13,7 +13,7 @@ from crane.description.external_forces import ExternalForce, Wrench
 from crane.description.kinematic_tree import Joint, Tree, Vector
 from crane.description.sensors import Sensor
 from crane.description.task_phases import Phase
-from crane.hydraulics.components import Hydraulics
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 
 
 def _check_numbers(element: object, label: str, *nonnegative_fields: str) -> None:

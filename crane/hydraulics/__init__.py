@@ -1,18 +1,15 @@
-"""The hydraulic circuit: its parts, the laws of their flows, the equations of the whole."""
+"""The hydraulic circuit of a machine: components, flows, and equations of the circuit."""
 
-from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
-from crane.hydraulics.circuit_equations import CircuitEquations
-from crane.hydraulics.components import (
-    CounterbalanceValve,
-    Cylinder,
-    Hydraulics,
-    Oil,
-    PDGains,
-    Spool,
-    Valve,
+from crane.hydraulics.circuit_elements import (
+    Accumulator,
+    CircuitElement,
+    CircuitLine,
+    Engine,
+    Supply,
 )
-from crane.hydraulics.opening_curve import OpeningCurve
-from crane.hydraulics.supply_and_engine import Engine, Supply
+from crane.hydraulics.circuit_equations import CircuitEquations
+from crane.hydraulics.components import CounterbalanceValve, Cylinder, OpeningCurve, Spool, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics, Oil, PDGains
 
 __all__ = [
     "Accumulator",

@@ -1,71 +1,75 @@
-"""The hydraulic circuit of a machine as its file describes it."""
+"""Cylinders, directional valves, spools and counterbalance valves of a circuit."""
 
+import itertools
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from crane.common.errors import suggest_names
-from crane.common.plausible_ranges import suggested_units_text
-from crane.hydraulics.circuit_elements import Accumulator, CircuitElement, CircuitLine
-from crane.hydraulics.opening_curve import OpeningCurve
-from crane.hydraulics.parameter_checks import (
-    CircuitPathError,
-    ComponentParameterError,
+from crane.codegen import Scalar
+from crane.common.errors import InputError
+from crane.hydraulics.circuit_elements import (
+    MAIN_PUMP,
+    TANK_NODE,
+    check_conditions,
     check_parameters,
     positive_field,
     positive_field_with_default,
     signed_field,
 )
-from crane.hydraulics.supply_and_engine import (
-    MAIN_PUMP,
-    TANK_NODE,
-    Engine,
-    Supply,
-    check_pump_pressures,
-    check_summed_pumps,
-)
+from crane.hydraulics.flow_equations import clip
 
-COUNTERBALANCE_KEYS = (
-    "counterbalance_a",
-    "counterbalance_b",
-)  # valves of a cylinder that hold its load
+# keys of the load-holding valves of a cylinder
+COUNTERBALANCE_KEYS = ("counterbalance_a", "counterbalance_b")
 
 
 @dataclass(frozen=True)
-class Oil:
-    """What fills the circuit.
+class OpeningCurve:
+    """Share of a flow coefficient over the spool stroke |u|: linear between points.
+
+    Before the first and behind the last point the curve is constant.
 
     Attributes:
-        bulk_modulus: Of the oil [Pa].
-        hose_modulus: Of a hose's volume, pressure per relative widening [Pa]; 0 for rigid hoses.
-        steel_modulus: The same of the cylinders' walls [Pa]; 0 for rigid ones.
-        vapour_pressure: Below which no chamber falls [Pa].
-        gas_exponent: Of the polytropic change of entrapped gas.
-        air: Share of a volume that free air in the oil has at 1e5 Pa.
+        points: Pairs of |u|, increasing from 0 to 1, and shares, at least 0.
     """
 
-    bulk_modulus: float = positive_field_with_default(1.65e9)
-    hose_modulus: float = 0.0
-    steel_modulus: float = 0.0
-    vapour_pressure: float = 1.0e3
-    gas_exponent: float = positive_field_with_default(1.4)
-    air: float = 0.0
+    points: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        check_parameters(self, "the oil")
+        if len(self.points) < 2:
+            raise InputError("a curve has two points at least, give pairs [u, value]")
+        strokes = [u for u, _ in self.points]
+        if strokes[0] < 0 or strokes[-1] > 1:
+            raise InputError(
+                f"a curve goes over the share of the spool's stroke, from 0 to 1, this one from "
+                f"{strokes[0]:g} to {strokes[-1]:g}"
+            )
+        if any(after <= before for before, after in itertools.pairwise(strokes)):
+            raise InputError("strokes of a curve do not increase, sort its points")
+        if not all(0 <= share < float("inf") for _, share in self.points):
+            raise InputError("values of a curve are negative or no finite numbers, correct them")
+        if not any(share for _, share in self.points):
+            raise InputError("all values of a curve are 0, leave it out")
+
+    def evaluate(self, u: Scalar) -> Scalar:
+        """Share at the stroke |u|, a float or a formula."""
+        share: Scalar = self.points[0][1]
+        for (u0, share0), (u1, share1) in itertools.pairwise(self.points):
+            slope = (share1 - share0) / (u1 - u0)
+            share = share + slope * (clip(u, u0, u1) - u0)
+        return share
 
 
 @dataclass(frozen=True)
 class CounterbalanceValve:
-    """A load-holding valve at one chamber: free inflow, outflow only when piloted open.
+    """A load-holding valve at one chamber: inflow is free, outflow needs a pilot pressure.
 
     Opening = (p + pilot_ratio p_other - pressure) / range, from 0 to 1.
 
     Attributes:
-        pressure: At which the chamber's own pressure begins to open it [Pa].
-        pilot_ratio: How much more the other chamber's pressure counts.
-        range: From begin to full opening [Pa].
-        coefficient: Flow per root of pressure, fully open [m3/(s Pa^0.5)].
+        pressure: Pressure of the chamber at which the valve begins to open [Pa].
+        pilot_ratio: Weight of the pressure in the other chamber.
+        range: Pressure difference from closed to fully open [Pa].
+        coefficient: Flow coefficient of the open valve [m3/(s Pa^0.5)].
     """
 
     pressure: float = positive_field()
@@ -81,46 +85,47 @@ class CounterbalanceValve:
 class Cylinder:
     """A double-acting cylinder, or a rotary drive with volumes per angle, along one joint.
 
-    Chamber A drives the joint in its positive direction. With x the joint's coordinate above its
-    lower limit and s the distance between the limits, V_A = hose_a + area_a x and
+    Chamber A drives the joint in its positive direction. With x the coordinate of the joint above
+    its lower limit and s the distance between the limits, V_A = hose_a + area_a x and
     V_B = hose_b + area_b (s - x), as in equation (23) of the electro-hydraulic forwarder paper.
 
     Attributes:
         joint: The active joint.
-        area_a: Of chamber A [m2], or volume per angle [m3/rad]; of all cylinders side by side.
-        area_b: Of chamber B.
+        area_a: Area of chamber A [m2], or volume per angle [m3/rad]; the sum of all parallel
+            cylinders.
+        area_b: The same of chamber B.
         hose_a: Volume of hoses and fittings at chamber A, V_hA [m3].
-        hose_b: At chamber B, V_hB [m3].
-        gas_a: Volume that gas entrapped in chamber A has at 1e5 Pa [m3].
-        gas_b: In chamber B.
-        leakage: Past the piston, flow per pressure [m3/(s Pa)].
-        leakage_a: From chamber A to the tank, through the closed spool [m3/(s Pa)].
-        leakage_b: From chamber B.
+        hose_b: Volume of hoses and fittings at chamber B, V_hB [m3].
+        gas_a: Volume at 1e5 Pa of the gas entrapped in chamber A [m3].
+        gas_b: The same of chamber B.
+        leakage: Leakage past the piston, flow per pressure [m3/(s Pa)].
+        leakage_a: Leakage from chamber A to the tank, through the closed spool [m3/(s Pa)].
+        leakage_b: The same from chamber B.
         relief: Pressure at which a chamber is relieved to the tank [Pa]; 0 for no relief valves.
-        relief_gain: Their flow per pressure above it [m3/(s Pa)].
-        refill: Coefficient of check valves that let oil from the tank into a chamber below its
-            pressure [m3/(s Pa^0.5)]; 0 for none.
-        cushion: Distance from either end where the outflow is throttled [m] or [rad]; 0 for no
-            cushioning.
-        cushion_coefficient: Of the throttle at the very end [m3/(s Pa^0.5)].
-        stiffness: Of a spring in series with the cylinder, for boom and mountings [N/m] or
-            [N m/rad]; 0 for none.
-        damping: Of a damper beside that spring [N s/m] or [N m s/rad].
-        seal_friction: By how much the pressures of both chambers raise the joint's Coulomb
-            friction [N/Pa] or [N m/Pa], see `ValveCylinderEquations.circuit_friction`.
-        brake: What a spring-applied brake holds while the spool is within its dead band [N] or
-            [N m]; 0 for none.
-        brake_release: Spool travel beyond the dead band over which it lets go.
+        relief_gain: Flow of the relief valves per pressure above `relief` [m3/(s Pa)].
+        refill: Coefficient of check valves from the tank into the chambers [m3/(s Pa^0.5)]; 0 for
+            none.
+        cushion: Distance from either end within which the outflow is throttled [m] or [rad]; 0
+            for no cushioning.
+        cushion_coefficient: Coefficient of the throttle at the end [m3/(s Pa^0.5)].
+        stiffness: Stiffness of a spring in series with the cylinder, for boom and mountings [N/m]
+            or [N m/rad]; 0 for none.
+        damping: Damping parallel to that spring [N s/m] or [N m s/rad].
+        seal_friction: Coulomb friction of the joint per pressure in the chambers [N/Pa] or
+            [N m/Pa], see `ValveCylinderEquations.circuit_friction`.
+        brake: Holding force of a spring-applied brake while the spool is within its dead band [N]
+            or [N m]; 0 for none.
+        brake_release: Spool travel beyond the dead band over which the brake releases.
         counterbalance_a: Load-holding valve at chamber A.
-        counterbalance_b: At chamber B.
-        cross_relief: Pressure of one chamber over the other at which the one is relieved into it
-            [Pa], by `relief_gain`; 0 for no such valves.
-        rupture_a: Flow out of chamber A at which its hose rupture valve holds [m3/s]; 0 for none.
-        rupture_b: Of chamber B.
-        motor: Whether it is a motor: its volumes do not change with the angle, and the joint needs
+        counterbalance_b: Load-holding valve at chamber B.
+        cross_relief: Pressure difference at which a chamber is relieved into the other one by
+            `relief_gain` [Pa]; 0 for no such valves.
+        rupture_a: Largest flow out of chamber A, set by its hose rupture valve [m3/s]; 0 for none.
+        rupture_b: The same of chamber B.
+        motor: Whether it is a motor: its volumes do not depend on the angle, and the joint needs
             no limits.
-        tube: Outer diameter of the tube [m]; 0 where it is not known. It counts for buckling.
-        count: How many cylinders side by side the areas are of.
+        tube: Outer diameter of the tube [m], used for buckling; 0 if unknown.
+        count: Number of parallel cylinders.
     """
 
     joint: str
@@ -155,47 +160,52 @@ class Cylinder:
     def __post_init__(self) -> None:
         label = f"the cylinder of '{self.joint}'"
         check_parameters(self, label)
-        if not isinstance(self.count, int) or self.count < 1:
-            raise ComponentParameterError(
-                "count", f"count of {label} is {self.count}, give a whole number"
+        check_conditions(
+            (
+                not isinstance(self.count, int) or self.count < 1,
+                "count",
+                f"count of {label} is {self.count}, give a whole number",
             )
-        if self.tube and not self.tube > self.bore:
-            raise ComponentParameterError(
+        )
+        check_conditions(
+            (
+                0 < self.tube <= self.bore,
                 "tube",
                 f"tube of {label} is {self.tube:g} m, it must be more than the bore of "
                 f"{self.bore:.4g} m",
             )
+        )
 
     @property
     def bore(self) -> float:
-        """Diameter of the piston of one of them, along a slide [m]."""
+        """Diameter of the piston of one cylinder, along a prismatic joint [m]."""
         return math.sqrt(4 / math.pi * max(self.area_a, self.area_b) / self.count)
 
     @property
     def rod(self) -> float:
-        """Diameter of the rod of one of them; 0 where the areas are the same [m]."""
+        """Diameter of the rod of one cylinder [m]; 0 for equal areas."""
         return math.sqrt(4 / math.pi * abs(self.area_a - self.area_b) / self.count)
 
     @property
     def adds_friction(self) -> bool:
-        """Whether it adds to the joint's Coulomb friction."""
+        """Whether seals or brake add to the Coulomb friction of the joint."""
         return self.seal_friction > 0 or self.brake > 0
 
 
 @dataclass(frozen=True)
 class Spool:
-    """What moves a second spool of a valve, that of chamber B: numbers as of `Valve`.
+    """The second spool of a valve, which controls chamber B; parameters as those of `Valve`.
 
     Attributes:
-        joint: Its cylinder's joint.
+        joint: Joint of the cylinder.
         neutral: Signal of the middle position [V].
         full: Signal of u = 1, which drains chamber B [V].
-        dead_band: Share of the spool's stroke without flow.
+        dead_band: Share of the spool stroke without flow.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
-        damping: Its damping ratio.
-        rate: The fastest it moves, in strokes per second; 0 for no limit.
+        damping: Damping ratio of the spool.
+        rate: Largest speed of the spool, in strokes per second; 0 for no limit.
         hysteresis: Width of the play between signal and spool, as a share of the stroke.
-        delay: Dead time of its electric stage [s].
+        delay: Dead time of the electric stage [s].
     """
 
     joint: str
@@ -218,32 +228,34 @@ class Spool:
 class Valve:
     """A proportional directional valve of one cylinder.
 
-    The signal U [V] asks for the spool position u = (U - neutral) / (full - neutral), from -1 to
-    1; the spool follows. Its opening is y = sign(u) (|u| - dead_band) / (1 - dead_band) outside of
-    the dead band. After a dead time it follows the signal of t - delay, at first the first one.
-    Flows through the open edges are equations (21), (22) of the electro-hydraulic forwarder
-    paper,
+    The signal U [V] sets the target u = (U - neutral) / (full - neutral), from -1 to 1, that the
+    spool position follows. Outside of the dead band the opening is
+    y = sign(u) (|u| - dead_band) / (1 - dead_band). With a dead time the spool follows the signal
+    of the time t - delay, and before that the first signal. The flows through the edges are
+    equations (21) and (22) of the electro-hydraulic forwarder paper,
 
         y > 0:  Q_A = c1 y sqrt(p_S - p_A),  Q_B = -c2 y sqrt(p_B - p_R),
         y < 0:  Q_A = c3 y sqrt(p_A - p_R),  Q_B = -c4 y sqrt(p_S - p_B).
 
-    With a second spool the first one has chamber A alone, Q_A(y), and the second chamber B,
-    Q_B(y_b), each with a signal of its own: an outflow is metered apart from the inflow then, both
-    chambers can be joined to the pump (which regenerates) or to the tank (where it floats).
+    With a second spool, the first one controls chamber A, Q_A(y), and the second one chamber B,
+    Q_B(y_b), by separate signals: the outflow is then metered independently of the inflow, and
+    both chambers can be connected to the pump (regeneration) or to the tank (floating).
 
-    With a margin the inlets c1, c4 are pressure compensated: the pressure drop is at most that
-    margin, so the flow is c1 y sqrt(margin) until the supply no longer suffices; nothing flows
-    back into the supply. With `sharing` the compensator stands behind the inlet and takes the
-    pressure there to that of the highest load of the supply's valves, p_LS: the flow is
-    c1 y sqrt(p_S - p_LS), which falls by one share in all such valves when the pump has no more.
+    With a margin, the inlets c1, c4 are pressure compensated: the pressure drop is at most the
+    margin, so the flow is c1 y sqrt(margin) as long as the pressure of the supply suffices, and no
+    oil flows back into the supply. With `sharing`, the compensator is behind the inlet and raises
+    the pressure there to the highest load of the valves of this supply, p_LS: the flow is
+    c1 y sqrt(p_S - p_LS), which decreases by the same share in all such valves where the pump is
+    at its limit.
 
-    Edges may have curves: c1 is the coefficient of the wide open edge then, and c1 curve(|u|)
-    stands for c1 y. An open centre lets the pump's flow pass while the spool rests; those of a
-    supply's valves are in series. Beyond `float_from` of the negative stroke both chambers are
-    joined to the tank and the inlet closes. Regeneration leads what leaves B into A while y > 0.
+    Edges may have curves: c1 is then the coefficient at full opening, and c1 curve(|u|) replaces
+    c1 y. The open centre passes the flow of the pump while the spool is neutral; the open centres
+    of a supply are in series. Beyond `float_from` of the negative stroke both chambers are
+    connected to the tank and the inlet closes. Regeneration leads the outflow of B into A for
+    y > 0.
 
     Attributes:
-        joint: Its cylinder's joint.
+        joint: Joint of the cylinder.
         c1: Coefficient of the edge from the supply to A [m3/(s Pa^0.5)].
         c2: From B to the tank.
         c3: From A to the tank.
@@ -251,26 +263,28 @@ class Valve:
         margin: Pressure drop that the compensator keeps [Pa]; 0 without compensation.
         neutral: Signal of the middle position [V].
         full: Signal of u = 1 [V].
-        dead_band: Share of the spool's stroke without flow.
+        dead_band: Share of the spool stroke without flow.
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
-        damping: Its damping ratio.
-        rate: The fastest it moves, in strokes (of u from 0 to 1) per second; 0 for no limit.
+        damping: Damping ratio of the spool.
+        rate: Largest speed of the spool, in strokes (of u from 0 to 1) per second; 0 for no limit.
         hysteresis: Width of the play between signal and spool, as a share of the stroke.
         delay: Dead time of the electric stage [s].
-        centre: Coefficient of the open centre at rest [m3/(s Pa^0.5)]; 0 for a closed one.
+        centre: Coefficient of the open centre in neutral [m3/(s Pa^0.5)]; 0 for a closed centre.
         regeneration: Coefficient of the check valve from B to A [m3/(s Pa^0.5)]; 0 for none.
-        float_from: |u| beyond which a negative spool floats; 0 for none.
-        float_coefficient: Of either way to the tank then [m3/(s Pa^0.5)].
-        demand: Share of the pump's flow that the wide open valve asks of a positive control.
-        sharing: Whether the compensator stands behind the inlet.
-        priority: Whether it is served first: the pump's other valves get the share
+        float_from: |u| beyond which the negative position floats; 0 for none.
+        float_coefficient: Coefficient from each chamber to the tank while floating
+            [m3/(s Pa^0.5)].
+        demand: Share of the flow of the pump that the fully open valve requests of a positive
+            control.
+        sharing: Whether the compensator is behind the inlet.
+        priority: Whether the valve is served first: the other valves of the pump receive the share
             1 - (load + margin - p_S) / (0.2 margin) of their flows, within 0 and 1, as behind a
             priority valve.
-        supply: Name of the pump that feeds it.
-        return_a: Node that chamber A is drained to.
-        return_b: Chamber B.
-        curves: By "c1" to "c4" and "centre", share of the coefficient over |u|.
-        spool_b: That of chamber B, where each chamber has one.
+        supply: Name of the pump that feeds the valve.
+        return_a: Node to which chamber A is drained.
+        return_b: Node to which chamber B is drained.
+        curves: Share of the coefficient over |u|, by "c1" to "c4" and "centre".
+        spool_b: Second spool, of chamber B; None for a valve with one spool.
     """
 
     joint: str
@@ -303,257 +317,75 @@ class Valve:
     def __post_init__(self) -> None:
         label = f"the valve of '{self.joint}'"
         check_parameters(self, label)
-        if self.priority and not self.margin:
-            raise ComponentParameterError(
-                "priority", f"{label} has priority and no margin to keep, give it one"
-            )
-        if self.sharing and self.margin:
-            raise ComponentParameterError(
-                "margin", f"{label} shares its flow, leave 'margin' to the pump"
-            )
-        if (self.float_from > 0) != (self.float_coefficient > 0) or self.float_from >= 1:
-            raise ComponentParameterError(
+        check_conditions(
+            (
+                self.priority and not self.margin,
+                "priority",
+                f"{label} has priority and no margin to keep, give it one",
+            ),
+            (
+                self.sharing and self.margin > 0,
+                "margin",
+                f"{label} shares its flow, leave 'margin' to the pump",
+            ),
+            (
+                (self.float_from > 0) != (self.float_coefficient > 0) or self.float_from >= 1,
                 "float_from",
                 f"{label} floats from {self.float_from:g} with the coefficient "
                 f"{self.float_coefficient:g}, give both, from below 1",
-            )
+            ),
+        )
         _check_spool(self, label)
-        for key in ("centre", "regeneration", "float_from") if self.spool_b else ():
-            if getattr(self, key):
-                raise ComponentParameterError(
-                    key, f"{label} has two spools and '{key}', which goes with one, remove it"
+        check_conditions(
+            *(
+                (
+                    self.spool_b is not None and getattr(self, key) > 0,
+                    key,
+                    f"{label} has two spools and '{key}', which goes with one, remove it",
                 )
+                for key in ("centre", "regeneration", "float_from")
+            )
+        )
 
     @property
     def spools(self) -> "dict[str, Valve | Spool]":
-        """What moves its spools, by the names of their signals."""
-        main_spool: dict[str, Valve | Spool] = {self.joint: self}
-        return main_spool | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
+        """Its spools by the names of their signals."""
+        return {self.joint: self} | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
 
     def opening(self, u: float) -> float:
-        """Opening y of a spool position u."""
+        """Opening y at a spool position u."""
         size = min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0)
         return math.copysign(size, u)
 
 
 def _check_spool(spool: Spool | Valve, label: str) -> None:
-    """Raise for what no spool can have.
+    """Check the parameters of a spool.
 
     Raises:
-        PartError: Of the number.
+        ComponentParameterError: One is invalid.
     """
-    if spool.hysteresis >= 0.5:
-        raise ComponentParameterError(
+    dead_band = spool.dead_band
+    hint = f": looks like percent, write {dead_band / 100:g}" if dead_band < 100 else ""
+    check_conditions(
+        (
+            spool.hysteresis >= 0.5,
             "hysteresis",
-            f"hysteresis of {label} is {spool.hysteresis:g}, give a "
-            "share of the stroke, below 0.5",
-        )
-    if spool.full == spool.neutral:
-        text = f"full and neutral of {label} are both {spool.full:g}, give two"
-        raise ComponentParameterError("full", text)
-    if spool.dead_band >= 1:
-        text = f"dead_band of {label} is {spool.dead_band:g}, it must be below 1"
-        if spool.dead_band < 100:
-            text += f": looks like percent, write {spool.dead_band / 100:g}"
-        raise ComponentParameterError("dead_band", text)
-    if spool.rate and not spool.bandwidth:
-        raise ComponentParameterError("rate", f"{label} has a rate but no bandwidth, give both")
-
-
-@dataclass(frozen=True)
-class PDGains:
-    """Gains of one valve's PD controller, equation (37) of the electro-hydraulic forwarder paper.
-
-    Attributes:
-        kp: Spool position per error [1/m] or [1/rad].
-        kd: Spool position per error of the velocity [s/m] or [s/rad].
-    """
-
-    kp: float
-    kd: float
-
-    def __post_init__(self) -> None:
-        check_parameters(self, "PD gains")
-
-
-@dataclass(frozen=True)
-class Hydraulics:
-    """A machine's hydraulic circuit: pumps, and a valve and a cylinder or motor per joint.
-
-    Pressures count from a vacuum. Forces are those of equation (20) of the electro-hydraulic
-    forwarder paper, F = area_a p_A - area_b p_B.
-
-    Attributes:
-        supply: Pump and tank.
-        oil: What fills it.
-        cylinders: By joint, in the order of the active joints.
-        valves: By joint, in the same order.
-        control: Gains of the valves' controllers, by joint; of all or of none.
-        supplies: Further pumps, by their nodes' names.
-        engine: That turns all pumps; they have constant speed without.
-        lines: Further nodes by name.
-        accumulators: Likewise.
-        elements: Between nodes, by name.
-    """
-
-    supply: Supply
-    oil: Oil
-    cylinders: Mapping[str, Cylinder]
-    valves: Mapping[str, Valve]
-    control: Mapping[str, PDGains] = field(default_factory=dict)
-    supplies: Mapping[str, Supply] = field(default_factory=dict)
-    engine: Engine | None = None
-    lines: Mapping[str, CircuitLine] = field(default_factory=dict)
-    accumulators: Mapping[str, Accumulator] = field(default_factory=dict)
-    elements: Mapping[str, CircuitElement] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_tank_pressure(self.supply, self.oil)
-        for cylinder in self.cylinders.values():
-            check_relief_pressure(self.supply, cylinder)
-        check_pump_pressures(self.pumps)
-        check_summed_pumps(self.pumps)
-        nodes, chambers = self.node_names, self._chamber_nodes
-        channels = [name.replace(".", "_") for name in nodes]  # as pressures are recorded
-        for field_name, own in self._named_nodes.items():
-            for name in own:
-                if channels.count(name) > 1:
-                    raise CircuitPathError(
-                        (field_name, name), f"two nodes are called '{name}', give them names"
-                    )
-        for joint, valve in self.valves.items():
-            path, label = ("valves", joint), f"valve of '{joint}'"
-            if valve.supply not in self.pumps:
-                raise CircuitPathError(
-                    (*path, "supply"),
-                    f"{label} is fed by '{valve.supply}', "
-                    f"{suggest_names(self.pumps, valve.supply)}",
-                )
-            if valve.spool_b and f"{joint}_b" in self.valves:
-                raise CircuitPathError(
-                    (*path, "spool_b"),
-                    f"the second spool of '{joint}' is called as the joint '{joint}_b', give that "
-                    "another name",
-                )
-            for key in ("return_a", "return_b"):
-                return_node = getattr(valve, key)
-                _check_node(
-                    [x for x in nodes if x not in chambers], label, return_node, (*path, key)
-                )
-        for name, element in self.elements.items():
-            path, label = ("elements", name), f"element '{name}'"
-            _check_node(nodes, label, element.source, (*path, "from"))
-            _check_node(nodes, label, element.target, (*path, "to"))
-            for joint in element.joints:
-                if joint not in self.valves:
-                    raise CircuitPathError(
-                        (*path, "joints"),
-                        f"{label} is opened by '{joint}', {suggest_names(self.valves, joint)}",
-                    )
-
-    @property
-    def pumps(self) -> dict[str, Supply]:
-        """All pumps by their nodes' names."""
-        return {MAIN_PUMP: self.supply, **self.supplies}
-
-    @property
-    def node_names(self) -> list[str]:
-        """Names of all nodes: tank, pumps, lines, accumulators, chambers JOINT.a and JOINT.b."""
-        own = [*self.pumps, *self.lines, *self.accumulators]
-        return [TANK_NODE, *own, *self._chamber_nodes]
-
-    @property
-    def _chamber_nodes(self) -> list[str]:
-        return [f"{joint}.{side}" for joint in self.cylinders for side in "ab"]
-
-    @property
-    def _named_nodes(self) -> dict[str, Iterable[str]]:
-        """Nodes that are named freely, by the field that they are in."""
-        return {name: getattr(self, name) for name in ("supplies", "lines", "accumulators")}
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints that it drives."""
-        return tuple(self.cylinders)
-
-    @property
-    def spools(self) -> dict[str, Valve | Spool]:
-        """What moves each spool, by the name of its signal: JOINT, and JOINT_b of a second one."""
-        return {name: x for valve in self.valves.values() for name, x in valve.spools.items()}
-
-    @property
-    def circuit_friction_joints(self) -> tuple[str, ...]:
-        """The joints whose Coulomb friction it adds to."""
-        return tuple(joint for joint, cylinder in self.cylinders.items() if cylinder.adds_friction)
-
-    def select_joints(self, joints: Iterable[str]) -> "Hydraulics | None":
-        """The circuit of some joints, in their order; None if it drives none of them.
-
-        Elements at chambers that are gone go, too, and lines that nothing leads to any more.
-        """
-        kept = [joint for joint in joints if joint in self.cylinders]
-        if not kept:
-            return None
-        removed_nodes = {
-            f"{joint}.{side}" for joint in self.cylinders if joint not in kept for side in "ab"
-        }
-        valves = {joint: self.valves[joint] for joint in kept}
-        elements = {
-            name: replace(x, joints=tuple(joint for joint in x.joints if joint in kept))
-            for name, x in self.elements.items()
-            if not removed_nodes & {x.source, x.target}
-            and (not x.joints or any(joint in kept for joint in x.joints))
-        }
-        connected_nodes = _connected_nodes(elements.values(), valves.values())
-        return replace(
-            self,
-            cylinders={joint: self.cylinders[joint] for joint in kept},
-            valves=valves,
-            control={joint: self.control[joint] for joint in kept if self.control},
-            elements=elements,
-            lines={name: x for name, x in self.lines.items() if name in connected_nodes},
-            accumulators={
-                name: x for name, x in self.accumulators.items() if name in connected_nodes
-            },
-        )
-
-
-def _check_node(nodes: list[str], label: str, name: str, path: tuple[str, ...]) -> None:
-    if name not in nodes:
-        raise CircuitPathError(path, f"{label} leads to '{name}', {suggest_names(nodes, name)}")
-
-
-def _connected_nodes(elements: Iterable[CircuitElement], valves: Iterable[Valve]) -> set[str]:
-    """Nodes that elements and returns of valves lead to."""
-    connected = {x for item in elements for x in (item.source, item.target)}
-    return connected | {x for valve in valves for x in (valve.return_a, valve.return_b)}
-
-
-def check_tank_pressure(supply: Supply, oil: Oil) -> None:
-    """Raise where the oil boils in the tank.
-
-    Raises:
-        PartError: Of the tank's pressure.
-    """
-    if supply.tank <= oil.vapour_pressure:
-        hint = ": pressures count from a vacuum, write 1e5 for an open tank"
-        raise ComponentParameterError(
-            "tank",
-            f"pressure of the tank is {supply.tank:g} Pa, the oil boils at "
-            f"{oil.vapour_pressure:g} Pa{suggested_units_text('tank', supply.tank) or hint}",
-        )
-
-
-def check_relief_pressure(supply: Supply, cylinder: Cylinder) -> None:
-    """Raise where a relief valve would never close.
-
-    Raises:
-        PartError: Of the relief pressure.
-    """
-    if 0 < cylinder.relief <= supply.tank:
-        raise ComponentParameterError(
-            "relief",
-            f"relief of the cylinder of '{cylinder.joint}' is {cylinder.relief:g} Pa, not above "
-            f"the tank's {supply.tank:g} Pa, so that it would never close"
-            f"{suggested_units_text('relief', cylinder.relief) or ', give a higher one'}",
-        )
+            f"hysteresis of {label} is {spool.hysteresis:g}, give a share of the stroke, "
+            "below 0.5",
+        ),
+        (
+            spool.full == spool.neutral,
+            "full",
+            f"full and neutral of {label} are both {spool.full:g}, give two",
+        ),
+        (
+            dead_band >= 1,
+            "dead_band",
+            f"dead_band of {label} is {dead_band:g}, it must be below 1{hint}",
+        ),
+        (
+            spool.rate > 0 and not spool.bandwidth,
+            "rate",
+            f"{label} has a rate but no bandwidth, give both",
+        ),
+    )

@@ -1,31 +1,32 @@
-"""Where the power of a circuit's pumps goes at an instant, as formulas."""
+"""Power balance of a circuit: power of each component at an instant, as formulas."""
 
 from collections.abc import Sequence
 
 from crane.codegen import Scalar, SymbolicExpression
+from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.circuit_equations import CircuitEquations, CircuitValues
-from crane.hydraulics.flow_balance import net_inflows_of
-from crane.hydraulics.supply_and_engine import TANK_NODE
+from crane.hydraulics.flow_equations import net_inflows_of
 
 SHAFT_POWER, ROD_POWER = "shaft", "rod"
 STORED_POWERS = ("stored", "spring")
-_MERGED_PATHS = {"piston": "leak", "cross": "relief"}  # flows that count with others
+_MERGED_PATHS = {"piston": "leak", "cross": "relief"}  # flows that are added to others
 
 
 def component_powers(
     circuit: CircuitEquations, values: CircuitValues, v: Sequence[Scalar]
 ) -> dict[str, Scalar]:
-    """Power [W] of every part as `OWNER.WHAT`, see `PowerBalance`.
+    """Power [W] of every component as `COMPONENT.KIND`, see `PowerBalance`.
 
-    With Q the flow from a node of pressure p_1 to one of p_2, and F the force of a cylinder,
+    With Q the flow from a node of pressure p_1 to one of p_2, and F the force of a cylinder, the
+    powers are
 
-        throttles Q (p_1 - p_2),    nodes p_i sum of their Q,    rods F v,
+        throttles Q (p_1 - p_2),    nodes p_i sum of their Q,    rods F v.
 
-    the tank being a node like others: what the pumps' shafts give is the sum of all others.
+    The tank is a node like the others. The power of the shafts is the sum of all other powers.
 
     Args:
-        circuit: Whose instant it is.
-        values: The instant.
+        circuit: The circuit.
+        values: Its values at the instant.
         v: (m,) velocities of its joints [m/s], [rad/s].
     """
     powers: dict[str, Scalar] = {}

@@ -1,26 +1,27 @@
-"""One valve and its cylinder: flows, pressures, force, equations (20) to (23)."""
+"""Equations of one valve with its cylinder: flows, pressures, force, equations (20) to (23)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from crane.codegen import Scalar, maximum
-from crane.codegen.symbolic import apply_function, minimum, where_positive
+from crane.codegen.symbolic import Scalar, apply_function, maximum, minimum, where_positive
+from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.components import CounterbalanceValve, Cylinder, Spool, Valve
-from crane.hydraulics.node_equations import SENSING_OPENING_GAIN, largest_of, volume_compliance
-from crane.hydraulics.orifice_flow import (
+from crane.hydraulics.flow_equations import (
     LAMINAR_PRESSURE_DROP,
+    SENSING_OPENING_GAIN,
     Flow,
     clip,
     directional_flow,
+    largest_of,
     series_coefficient,
     signed_square_root,
+    volume_compliance,
 )
-from crane.hydraulics.supply_and_engine import TANK_NODE
 
-INTERNAL_FLOWS = ("piston", "cross")  # flows that pass no hose
-_PLAY_RATE = 500.0  # [1/s], at which a signal takes its play along
-_PRIORITY_MARGIN_SHARE = 0.2  # of its margin, within which a valve of priority stops the others
-_MIN_VOLUME_SHARE = 0.1  # of the hose's volume, the least that a chamber holds
+INTERNAL_FLOWS = ("piston", "cross")  # paths of flows that pass no hose
+_PLAY_RATE = 500.0  # rate at which the signal moves the play of a spool [1/s]
+_PRIORITY_MARGIN_SHARE = 0.2  # share of the margin over which a priority valve stops the others
+_MIN_VOLUME_SHARE = 0.1  # least volume of a chamber, as a share of the volume of its hose
 CYLINDER_CONSTANTS = (
     "area_a", "area_b", "hose_a", "hose_b", "gas_a", "gas_b", "leakage", "leakage_a", "leakage_b",
     "relief", "relief_gain", "refill", "cushion", "cushion_resistance", "stiffness", "damping",
@@ -39,15 +40,15 @@ CYLINDER_CONSTANT_COUNT = len(CYLINDER_CONSTANTS) + 2 * len(_COUNTERBALANCE_CONS
 
 @dataclass
 class ChamberValues:
-    """One side of a cylinder at an instant.
+    """A chamber of a cylinder at an instant.
 
     Attributes:
-        pressure: [Pa].
-        volume: [m3].
-        area: [m2], [m3/rad].
-        hose_flow: Flow through its hose into it [m3/s].
-        net_inflow: Flow into it less what its volume grows by [m3/s].
-        pressure_state_rate: Rate of the state that stands for its pressure [Pa/s].
+        pressure: Pressure [Pa].
+        volume: Volume [m3].
+        area: Area [m2], [m3/rad].
+        hose_flow: Flow through its hose into the chamber [m3/s].
+        net_inflow: Inflow less the rate of the volume [m3/s].
+        pressure_state_rate: Rate of the state of the pressure [Pa/s].
     """
 
     pressure: Scalar
@@ -59,30 +60,32 @@ class ChamberValues:
 
 
 class ValveCylinderEquations:
-    """One valve and its cylinder or motor at an instant.
+    """One valve with its cylinder or motor at an instant.
+
+    Chambers are indexed by their side: 0 for A, 1 for B.
 
     Args:
-        oil_constants: Numbers of the oil.
-        constants: `cylinder_constants` the parts, as floats or traced.
-        cylinder: What it is.
-        valve: Likewise.
-        spool_positions: Position u; those of the spools of A and of B where there are two.
-        second_spool: Numbers of the second spool, `SPOOL_CONSTANTS`.
+        oil_constants: Constants of the oil.
+        constants: See `cylinder_constants`, floats or formulas.
+        cylinder: Description of the cylinder.
+        valve: Description of the valve.
+        spool_positions: Position u; with two spools, those of the spools of A and B.
+        second_spool: Constants of the second spool, see `SPOOL_CONSTANTS`.
         x: Coordinate above the lower limit [m], [rad].
-        v: Its rate [m/s], [rad/s].
-        states: States: those of the pressures in A and B, then the series spring's compression.
+        v: Velocity [m/s], [rad/s].
+        states: States of the pressures in A and B, then the compression of the series spring.
 
     Attributes:
-        joint: Whose cylinder it is.
+        joint: Joint of the cylinder.
         valve: Its valve.
-        pressures: Of A and B [Pa].
-        inlet_openings: Openings y of the inlets to A and to B: of one spool on its positive and
-            its negative side.
-        force: Of the cylinder, equation (20) [N], [N m].
-        spring_rate: Rate of the series spring's compression, if there is one.
-        spring_power: What goes into it [W].
-        spring_flow: What both chambers grow by as it gives way [m3/s].
-        damper_power: What its damper turns into heat [W].
+        pressures: Pressures in A and B [Pa].
+        inlet_openings: Openings y of the inlets to A and B; of a single spool, for positive and
+            negative positions.
+        force: Force of the cylinder, equation (20) [N], [N m].
+        spring_rate: Rate of the compression of the series spring; empty without one.
+        spring_power: Power stored in the series spring [W].
+        spring_flow: Rate of both volumes by the compression of the spring [m3/s].
+        damper_power: Power dissipated by the damper of the spring [W].
     """
 
     def __init__(
@@ -97,76 +100,72 @@ class ValveCylinderEquations:
         v: Scalar,
         states: Sequence[Scalar],
     ):
-        self._oil_constants, width = oil_constants, len(_COUNTERBALANCE_CONSTANTS)
-        self._cylinder, self.valve, self._states, self._spool_positions = (
-            cylinder,
-            valve,
-            states,
-            spool_positions,
-        )
-        self.joint = cylinder.joint
-        named_constants = self._constants = dict(
-            zip(CYLINDER_CONSTANTS, constants[: len(CYLINDER_CONSTANTS)], strict=True)
-        )
-        ends = [len(CYLINDER_CONSTANTS) + side * width for side in range(3)]
+        self.joint, self.valve, self._cylinder = cylinder.joint, valve, cylinder
+        self._oil_constants, self._states = oil_constants, states
+        self._spool_positions = spool_positions
+        count, width = len(CYLINDER_CONSTANTS), len(_COUNTERBALANCE_CONSTANTS)
+        named = self._constants = dict(zip(CYLINDER_CONSTANTS, constants, strict=False))
         self._counterbalance_constants = [
-            dict(zip(_COUNTERBALANCE_CONSTANTS, constants[start:end], strict=True))
-            for start, end in zip(ends, ends[1:], strict=False)
+            dict(zip(_COUNTERBALANCE_CONSTANTS, constants[count + side * width :], strict=False))
+            for side in range(2)
         ]
         vapour = oil_constants["vapour"]
-        pressures = self.pressures = [vapour + maximum(states[side], 0.0) for side in range(2)]
-        areas = self._areas = [named_constants["area_a"], named_constants["area_b"]]
-        self.force = areas[0] * pressures[0] - areas[1] * pressures[1]
+        self.pressures = [vapour + maximum(states[side], 0.0) for side in range(2)]
+        self._areas = [named["area_a"], named["area_b"]]
+        self.force = self._areas[0] * self.pressures[0] - self._areas[1] * self.pressures[1]
         self.spring_rate: list[Scalar] = []
         self.spring_power: Scalar = 0.0
         self.spring_flow: Scalar = 0.0
         self.damper_power: Scalar = 0.0
         if cylinder.stiffness > 0:
-            # massless: the spring and its damper carry the cylinder's force
-            spring_force = named_constants["stiffness"] * states[2]
-            compression_rate = (self.force - spring_force) / named_constants["damping"]
+            # without a mass in between, spring and damper carry the force of the cylinder
+            spring_force = named["stiffness"] * states[2]
+            compression_rate = (self.force - spring_force) / named["damping"]
             x, v = x + states[2], v + compression_rate
             self.spring_rate = [compression_rate]
             self.spring_power = spring_force * compression_rate
-            self.spring_flow = (areas[0] - areas[1]) * compression_rate
-            self.damper_power = named_constants["damping"] * compression_rate * compression_rate
-        self._clearances = [x, named_constants["stroke"] - x]
+            self.spring_flow = (self._areas[0] - self._areas[1]) * compression_rate
+            self.damper_power = named["damping"] * compression_rate * compression_rate
+        self._clearances = [x, named["stroke"] - x]
         self._velocity = v
-        self._spool_constants = [named_constants, second_spool][: len(spool_positions)]
-        sides = [
+        self._spool_constants = [named, second_spool][: len(spool_positions)]
+        openings = [
             [
-                clip((side - law["dead_band"]) * law["per_stroke"], 0.0, 1.0)
-                for side in (spool, -spool)
+                clip((position - spool["dead_band"]) * spool["per_stroke"], 0.0, 1.0)
+                for position in (u, -u)
             ]
-            for spool, law in zip(spool_positions, self._spool_constants, strict=True)
+            for u, spool in zip(spool_positions, self._spool_constants, strict=True)
         ]
-        self.inlet_openings = [sides[0][0], sides[-1][1]]
-        self._outlet_openings = [sides[0][1], sides[-1][0]]
+        self.inlet_openings = [openings[0][0], openings[-1][1]]
+        self._outlet_openings = [openings[0][1], openings[-1][0]]
 
     @property
     def pressures_by_node(self) -> dict[str, Scalar]:
-        """Pressures of its chambers by their nodes' names."""
+        """Pressures of its chambers by the names of their nodes [Pa]."""
         return {f"{self.joint}.{side}": p for side, p in zip("ab", self.pressures, strict=True)}
 
     @property
     def pump_demand(self) -> Scalar:
-        """Share of its pump's flow that a positive control gives for it."""
+        """Share of the flow of its pump that it requests of a positive control."""
         return self._constants["demand"] * maximum(*self.inlet_openings)
 
+    @property
+    def _sensing_shares(self) -> list[Scalar]:
+        return [clip(y * SENSING_OPENING_GAIN, 0.0, 1.0) for y in self.inlet_openings]
+
     def sensed_load_pressure(self, tank: Scalar) -> Scalar:
-        """Pressure that its valve reports as its load, the tank's while it is closed [Pa]."""
-        shares = [clip(y * SENSING_OPENING_GAIN, 0.0, 1.0) for y in self.inlet_openings]
-        loads = [share * (p - tank) for share, p in zip(shares, self.pressures, strict=True)]
-        return tank + maximum(*loads)
+        """Load pressure that its valve reports; the tank pressure while it is closed [Pa]."""
+        shares = zip(self._sensing_shares, self.pressures, strict=True)
+        return tank + maximum(*(share * (p - tank) for share, p in shares))
 
     def relative_shortage(self, supply: Scalar, tank: Scalar) -> Scalar:
-        """What a pump's pressure is short of for its flow, over what `Valve.priority` allows."""
-        share = largest_of([clip(y * SENSING_OPENING_GAIN, 0.0, 1.0) for y in self.inlet_openings])
+        """Missing pressure of the pump, relative to the range of `Valve.priority`."""
+        share = largest_of(self._sensing_shares)
         required_pressure = self.sensed_load_pressure(tank) + share * self._constants["margin"]
         return (required_pressure - supply) / (_PRIORITY_MARGIN_SHARE * self._constants["margin"])
 
     def open_centre_coefficient(self) -> Scalar:
-        """Coefficient of its open centre."""
+        """Flow coefficient of its open centre [m3/(s Pa^0.5)]."""
         size = maximum(self._spool_positions[0], -self._spool_positions[0])
         if (curve := self.valve.curves.get("centre")) is not None:
             return self._constants["centre"] * curve.evaluate(size)
@@ -179,173 +178,161 @@ class ValveCylinderEquations:
         highest_load: Scalar,
         priority_share: Scalar,
     ) -> list[Flow]:
-        """All through its valve and past its piston.
+        """Flows through its valve and past its piston.
 
         Args:
-            supply: Pressure of what feeds it [Pa].
-            return_pressures: Those of what A and B are drained to [Pa].
-            highest_load: Highest load of the valves beside it, where it shares its flow [Pa].
-            priority_share: Share of its inlet that valves of priority leave.
+            supply: Pressure of the supply [Pa].
+            return_pressures: Pressures of the nodes to which A and B are drained [Pa].
+            highest_load: Highest load pressure of the valves of the supply [Pa].
+            priority_share: Share of the inflow that priority valves leave.
         """
-        part, valve = self._constants, self.valve
-        nodes = list(self.pressures_by_node)
-        node_a, node_b = nodes
-        pressure_a, pressure_b = self.pressures
-        pressure_difference = pressure_a - pressure_b
-        all_flows = [Flow(node_a, node_b, part["leakage"] * pressure_difference, "piston")]
-        if self._cylinder.cross_relief > 0:
-            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
-                over = maximum(sign * pressure_difference - part["cross_relief"], 0.0)
-                all_flows.append(Flow(source, target, part["relief_gain"] * over, "cross"))
-        if valve.regeneration > 0:
-            orifice = series_coefficient(
-                part["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
-            )
-            rate = self._limit_outflow(
-                orifice * signed_square_root(maximum(-pressure_difference, 0.0)), 1
-            )
-            all_flows.append(Flow(node_b, node_a, rate, "regeneration"))
         float_share: Scalar = 0.0
-        if valve.float_from > 0:
-            float_share = clip(
-                (-self._spool_positions[0] - part["float_from"]) * part["per_float"], 0.0, 1.0
-            )
-        for side in range(2):
-            p, return_pressure, node = self.pressures[side], return_pressures[side], nodes[side]
-            return_node = valve.return_a if side == 0 else valve.return_b
-            direction = 1.0 if side == 0 else -1.0
+        flows = self._flows_between_chambers()
+        if self.valve.float_from > 0:
+            excess = -self._spool_positions[0] - self._constants["float_from"]
+            float_share = clip(excess * self._constants["per_float"], 0.0, 1.0)
+        for side, node in enumerate(self.pressures_by_node):
+            p = self.pressures[side]
+            sign = 1.0 if side == 0 else -1.0
             inlet = self._edge_coefficient(
-                ("c1", "c4")[side], side, direction, self.inlet_openings[side]
+                ("c1", "c4")[side], side, sign, self.inlet_openings[side]
             )
             outlet = self._edge_coefficient(
-                ("c3", "c2")[side], side, -direction, self._outlet_openings[side]
+                ("c3", "c2")[side], side, -sign, self._outlet_openings[side]
             )
-            if valve.float_from > 0:
-                outlet = outlet + part["float_coefficient"] * float_share
+            if self.valve.float_from > 0:
+                outlet = outlet + self._constants["float_coefficient"] * float_share
                 if side == 1:
                     inlet = inlet * (1.0 - float_share)
             inflow, drop = self._inlet_flow(supply, inlet, side, highest_load)
-            if drop is None:  # else nothing comes back
-                inflow = (
-                    -self._limit_outflow(-inflow, side)
-                    if self._has_rupture_valve(side)
-                    else inflow
-                )
-            all_flows.append(Flow(valve.supply, node, priority_share * inflow, "inlet", drop))
+            if drop is None and self._has_rupture_valve(side):  # a compensator lets nothing back
+                inflow = -self._limit_outflow(-inflow, side)
+            flows.append(Flow(self.valve.supply, node, priority_share * inflow, "inlet", drop))
             outflow = -directional_flow(
-                return_pressure - p,
+                return_pressures[side] - p,
                 outlet,
                 series_coefficient(outlet, *self._outflow_restrictions(side)),
             )
-            all_flows.append(Flow(node, return_node, self._limit_outflow(outflow, side), "outlet"))
-        return all_flows
+            return_node = (self.valve.return_a, self.valve.return_b)[side]
+            flows.append(Flow(node, return_node, self._limit_outflow(outflow, side), "outlet"))
+        return flows
+
+    def _flows_between_chambers(self) -> list[Flow]:
+        """Leakage past the piston, cross relief, regeneration."""
+        constants, (node_a, node_b) = self._constants, self.pressures_by_node
+        difference = self.pressures[0] - self.pressures[1]
+        flows = [Flow(node_a, node_b, constants["leakage"] * difference, "piston")]
+        if self._cylinder.cross_relief > 0:
+            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
+                excess = maximum(sign * difference - constants["cross_relief"], 0.0)
+                flows.append(Flow(source, target, constants["relief_gain"] * excess, "cross"))
+        if self.valve.regeneration > 0:
+            orifice = series_coefficient(
+                constants["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
+            )
+            rate = orifice * signed_square_root(maximum(-difference, 0.0))
+            flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
+        return flows
 
     def leak_and_relief_flows(self, tank: Scalar) -> list[Flow]:
-        """Leaks, relief and suction valves of both chambers."""
-        part, all_flows = self._constants, []
-        for side, name in enumerate("ab"):
-            p, node = self.pressures[side], f"{self.joint}.{name}"
-            all_flows.append(Flow(node, TANK_NODE, part[f"leakage_{name}"] * (p - tank), "leak"))
+        """Leakage, relief and suction flows between both chambers and the tank."""
+        constants, flows = self._constants, []
+        for name, p in zip("ab", self.pressures, strict=True):
+            node = f"{self.joint}.{name}"
+            leakage = constants[f"leakage_{name}"] * (p - tank)
+            flows.append(Flow(node, TANK_NODE, leakage, "leak"))
             if self._cylinder.relief > 0:
-                rate = part["relief_gain"] * maximum(p - part["relief"], 0.0)
-                all_flows.append(Flow(node, TANK_NODE, rate, "relief"))
+                rate = constants["relief_gain"] * maximum(p - constants["relief"], 0.0)
+                flows.append(Flow(node, TANK_NODE, rate, "relief"))
             if self._cylinder.refill > 0:
-                rate = part["refill"] * signed_square_root(maximum(tank - p, 0.0))
-                all_flows.append(Flow(TANK_NODE, node, rate, "refill"))
-        return all_flows
+                rate = constants["refill"] * signed_square_root(maximum(tank - p, 0.0))
+                flows.append(Flow(TANK_NODE, node, rate, "refill"))
+        return flows
 
     def chamber_values(self, side: int, hose_flow: Scalar, inflow: Scalar) -> ChamberValues:
-        """A chamber that gets flows.
+        """A chamber with given flows.
 
         Args:
-            side: 0 of A, 1 of B.
-            hose_flow: Through its hose [m3/s].
-            inflow: In all [m3/s].
+            side: Side of the chamber.
+            hose_flow: Flow through its hose [m3/s].
+            inflow: Total inflow [m3/s].
         """
-        part, p, area = self._constants, self.pressures[side], self._areas[side]
-        sign = 1.0 if side == 0 else -1.0
-        net = inflow - sign * area * self._velocity
-        hose = part["hose_a" if side == 0 else "hose_b"]
-        gas = part["gas_a" if side == 0 else "gas_b"]
+        constants, name = self._constants, "ab"[side]
+        p, area, state = self.pressures[side], self._areas[side], self._states[side]
+        net = inflow - (1.0 if side == 0 else -1.0) * area * self._velocity
+        hose, gas = constants[f"hose_{name}"], constants[f"gas_{name}"]
         volume, half_volume = hose, hose
         if not self._cylinder.motor:
             volume = maximum(hose + area * self._clearances[side], _MIN_VOLUME_SHARE * hose)
-            half_volume = hose + 0.5 * area * part["stroke"]
+            half_volume = hose + 0.5 * area * constants["stroke"]
         compliance = volume_compliance(self._oil_constants, volume, hose, gas, p)
         void_compliance = self._oil_constants["oil"] * half_volume
         if self.valve.float_from > 0:
-            # it runs into voids all the time: over a jump steps get a million times shorter
-            filled_share = clip(self._states[side] * (1.0 / LAMINAR_PRESSURE_DROP), 0.0, 1.0)
-            pressure_state_rate = net / (
-                void_compliance + (compliance - void_compliance) * filled_share
-            )
+            # a floating chamber often cavitates: a jump would make the steps a million times
+            # shorter
+            filled_share = clip(state * (1.0 / LAMINAR_PRESSURE_DROP), 0.0, 1.0)
+            compliance = void_compliance + (compliance - void_compliance) * filled_share
         else:
-            pressure_state_rate = net / where_positive(
-                self._states[side], compliance, void_compliance
-            )
-        return ChamberValues(p, volume, area, hose_flow, net, pressure_state_rate)
-
-    def _edge_coefficient(self, name: str, side: int, direction: float, opening: Scalar) -> Scalar:
-        """Coefficient of a chamber's edge as far as its spool opens it, `direction` 1 or -1."""
-        if (curve := self.valve.curves.get(name)) is not None:
-            spool = self._spool_positions[-1 if side else 0]
-            stroke = clip(spool if direction > 0 else -spool, 0.0, 1.0)
-            return self._constants[name] * where_positive(stroke, curve.evaluate(stroke), 0.0)
-        return self._constants[name] * opening
+            compliance = where_positive(state, compliance, void_compliance)
+        return ChamberValues(p, volume, area, hose_flow, net, net / compliance)
 
     def circuit_friction(self, tank: Scalar) -> Scalar:
-        """Coulomb friction that seals and brake add to the joint's [N], [N m].
+        """Coulomb friction that seals and brake add to that of the joint [N], [N m].
 
-        F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e), with mu and B of
-        the seals and the brake, its last factor within 0 and 1, d the dead band and e the travel
-        that releases it; of two spools the one that goes farther counts.
+        F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e), with mu of the
+        seals, B of the brake, d the dead band and e the travel that releases the brake. The last
+        factor is limited to 0 and 1; with two spools, that with the larger travel counts.
 
         Args:
             tank: p_R [Pa].
         """
-        part = self._constants
-        grip: Scalar = 0.0
+        constants = self._constants
+        friction: Scalar = 0.0
         if self._cylinder.seal_friction > 0:
             gauge_pressures = [maximum(p - tank, 0.0) for p in self.pressures]
-            grip = grip + part["seal_friction"] * (gauge_pressures[0] + gauge_pressures[1])
+            friction = friction + constants["seal_friction"] * (
+                gauge_pressures[0] + gauge_pressures[1]
+            )
         if self._cylinder.brake > 0:
             travel = largest_of([
-                (apply_function("abs", spool) - law["dead_band"]) * part["per_release"]
-                for spool, law in zip(self._spool_positions, self._spool_constants, strict=True)
+                (apply_function("abs", u) - spool["dead_band"]) * constants["per_release"]
+                for u, spool in zip(self._spool_positions, self._spool_constants, strict=True)
             ])  # fmt: skip
-            grip = grip + part["brake"] * (1.0 - clip(travel, 0.0, 1.0))
-        return grip
+            friction = friction + constants["brake"] * (1.0 - clip(travel, 0.0, 1.0))
+        return friction
+
+    def _edge_coefficient(self, name: str, side: int, sign: float, opening: Scalar) -> Scalar:
+        """Flow coefficient of an edge of a chamber that opens for spool positions of a sign."""
+        if (curve := self.valve.curves.get(name)) is not None:
+            u = self._spool_positions[-1 if side else 0]
+            stroke = clip(u if sign > 0 else -u, 0.0, 1.0)
+            return self._constants[name] * where_positive(stroke, curve.evaluate(stroke), 0.0)
+        return self._constants[name] * opening
 
     def _inlet_flow(
         self, supply: Scalar, inlet: Scalar, side: int, highest_load: Scalar
     ) -> tuple[Scalar, Scalar | None]:
-        """From the supply, and the drop at the edge that meters it where another one follows.
-
-        A compensator keeps the pressure drop and lets nothing back.
-        """
+        """Flow from the supply, and the drop at the metering edge of a compensated valve."""
         p, margin = self.pressures[side], self._constants["margin"]
         if self.valve.sharing:
             drop = maximum(supply - maximum(highest_load, p), 0.0)
-            return inlet * signed_square_root(drop), drop
-        if self.valve.margin > 0:
+        elif self.valve.margin > 0:
             drop = clip(supply - p, 0.0, margin)
-            return inlet * signed_square_root(drop), drop
-        return directional_flow(
-            supply - p, inlet, series_coefficient(inlet, *self._outflow_restrictions(side))
-        ), None
+        else:
+            outflow = series_coefficient(inlet, *self._outflow_restrictions(side))
+            return directional_flow(supply - p, inlet, outflow), None
+        return inlet * signed_square_root(drop), drop
 
     def _has_rupture_valve(self, side: int) -> bool:
-        """Whether a chamber has a hose rupture valve."""
         return (self._cylinder.rupture_a, self._cylinder.rupture_b)[side] > 0
 
     def _limit_outflow(self, rate: Scalar, side: int) -> Scalar:
-        """A flow out of a chamber, as far as its hose rupture valve lets it."""
-        if not self._has_rupture_valve(side):
-            return rate
-        return minimum(rate, self._constants["rupture_a" if side == 0 else "rupture_b"])
+        """Flow out of a chamber, limited by its hose rupture valve."""
+        limit = self._constants["rupture_a" if side == 0 else "rupture_b"]
+        return minimum(rate, limit) if self._has_rupture_valve(side) else rate
 
     def _outflow_restrictions(self, side: int) -> tuple[Scalar | None, Scalar]:
-        """In the way of the outflow: coefficient of the holding valve, 1 / c^2 of the cushion."""
+        """Coefficient of the load-holding valve, and 1 / c^2 of the cushion."""
         holding, p, other = None, self.pressures[side], self.pressures[1 - side]
         valve = self._counterbalance_constants[side]
         if (self._cylinder.counterbalance_a, self._cylinder.counterbalance_b)[side] is not None:
@@ -353,10 +340,8 @@ class ValveCylinderEquations:
             holding = valve["coefficient"] * clip(opening_pressure * valve["per_range"], 0.0, 1.0)
         cushion: Scalar = 0.0
         if self._cylinder.cushion > 0:
-            cushion_share = clip(
-                1.0 - self._clearances[side] / self._constants["cushion"], 0.0, 1.0
-            )
-            cushion = self._constants["cushion_resistance"] * cushion_share * cushion_share
+            share = clip(1.0 - self._clearances[side] / self._constants["cushion"], 0.0, 1.0)
+            cushion = self._constants["cushion_resistance"] * share * share
         return holding, cushion
 
 
@@ -367,17 +352,17 @@ def spool_equations(
     states: Mapping[str, Scalar],
     signal: Scalar,
 ) -> tuple[Scalar, list[Scalar]]:
-    """A spool's position u, and the rates of its states: u'' = w^2 (wanted - u) - 2 d w u'.
+    """Position u of a spool, and the rates of its states: u'' = w^2 (target - u) - 2 d w u'.
 
-    With a play of width h what is wanted follows the signal by z' = rate (|signal - z| - h / 2)
-    beyond the play.
+    With a play of the width h the target follows the signal by z' = rate (|signal - z| - h / 2)
+    outside of the play.
 
     Args:
-        name: Of its signal.
-        spool: What it is.
-        constants: Its numbers, `SPOOL_CONSTANTS` among them.
-        states: States by name.
-        signal: That reaches it [V].
+        name: Name of its signal.
+        spool: Its description.
+        constants: Its constants, among them `SPOOL_CONSTANTS`.
+        states: States of the circuit by name.
+        signal: Signal at the spool [V].
     """
     rates: list[Scalar] = []
     target = clip((signal - constants["neutral"]) * constants["per_signal"], -1.0, 1.0)
@@ -397,31 +382,25 @@ def spool_equations(
 
 
 def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
-    """The numbers of a cylinder, its valve and its stroke, in the order of the formulas."""
+    """Constants of a cylinder and its valve: `CYLINDER_CONSTANTS`, then counterbalance valves."""
     values = {
+        **vars(valve),
         **vars(cylinder),
         "cushion_resistance": cylinder.cushion_coefficient**-2,
         "stroke": stroke,
-        "c1": valve.c1, "c2": valve.c2, "c3": valve.c3, "c4": valve.c4,
-        "margin": valve.margin,
         **dict(zip(SPOOL_CONSTANTS, spool_constants(valve), strict=True)),
-        "centre": valve.centre,
-        "regeneration": valve.regeneration,
-        "float_from": valve.float_from,
         "per_float": 1.0 / (1.0 - valve.float_from),
-        "float_coefficient": valve.float_coefficient,
-        "demand": valve.demand,
         "per_release": 1.0 / cylinder.brake_release,
-    }  # fmt: skip
-    holding = [
-        _counterbalance_row(cylinder.counterbalance_a),
-        _counterbalance_row(cylinder.counterbalance_b),
+    }
+    return [
+        *(float(values[name]) for name in CYLINDER_CONSTANTS),
+        *_counterbalance_constants(cylinder.counterbalance_a),
+        *_counterbalance_constants(cylinder.counterbalance_b),
     ]
-    return [*(float(values[name]) for name in CYLINDER_CONSTANTS), *holding[0], *holding[1]]
 
 
 def spool_constants(spool: Valve | Spool) -> list[float]:
-    """The numbers of what moves a spool, in the order of `SPOOL_CONSTANTS`."""
+    """Constants of a spool, see `SPOOL_CONSTANTS`."""
     return [
         spool.neutral, 1.0 / (spool.full - spool.neutral), spool.dead_band,
         1.0 / (1.0 - spool.dead_band), spool.bandwidth, spool.damping, spool.rate,
@@ -429,7 +408,7 @@ def spool_constants(spool: Valve | Spool) -> list[float]:
     ]  # fmt: skip
 
 
-def _counterbalance_row(valve: CounterbalanceValve | None) -> list[float]:
+def _counterbalance_constants(valve: CounterbalanceValve | None) -> list[float]:
     if valve is None:
         return [0.0] * len(_COUNTERBALANCE_CONSTANTS)
     return [valve.pressure, valve.pilot_ratio, 1.0 / valve.range, valve.coefficient]

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from crane.common.errors import InputError, suggest_names
-from crane.hydraulics.components import Cylinder, Hydraulics
+from crane.hydraulics.components import Cylinder
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine import Machine
 
 WORKING_PRESSURE, HOLDING_PRESSURE, MOTOR_EFFORT = "working pressure", "holding pressure", "effort"

@@ -1,4 +1,4 @@
-"""Many simulations at once: variants of a machine, initial states, payloads."""
+"""Batches of simulations in threads: variants of a machine, initial states, payloads."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -16,11 +16,9 @@ from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.simulation.run_checks import run_warnings
-from crane.simulation.simulation_run import (
-    Progress,
+from crane.simulation.simulation_run import Progress, has_fixed_steps, integrate
+from crane.simulation.simulation_setup import (
     count_steps,
-    has_fixed_steps,
-    integrate,
     machine_under_control,
     reference_limits_text,
     resolve_controller,
@@ -39,8 +37,8 @@ class Batch(OneLineRepr):
         v: (B, N, n) their velocities [m/s], [rad/s].
         tau: (B, N, n) active forces [N], [N m].
         energy: (B, N, 4) kinetic, potential, work of the active forces, dissipated [J].
-        failures: Why a simulation failed, by its index.
-        warnings: What is doubtful about one that did not, by its index.
+        failures: Errors of failed simulations, by index.
+        warnings: Warnings of the other simulations, by index.
     """
 
     time: Array
@@ -52,7 +50,7 @@ class Batch(OneLineRepr):
     warnings: dict[int, str]
 
     def _one_line(self) -> str:
-        """How many, how long, and how many failed."""
+        """Number of simulations, duration, and number of failures."""
         return (
             f"Batch of {format_count(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
             f"{format_count(len(self.time), 'sample')}: {len(self.failures)} failed"
@@ -71,24 +69,24 @@ def simulate_batch(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Batch:
-    """Simulate many variants over threads; see `simulate` for what is computed.
+    """Simulate many variants in threads; see `simulate`.
 
     Variants made by `Machine.replace` and `Machine.with_payload` share their machine code. A
     variant that fails does not stop the others.
 
     Args:
         machines: B machines with the same active joints, or one for all initial states.
-        controller: Makes the controller of a machine; None for no force.
-        initial: B initial states as `simulate` takes them, or None for its default.
-        duration: [s]; that of the controller's reference if not given.
-        step: [s].
+        controller: Creates the controller of a machine; None for no force.
+        initial: B initial states, see `simulate`; None for its default.
+        duration: Duration [s]; that of the reference of the controller if not given.
+        step: Output interval [s].
         method: See `simulate`.
         tolerance: See `simulate`.
         threads: Number of threads; one per core if not given.
-        progress: Called with the finished share, 0 to 1.
+        progress: Function that is called with the finished share, 0 to 1.
 
     Raises:
-        InputError: Lengths or active joints that do not go together.
+        InputError: Lengths or active joints differ, or all simulations failed.
     """
     progress = progress_reporter(progress)
     if isinstance(machines, Machine):
@@ -99,8 +97,7 @@ def simulate_batch(
     if len(initial_states) != len(machines):
         raise InputError(
             f"{len(machines)} machines and {len(initial_states)} initial states do not go "
-            f"together, give "
-            "one state per machine, or one machine"
+            "together, give one state per machine, or one machine"
         )
     active = machines[0].active
     for i, machine in enumerate(machines):
@@ -133,7 +130,7 @@ def simulate_batch(
         if found.stop is not None:
             raise found.stop
         time, rows = found.time, found.rows
-        energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.lost])
+        energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.dissipated])
         q_a = rows.q[:, machine.closure.active]
         doubts = [
             *found.notes,
@@ -143,7 +140,7 @@ def simulate_batch(
 
     results: dict[int, _Result] = {}
     failures: dict[int, str] = {}
-    # one first, so that the others find their machine code made
+    # the first one compiles the machine code of the others
     indices = list(range(len(machines)))
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
@@ -163,7 +160,7 @@ def simulate_batch(
 def _completed_runs(
     pool: ThreadPoolExecutor, run: Callable[[int], _Result], groups: Sequence[Sequence[int]]
 ) -> Iterator[tuple[int, Future[_Result]]]:
-    """Every run as it is finished, one group after the other."""
+    """Runs in the order of their completion, one group after another."""
     for group in groups:
         futures = {pool.submit(run, i): i for i in group}
         for future in as_completed(futures):

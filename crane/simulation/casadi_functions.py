@@ -1,4 +1,4 @@
-"""A machine's formulas as functions of CasADi, for optimal control and estimation."""
+"""Formulas of a machine as CasADi functions, for optimal control and estimation."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +18,10 @@ from crane.dynamics.dynamics import QUANTITY_ARGUMENTS
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats import load
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import controller_settings, trace_machine
-from crane.simulation.integration.state_layouts import state_layout
 
 _KINEMATIC_QUANTITIES = ("loops", "gamma", "tip")  # what depends on q alone
 _SIMULATION_QUANTITY = "simulation"
@@ -35,33 +34,33 @@ def casadi_function(
 ) -> Any:
     """A quantity of a machine as a `casadi.Function`, generated from the formulas of its programs.
 
-    All coordinates q of the spanning tree are an argument, in the order of `machine.joints`, not
-    the active ones alone: the loops are no part of the function but equations `loops`, phi(q) = 0,
-    for the optimisation to hold. So the branch is the one that its variables are on, where an
-    iteration inside might end on another; and a function is one expression, of which CasADi has
-    exact sparse derivatives of any order, and makes code. Along the closed machine
+    The argument q has all coordinates of the spanning tree, in the order of `machine.joints`. The
+    loops are not solved within the function; they are the equations `loops`, phi(q) = 0, which are
+    constraints of the optimisation. Its variables then stay on their branch, whereas an inner
+    iteration could leave it; and a function is one expression, of which CasADi generates exact
+    sparse derivatives of any order, and code. Along the closed machine
 
         d f / d q_A = (df/dq) gamma,    q' = gamma v_A,
 
-    but for a base that floats, whose q holds a rotation vector. Where only q_A is wanted,
-    `casadi.rootfinder` makes q_P from `loops`.
+    except for a floating base, whose q has a rotation vector. `casadi.rootfinder` computes q_P
+    from q_A by `loops`.
 
     | quantity | arguments | result |
     |---|---|---|
     | "loops" | q | phi (r,) of the independent equations |
     | "gamma" | q | dq/dq_A (nq, n) |
-    | "tip" | q | place of the tip (3,) [m] |
+    | "tip" | q | position of the tip (3,) [m] |
     | "inverse", "regressor" | q, v_a, a_a | as `Dynamics` |
     | "forward" | q, v_a, tau_a | as `Dynamics` |
     | "mass_matrix", "gravity" | q | as `Dynamics` |
     | "bias", "friction", "passive" | q, v_a | as `Dynamics` |
     | "energy" | q, v_a | kinetic, potential (2,) [J] |
-    | "simulation" | q, v_a, circuit, signals | what a machine with valves is simulated by |
+    | "simulation" | q, v_a, circuit, signals | rates of a machine with valves |
 
     "simulation" gives the rates q_rate (nq,), a_a (n,), circuit_rate of the states of
-    `crane.hydraulics.CircuitEquations` (`ValveDrive(machine, command).circuit.states` names them,
-    its `start` has those at rest) and balance_rate (6,) of the oil's and the energy's balances, in
-    `crane.hydraulics.circuit_equations.BALANCE_UNITS`. `signals` are those of the valves [V].
+    `crane.hydraulics.CircuitEquations` (`ValveDrive(machine, command).circuit.state_units` names
+    them, `start` of the drive returns those at rest) and balance_rate (6,) of the integrals
+    `crane.hydraulics.circuit_states.BALANCE_UNITS`. `signals` are those of the valves [V].
 
     Args:
         machine: The machine, or what `crane.load` takes.
@@ -99,7 +98,7 @@ def casadi_function(
 
 
 def _casadi_argument(ca: Any, symbols: dict[str, Any], argument: Any) -> Any:
-    """What stands for an argument of the tape: numbers, or parts named in a tuple."""
+    """An argument of the tape: numbers, or the symbols named in a tuple."""
     if not isinstance(argument, tuple):
         return argument
     return [x for name in argument for x in ca.vertsplit(symbols[name])]
@@ -108,7 +107,7 @@ def _casadi_argument(ca: Any, symbols: dict[str, Any], argument: Any) -> Any:
 def _dynamics_quantity(
     machine: Machine, quantity: str, friction: bool
 ) -> tuple[dict[str, int], list[Any], FormulaOutputs]:
-    """Sizes of the arguments, what the tape's are, and formulas."""
+    """Sizes of the arguments, arguments of the tape, and formulas."""
     fast, tape, n = machine.closure.compiled_closure, Tape(), len(machine.active)
     q, kinematics, loops = fast.trace_kinematics(tape, 0, 1)
     geometry = fast.geometry.constants
@@ -147,14 +146,14 @@ def _kinematic_quantity(
     rotation = machine.closure.compiled_closure.geometry.body_rotations[body]
     offset = (rotation.T @ frame.placement.translation).tolist()
     place = add_vectors(kinematics.origin[body], matvec(kinematics.rotation[body], offset))
-    # formulas are seen from the trunk, which may be another body than the world
+    # positions are relative to the reference body, which may not be the world
     return matvec(
         transpose(kinematics.rotation[0]), subtract_vectors(place, kinematics.origin[0])
     ), (3,)
 
 
 def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], FormulaOutputs]:
-    """The same of what `crane.simulate` integrates."""
+    """The same for the quantity "simulation"."""
     for column in find_stick_slip_columns(machine):
         joint = machine.joints[column]
         raise InputError(
@@ -169,7 +168,7 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
     )
     tape, m = Tape(), len(drive.circuit.spools)
     formulas = trace_machine(chart, tape, layout, 4, [])
-    # zeros among the settings are parts that the circuit has not
+    # zeros among the settings are features that the circuit does not have
     inputs = formulas.controller_inputs(
         controller_settings(drive, tape, 2, True), tape.load_vector(3, 0, m)
     )

@@ -1,6 +1,6 @@
-"""What a simulation leaves: a recording with channels."""
+"""Recording of a simulation: its channels, and readings of ideal sensors."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -8,32 +8,45 @@ import numpy as np
 
 from crane.codegen import Layout, LayoutView
 from crane.common import scratch_arrays
-from crane.common.errors import CraneError, format_one_line
+from crane.common.errors import CraneError, RecordingError, format_one_line, suggest_names
 from crane.common.one_line_repr import shorten_to_line
 from crane.common.samples import MAX_QUANTITY, Array
 from crane.control import Controller, ValveDrive, ZeroForce, controller_reference
 from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.description.sensors import (
+    FORCE_SUFFIX,
+    FORCE_UNITS,
+    INCLINATION_PREFIX,
+    SUPPLY_PRESSURE,
+    TANK_PRESSURE,
+    VALVE_SIGNAL_PREFIX,
+    VELOCITY_SUFFIX,
+    VELOCITY_UNITS,
+    quantity_unit,
+)
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.dynamics.tipping_stability import TippingStability, has_supports
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory
-from crane.recordings.recording import FORCE_UNITS, Recording
+from crane.recordings.ideal_sensors import ideal_readings
+from crane.recordings.recording import Recording
+from crane.recordings.timeseries import TIME, Table, accepted_units, check_unit
 
 ChannelColumn = tuple[str, Array, str]  # name, values, unit
 
 
 class IntegrationResult(NamedTuple):
-    """What an integration leaves.
+    """Result of an integration.
 
     Attributes:
-        time: (N,) [s].
+        time: (N,) instants [s].
         array: (N, .) rows at these instants.
-        layout: Of a row, see `crane.simulation.integration.row_layout`.
-        notes: What is to be said of the motion.
-        start_text: How it starts, where that is not what the file says.
-        stop: What ended it before its time, if something did.
+        layout: Layout of a row, see `row_layout`.
+        notes: Notes for the user about the motion.
+        start_text: Note about an initial state that differs from home.
+        stop: The exception that stopped it, or None.
     """
 
     time: Array
@@ -45,19 +58,19 @@ class IntegrationResult(NamedTuple):
 
     @property
     def rows(self) -> LayoutView:
-        """The rows part by part, (N, .) each."""
+        """The parts of the rows, (N, .) each."""
         return self.layout.view(self.array)
 
     def first_instants(self, count: int, stop: BaseException | None) -> "IntegrationResult":
-        """The first instants of it, and what ended it there."""
+        """The first instants of the result, with the exception that stopped it there."""
         return self._replace(time=self.time[:count], array=self.array[:count], stop=stop)
 
 
 class InterruptedRun(KeyboardInterrupt):
-    """A run that was interrupted.
+    """Interrupt of a run.
 
     Attributes:
-        recording: What there is of it, whose `stop_with_recording` says where it ended.
+        recording: The recording up to the interrupt; its `stopped` says where it ended.
     """
 
     def __init__(self, recording: Recording):
@@ -68,14 +81,14 @@ class InterruptedRun(KeyboardInterrupt):
 def stop_with_recording(
     machine: Machine, control: Controller, run: IntegrationResult, task: str, end_time: float
 ) -> BaseException:
-    """What stopped a run, which has what there is of it as its `recording`.
+    """The exception that stopped a run, with the recording up to there as its `recording`.
 
     Args:
         machine: The machine.
-        control: What drove it.
-        run: What was integrated.
-        task: Name to put into the recording.
-        end_time: When it should have ended [s].
+        control: Its controller.
+        run: Result of the integration.
+        task: Name of the motion.
+        end_time: Intended end [s].
     """
     assert (stop := run.stop) is not None
     if not len(run.time):
@@ -83,7 +96,7 @@ def stop_with_recording(
     largest_values = scratch_arrays.compute_in_blocks(
         lambda part: np.abs(run.array[part]).max(axis=1, keepdims=True), len(run.time)
     )
-    # what has exploded is no motion
+    # values that diverged are removed
     run = run.first_instants(int(np.append(largest_values < MAX_QUANTITY, False).argmin()), stop)
     if not len(run.time):
         return stop
@@ -93,7 +106,7 @@ def stop_with_recording(
         text = f"at t = {run.time[-1]:g} s of {end_time:g} s: interrupted"
     elif not text.startswith("at t = "):
         text = f"at t = {run.time[-1]:g} s: {text}"
-    with suppress(CraneError):  # channels that cannot be computed there hide no error
+    with suppress(CraneError):  # an error of the channels must not hide that of the run
         recording = record_run(machine, control, run.time, run.rows, task, text)
         if interrupted:
             return InterruptedRun(recording)
@@ -110,16 +123,16 @@ def record_run(
     stopped: str = "",
     start_text: str = "",
 ) -> Recording:
-    """What the integration left as a recording.
+    """The recording of a run.
 
     Args:
         machine: The machine.
-        control: What drove it.
-        time: (N,) [s].
-        rows: See `integrate`.
-        task: Name to put into it.
-        stopped: When and why it ended before its time.
-        start_text: How it starts, where that is not what the file says.
+        control: Its controller.
+        time: (N,) instants [s].
+        rows: Parts of the rows, see `integrate`.
+        task: Name of the motion.
+        stopped: When and why the run was stopped.
+        start_text: Note about an initial state that differs from home.
     """
     active = machine.closure.active
     q_a = scratch_arrays.compute_in_blocks(lambda part: rows.q[part][:, active], len(time))
@@ -151,7 +164,7 @@ def record_run(
 def _channel_columns(
     machine: Machine, control: Controller, time: Array, rows: LayoutView
 ) -> Iterator[ChannelColumn]:
-    """What is recorded beside the active joints."""
+    """Channels besides the active joints."""
     for column in machine.closure.passive:
         joint = machine.joints[column]
         yield joint, rows.q[:, column], machine.unit(joint)
@@ -170,19 +183,26 @@ def _channel_columns(
             rows.friction[:, i],
             FORCE_UNITS[machine.unit(joint)],
         )
-    for column, values in zip(find_stick_slip_columns(machine), rows.rest.T, strict=True):
+    for column, values in zip(
+        find_stick_slip_columns(machine), rows.friction_at_rest.T, strict=True
+    ):
         joint = machine.joints[column]
         yield f"rest_{joint}", values, FORCE_UNITS[machine.unit(joint)]
-    names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
+    names = {
+        "kinetic": "kinetic",
+        "potential": "potential",
+        "work": "work",
+        "dissipated": "dissipated",
+    }
     for name, part in names.items():
         yield name, getattr(rows, part)[:, 0], "J"
     yield from _external_force_columns(machine, rows)
     yield from _stability_columns(machine, rows)
     if isinstance(control, ValveDrive):
-        integrals = rows.own[:, -len(BALANCE_UNITS) :]
+        integrals = rows.controller[:, -len(BALANCE_UNITS) :]
         units = [*control.channels, *BALANCE_UNITS.items()]
         delayed_signals: dict[str, Array] = {}
-        if control.delays.any():  # a log has what was commanded, not what arrives
+        if control.delays.any():  # a log has the commanded signals
             spools = (f"voltage_{name}" for name in control.circuit.spools)
             commanded = scratch_arrays.compute_in_blocks(
                 lambda part: control.commanded_signals(time[part]), len(time)
@@ -193,8 +213,8 @@ def _channel_columns(
 
 
 def _external_force_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
-    """What acts from outside, in the world's axes at the origins of frames, and its work."""
-    columns = iter(rows.outside.T)
+    """External forces in the axes of the world at the origins of their frames, and their work."""
+    columns = iter(rows.external.T)
     for k, force in enumerate(machine.external_forces):
         for part, values in zip(WRENCH_COMPONENTS, columns, strict=False):
             if part.startswith("force") or values.any():
@@ -205,7 +225,7 @@ def _external_force_columns(machine: Machine, rows: LayoutView) -> Iterator[Chan
 
 
 def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelColumn]:
-    """What supports carry, and how far it is from tipping."""
+    """Forces of supports, and stability margins."""
     if not has_supports(machine):
         return
     stability = TippingStability(machine)
@@ -217,7 +237,7 @@ def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelCo
         titles += [(word, "")]
 
     def stand(part: slice) -> Array:
-        q, outside = rows.q[part], rows.outside[part]
+        q, outside = rows.q[part], rows.external[part]
         columns: list[Array] = []
         if stability.is_stationary:
             v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[part])
@@ -238,7 +258,7 @@ def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelCo
 def _reference_columns(
     machine: Machine, reference: Trajectory, time: Array
 ) -> Iterator[ChannelColumn]:
-    """What a reference asks of the joints, and of the tip where it was given there."""
+    """The reference of the joints, and of the tip if it is a trajectory of the tip."""
     q = scratch_arrays.compute_in_blocks(lambda part: reference.position(time[part]), len(time))
     v = scratch_arrays.compute_in_blocks(lambda part: reference.velocity(time[part]), len(time))
     for i in np.flatnonzero(machine.is_driven):
@@ -263,3 +283,97 @@ def _controller_name(control: Controller) -> str:
     if isinstance(control, ValveDrive):
         return getattr(control.command, "title", type(control.command).__name__)
     return "" if isinstance(control, ZeroForce) else type(control).__name__
+
+
+_INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)
+
+
+def simulated_columns(machine: Machine, table: Table) -> list[str]:
+    """Columns of a measured table that a simulation of its inputs has.
+
+    Joints, their velocities and forces, pressures, channels of the circuit, the tip, and
+    inclinations of links, `inclination_LINK` and `inclination_LINK_velocity`.
+
+    Raises:
+        RecordingError: A column has the unit of another quantity, or belongs to no link.
+    """
+    return _select_columns(machine, table, simulated_units(machine))
+
+
+def recorded_columns(machine: Machine, table: Table, recording: Recording) -> list[str]:
+    """Columns of a measured table that the recording of a simulation has.
+
+    Raises:
+        RecordingError: As for `simulated_columns`.
+    """
+    units = recording.units | recording.channel_units
+    units |= {x + VELOCITY_SUFFIX: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
+    driven = (x for x in recording.joints if x not in recording.free)
+    units |= {x + FORCE_SUFFIX: FORCE_UNITS[recording.units[x]] for x in driven}
+    return _select_columns(machine, table, units)
+
+
+def _select_columns(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
+    """Columns, without the inputs, whose names have units, or that are inclinations."""
+    columns = []
+    for name, unit in table.units.items():
+        if name == TIME:
+            continue
+        wanted = units.get(name)
+        if name.startswith(INCLINATION_PREFIX):
+            wanted = quantity_unit(machine.tree, name)
+            if wanted is None:
+                link = name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
+                links = machine.tree.links
+                raise RecordingError(
+                    f"column '{name}' is of no link, {suggest_names(links, link)}"
+                )
+        if wanted is not None:
+            check_unit(name, unit, accepted_units(wanted))
+            if not name.startswith(_INPUT_PREFIXES):
+                columns.append(name)
+    return columns
+
+
+def simulated_units(machine: Machine) -> dict[str, str]:
+    """Units of the columns that a simulation with valves records, by name."""
+    joint_units = {joint: machine.unit(joint) for joint in machine.joints}
+    units = dict(joint_units)
+    units |= {
+        joint + VELOCITY_SUFFIX: VELOCITY_UNITS[joint_units[joint]] for joint in machine.active
+    }
+    units |= {
+        joint + FORCE_SUFFIX: FORCE_UNITS[joint_units[joint]] for joint in machine.driven_joints
+    }
+    units |= {f"tip_{axis}": "m" for axis in "xyz" if machine.tip is not None}
+    for joint in machine.hydraulics.joints if machine.hydraulics else ():
+        units |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}
+        units |= {f"spool_{joint}": ""}
+    return units
+
+
+def read_simulation(machine: Machine, recording: Recording, names: list[str]) -> Array:
+    """Readings (N, k) of ideal sensors at the recorded instants, SI units.
+
+    Args:
+        machine: The simulated machine.
+        recording: Its recording.
+        names: See `simulated_columns`.
+    """
+    columns = recording.columns()
+    inclination_names = [name for name in names if name.startswith(INCLINATION_PREFIX)]
+    readings = columns | (
+        _inclination_readings(machine, recording, inclination_names) if inclination_names else {}
+    )
+    values = [readings[name] for name in names]
+    return np.column_stack(values) if values else np.empty((len(recording.time), 0))
+
+
+def _inclination_readings(
+    machine: Machine, recording: Recording, names: list[str]
+) -> dict[str, Array]:
+    columns = recording.columns()
+    q = np.column_stack([columns[joint] for joint in machine.joints])
+    order = [recording.joints.index(joint) for joint in machine.active]
+    v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
+    return ideal_readings(machine, q, v, names)

@@ -1,4 +1,4 @@
-"""Measured valve signals put through the model, and what comes out beside what was measured."""
+"""Simulation of measured valve signals, and comparison with the measurement."""
 
 import warnings
 from collections.abc import Sequence
@@ -34,16 +34,14 @@ from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_qua
 from crane.recordings.sensor_discrepancy import warn_discrepancies
 from crane.recordings.stroke_check import check_strokes
 from crane.recordings.timeseries import TIME, Table, table_column
-from crane.simulation.simulated_readings import read_simulation, recorded_columns
+from crane.simulation.recorded_run import read_simulation, recorded_columns
 from crane.simulation.simulation_run import Progress, simulate
 
-_START_FIT_DURATION, _MAX_REST_DURATION = (
-    0.1,
-    1.0,
-)  # over which the start is fitted, and a rest looked for [s]
+_START_FIT_DURATION = 0.1  # interval of the fit of the initial state [s]
+_MAX_REST_DURATION = 1.0  # longest interval that is tested for rest [s]
 _MIN_FIT_SAMPLES = 5  # samples of that fit
-_LIMIT_TOLERANCE = 0.01  # of a range, beyond a limit, that noise does not explain
-_REST_TOLERANCE = 1e-12  # variation of a channel that is rounding, per its size
+_LIMIT_TOLERANCE = 0.01  # share of the range by which measured coordinates may pass limits
+_REST_TOLERANCE = 1e-12  # relative variation of a constant channel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,10 +49,10 @@ class ChannelComparison(OneLineRepr):
     """One channel, measured and simulated at the measured instants.
 
     Attributes:
-        name: Of the column.
+        name: Name of the column.
         unit: Its unit.
-        measured: (N,).
-        simulated: (N,).
+        measured: (N,) measured values.
+        simulated: (N,) simulated values.
     """
 
     name: str
@@ -69,7 +67,7 @@ class ChannelComparison(OneLineRepr):
 
     @property
     def relative_rms(self) -> float:
-        """The same over that of the measured channel about its mean; infinite if that rests."""
+        """RMS error over the standard deviation of the measurement; infinite if that is 0."""
         deviation = float(np.std(self.measured))
         if deviation < _REST_TOLERANCE * float(np.abs(self.measured).max()):
             deviation = 0.0
@@ -91,7 +89,7 @@ class Comparison(Result):
     recording: Recording | None = None
 
     def _one_line(self) -> str:
-        """How long, and what is compared."""
+        """Duration and compared channels."""
         return (
             f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
             + ", ".join(channel.name for channel in self.channels)
@@ -123,18 +121,18 @@ def replay(
     The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
     where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
     strokes or angles, velocities, pressures (see `crane.recordings.measured_recordings`). The
-    simulation starts from the measured posture and velocity, at rest or fitted over the first
-    tenth of a second, and from the measured pressures; where the file does not tell, from the home
-    posture at rest, and from what holds it.
+    simulation starts from the measured configuration and velocity, at rest or fitted over the
+    first tenth of a second, and from the measured pressures. Where they are not measured, it
+    starts at home and rest, and with pressures that hold the machine.
 
     Args:
         machine: The machine.
         path: A CSV or npz file.
-        step: Of the simulation [s].
+        step: Output interval of the simulation [s].
         progress: Called with the finished share, 0 to 1.
-        columns: Which columns of a log are which, if not as the machine's sensors say, see
-            `crane.recordings.logs`.
-        span: From when to when [s], by the file's own clock; the simulation counts from zero.
+        columns: Assignment of the columns of a log, if not that of the sensors of the machine,
+            see `crane.recordings.logs`.
+        span: Time span [s] by the clock of the file; the simulation starts at zero.
 
     Returns:
         The simulated recording, and its comparison with the file.
@@ -166,15 +164,15 @@ def replay(
 
 
 def compare_channels(machine: Machine, table: Table, recording: Recording) -> Comparison:
-    """Channels that a file and a simulation both tell, but for the inputs.
+    """Compare the channels of a measurement with those of a simulation, without the inputs.
 
     Args:
-        machine: What was simulated.
-        table: What was measured.
-        recording: What was simulated from the same instant on.
+        machine: The simulated machine.
+        table: The measurement.
+        recording: The simulation from the same instant on.
 
     Raises:
-        RecordingError: A channel of the file is in a unit of something else.
+        RecordingError: A channel of the file has the unit of another quantity.
     """
     time = table_column(table, TIME)
     time = time - time[0]
@@ -196,17 +194,16 @@ def compare_channels(machine: Machine, table: Table, recording: Recording) -> Co
 
 @dataclass(frozen=True, eq=False)
 class ReplayInputs:
-    """What a measured machine was driven by, and where it started.
+    """Inputs and initial state of a measured machine.
 
     Attributes:
         time: (N,) [s] from zero.
-        signals: Of the spools that were moved, (k,) by name [V].
-        supply: (N,) pressure of the supply [Pa], None where it was not measured.
-        tank: Likewise.
-        pressures: Of A and B at the start [Pa] by joint, where they were measured.
-        initial: q_A and v_A at the start, None where nothing tells.
-        signal_times: (k,) times of the signals [s], from before zero where these are known; None
-            for `time`.
+        signals: (k,) measured signals of spools by name [V].
+        supply: (N,) pressure of the supply [Pa]; None if it was not measured.
+        tank: (N,) pressure of the tank [Pa]; None if it was not measured.
+        pressures: Measured initial pressures in A and B [Pa] by joint.
+        initial: Initial q_A and v_A; None if they were not measured.
+        signal_times: (k,) times of the signals [s], which may be negative; None for `time`.
     """
 
     time: Array
@@ -218,7 +215,7 @@ class ReplayInputs:
     signal_times: Array | None = None
 
     def valve_drive(self, machine: Machine) -> ValveDrive:
-        """The valves' drive of a machine."""
+        """The valve drive of a machine."""
         time, line_pressures = self.time, [self.supply, self.tank]
         if self.signal_times is not None:
             time = self.signal_times
@@ -230,7 +227,7 @@ class ReplayInputs:
 
 
 def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
-    """What drove a machine, of which a table was measured.
+    """Inputs and initial state of a machine, from a measured table.
 
     Raises:
         RecordingError: The table has no signals, or is malformed.
@@ -275,12 +272,12 @@ def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
 
 
 def _spool_signals(machine: Machine, spools: Sequence[str], table: Table) -> dict[str, Array]:
-    """Of the spools that were moved, by name [V]."""
+    """Measured signals of spools by name [V]."""
     signals = {}
     for name in (name for name in table.units if name.startswith(VALVE_SIGNAL_PREFIX)):
         spool = name.removeprefix(VALVE_SIGNAL_PREFIX)
         if spool in machine.locked_joints or spool.removesuffix("_b") in machine.locked_joints:
-            continue  # the valve of a joint that is held moves nothing
+            continue  # the valve of a locked joint has no effect
         if spool not in spools:
             raise RecordingError(f"column '{name}' is of no valve, {suggest_names(spools, spool)}")
         signals[spool] = table_column(table, name, "V")
@@ -293,15 +290,17 @@ def _spool_signals(machine: Machine, spools: Sequence[str], table: Table) -> dic
 def _initial_pressures(
     joints: Sequence[str], table: Table, time: Array
 ) -> dict[str, tuple[float, float]]:
-    """Of A and B at the start, by joint [Pa], from all samples near it."""
+    """Initial pressures in A and B by joint [Pa], from the first samples."""
     pressures: dict[str, tuple[float, float]] = {}
     for joint in joints:
         pair = [f"pressure_{joint}_{side}" for side in "ab"]
-        there = [name for name in pair if name in table.units]
-        if len(there) == 1:
-            missing = pair[pair[0] in there]
-            raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
-        if there:
+        measured = [name for name in pair if name in table.units]
+        if len(measured) == 1:
+            missing = pair[pair[0] in measured]
+            raise RecordingError(
+                f"'{missing}' is missing beside '{measured[0]}', add or remove one"
+            )
+        if measured:
             a, b = (_value_at_first_sample(time, table_column(table, name), 0) for name in pair)
             pressures[joint] = max(a, 0.0), max(b, 0.0)
     return pressures
@@ -310,7 +309,7 @@ def _initial_pressures(
 def _initial_motion(
     machine: Machine, table: Table, time: Array, signals: list[Array]
 ) -> tuple[Array, Array]:
-    """Active coordinates and velocities at the start."""
+    """Initial active coordinates and velocities."""
     for text in locked_joint_conflicts(machine, _table_columns(table), table.units):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q_a, v_a = joint_motion(machine, table)
@@ -326,7 +325,7 @@ def _initial_motion(
 
 
 def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
-    """Warn of measured coordinates (N, n) where the simulated machine cannot be."""
+    """Warn of measured coordinates (N, n) outside of the limits."""
     span = machine.upper - machine.lower
     excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
     excess /= np.where(np.isfinite(span), span, 1.0)
@@ -348,7 +347,7 @@ def _table_columns(table: Table) -> dict[str, Array]:
 
 
 def _steady_duration(time: Array, signals: list[Array]) -> float:
-    """Until when no valve is moved [s], within bounds."""
+    """Time until a valve moves [s], within bounds."""
     has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
     first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
     min_duration = float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1])
@@ -358,11 +357,11 @@ def _steady_duration(time: Array, signals: list[Array]) -> float:
 def _start_of_joint(
     time: Array, x: Array, v: Array | None, is_steady: np.ndarray
 ) -> tuple[float, float]:
-    """Coordinate and velocity of a joint at the first sample, from all samples near it.
+    """Coordinate and velocity of a joint at the first sample, from the first samples.
 
-    At rest, if over the stretch that is steady a straight line rises by no more than three times
-    what is left about it. Else by parabolas, see `_value_at_first_sample`: of velocities (N,)
-    where they were recorded, else of the coordinates.
+    The joint is at rest if a line through the steady interval rises by at most three standard
+    deviations of its residual. Else parabolas are fitted, see `_value_at_first_sample`: to the
+    velocities (N,) if recorded, else to the coordinates.
     """
     steady_times, steady_positions = time[is_steady], x[is_steady]
     if len(x) < _MIN_FIT_SAMPLES:

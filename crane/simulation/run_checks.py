@@ -1,4 +1,4 @@
-"""What is to be said of a run: limits passed, energy lost or gained, friction that chatters."""
+"""Checks of a run: passed limits, energy imbalance, chattering friction."""
 
 import numpy as np
 
@@ -11,17 +11,15 @@ from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
 
-_MAX_CONTACT_FORCE_RATIO = (
-    3.0  # weights of the machine, with which a contact may press at the start
-)
-_MAX_NAMED_JOINTS = 3  # joints beyond their limits that are named
-_MAX_RELATIVE_IMBALANCE = 5e-3  # share of the energy that went through
-_MAX_STROKE_EXCESS = 5e-3  # share of a cylinder's stroke, of which no steel gives way
-_MAX_STOP_ENERGY_GAIN = 0.05  # share of what a stop held at most
-_SMOOTHING_RANGE = 3.0  # smoothing velocities, below which friction turns
-_MAX_DISSIPATION_ERROR = 0.2  # of what is taken out over a step
-_MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE = 3, 1e-3  # samples that may, of all
-_BLOCK_SAMPLES = 20000  # samples looked at at once
+_MAX_CONTACT_FORCE_RATIO = 3.0  # largest initial force of a contact over the weight of the machine
+_MAX_NAMED_JOINTS = 3  # joints that a message names
+_MAX_RELATIVE_IMBALANCE = 5e-3  # share of the energy throughput
+_MAX_STROKE_EXCESS = 5e-3  # share of the stroke by which end stops may be compressed
+_MAX_STOP_ENERGY_GAIN = 0.05  # share of the largest energy in an end stop
+_SMOOTHING_RANGE = 3.0  # velocity, in smoothing velocities, below which friction reverses
+_MAX_DISSIPATION_ERROR = 0.2  # share of the dissipation of a step
+_MIN_CHATTER_SAMPLES, _MIN_CHATTER_SHARE = 3, 1e-3  # accepted number and share of samples
+_BLOCK_SAMPLES = 20000  # samples of a block
 
 
 def run_warnings(
@@ -32,18 +30,17 @@ def run_warnings(
     has_fixed_steps: bool,
     is_exact: bool = True,
 ) -> list[str]:
-    """What to say of a run.
+    """Warnings about a run.
 
-    The energies are integrated with the motion, so they tell when the step is too long.
+    The energies are integrated with the motion, so their imbalance shows a step that is too long.
 
     Args:
         machine: The machine.
         time: (N,) [s].
         rows: See `integrate`.
         step: [s].
-        has_fixed_steps: Whether the method's steps are these, whatever their error.
-        is_exact: Whether the formulation keeps its energy.
-
+        has_fixed_steps: Whether the steps of the method are the output intervals.
+        is_exact: Whether the formulation conserves energy.
     """
     texts = (
         passed_limits_text(machine, time, rows.q),
@@ -57,10 +54,10 @@ def run_warnings(
 def find_invalid_motion(
     machine: Machine, time: Array, rows: LayoutView, step: float, is_exact: bool = True
 ) -> tuple[int, str] | None:
-    """From which instant on a run is no motion of the machine, and why; None if it is one.
+    """Index of the first invalid instant of a run, and the reason; None for a valid run.
 
-    A piston has left its cylinder, or an end stop has given back more energy than it took.
-    Arguments as those of `run_warnings`.
+    A run is invalid where a piston has left its cylinder, or an end stop has released more energy
+    than it took. For the arguments see `run_warnings`.
     """
     departure = find_piston_outside_cylinder(machine, time, rows.q)
     return departure or (
@@ -71,12 +68,12 @@ def find_invalid_motion(
 
 
 def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
-    """What to say of joints that went beyond limits where nothing stops them, else nothing.
+    """Warning about joints without end stops beyond their limits; empty without any.
 
     Args:
         machine: The machine.
         time: (N,) [s].
-        q: (N, nv) the motion.
+        q: (N, nv) configurations.
     """
     lower, upper = machine.coordinates.lower, machine.coordinates.upper
 
@@ -118,9 +115,9 @@ def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
 
 
 def passed_strokes_text(machine: Machine, time: Array, q: Array) -> str:
-    """What to say of cylinders whose stops give way as no steel does, else nothing.
+    """Warning about end stops of cylinders that are too soft; empty without any.
 
-    Arguments as those of `passed_limits_text`.
+    For the arguments see `passed_limits_text`.
     """
     cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
     with_end_stop = {stop.joint for stop in machine.end_stops}
@@ -144,9 +141,9 @@ def passed_strokes_text(machine: Machine, time: Array, q: Array) -> str:
 def find_piston_outside_cylinder(
     machine: Machine, time: Array, q: Array
 ) -> tuple[int, str] | None:
-    """When a piston is beyond all room of its chambers, hoses among it, and what to say of it.
+    """Index of the instant when a piston leaves its cylinder and hoses, and the error; else None.
 
-    Arguments as those of `passed_limits_text`.
+    For the arguments see `passed_limits_text`.
     """
     cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
     for joint, cylinder in cylinders.items():
@@ -170,7 +167,7 @@ def find_piston_outside_cylinder(
 
 
 def buried_contact_text(machine: Machine, q: Array) -> str:
-    """What to say of a contact deep in the ground at a posture (nq,), else nothing."""
+    """Error of a contact deep in the ground at a configuration (nq,); empty without one."""
     contacts = [force for force in machine.external_forces if isinstance(force, Contact)]
     if not contacts:
         return ""
@@ -178,11 +175,8 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
     for contact in contacts:
-        height = float(
-            contact.ground.distance_and_normal(
-                frames.frame_pose(contact.frame).translation.tolist()
-            )[0]
-        )  # type: ignore[arg-type]
+        position = frames.frame_pose(contact.frame).translation.tolist()
+        height = float(contact.ground.distance_and_normal(position)[0])  # type: ignore[arg-type]
         depth = contact.radius - height
         if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
             return (
@@ -193,22 +187,21 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
 
 
 def _energy_imbalance(rows: LayoutView) -> Array:
-    """(N,) work less change of energy less dissipation [J]: what a run has lost by its steps."""
+    """(N,) work less change of energy less dissipation [J]: the error of the integration."""
     stored = rows.kinetic[:, 0] + rows.potential[:, 0]
-    imbalance_over_time: Array = rows.work.sum(axis=1) - rows.lost[:, 0] - stored + stored[0]
-    return imbalance_over_time
+    return rows.work.sum(axis=1) - rows.dissipated[:, 0] - stored + stored[0]
 
 
 def _energy_throughput(rows: LayoutView) -> float:
-    """The energy that went through [J]."""
-    parts = rows.work, rows.lost, rows.kinetic, rows.potential
+    """The energy throughput: largest range of work, dissipation and energies [J]."""
+    parts = rows.work, rows.dissipated, rows.kinetic, rows.potential
     return float(max(np.ptp(part) for part in parts))
 
 
 def find_stop_energy_gain(
     machine: Machine, time: Array, rows: LayoutView, step: float, energy_imbalance: Array
 ) -> tuple[int, str] | None:
-    """When a stop was met that gave back more energy than it took, and what to say of it."""
+    """Index of the instant when an end stop releases more energy than it took, and the error."""
     min_gain = _MAX_RELATIVE_IMBALANCE * _energy_throughput(rows)
     if not np.ptp(energy_imbalance) > min_gain:
         return None
@@ -225,18 +218,16 @@ def find_stop_energy_gain(
                 return first, (
                     f"at t = {time[first]:.4g} s the end stop of '{stop.joint}' gives back "
                     f"{energy_gain:.2g} J more than it takes, so the step of {step:g} s is too "
-                    f"long "
-                    "for it: shorten it, or let method DOP853 choose it"
+                    "long for it: shorten it, or let method DOP853 choose it"
                 )
     return None
 
 
 def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step: float) -> str:
-    """What to say of smoothed friction that steps did not follow, else nothing.
+    """Warning about smoothed friction that chatters; empty without any.
 
-    Where a step of a fixed length is too long for a slope that turns within it, friction changes
-    its sign from stage to stage: what it took out over the step is not what its power at both
-    ends says.
+    Where a fixed step is too long for the smoothing, friction changes its sign between stages: the
+    dissipation of the step differs from that by its power at both ends.
     """
     laws = machine.friction.items()
     smoothings = {
@@ -245,7 +236,7 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     columns = list(smoothings)
     if not columns:
         return ""
-    dissipated_energy = rows.lost[:, 0]
+    dissipated_energy = rows.dissipated[:, 0]
     dissipated_per_step, energy_tolerance = (
         np.diff(dissipated_energy),
         1e-6 * float(np.diff(dissipated_energy).max()),
@@ -298,12 +289,12 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
 
 
 def _midpoint_means(values: Array) -> Array:
-    """(N - 1,) of each two neighbours."""
+    """Means (N - 1,) of neighbouring values."""
     return 0.5 * (values[1:] + values[:-1])
 
 
 def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:
-    """Where energies (N,) [J] are not the same."""
+    """Whether energies (N,) [J] differ."""
     gap = np.abs(one - other)
     return (gap > _MAX_DISSIPATION_ERROR * np.maximum(np.abs(one), np.abs(other))) & (
         gap > tolerance
@@ -311,7 +302,7 @@ def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:
 
 
 def energy_imbalance_text(rows: LayoutView, step: float, energy_imbalance: Array) -> str:
-    """What to say if a simulation does not keep its energy, else nothing."""
+    """Warning about the energy imbalance of a run; empty if it is small."""
     gap = float(np.abs(energy_imbalance).max())
     throughput = _energy_throughput(rows)
     rounding = 1e-12 * float(max(np.abs(rows.kinetic).max(), np.abs(rows.potential).max()))

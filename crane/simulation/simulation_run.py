@@ -1,9 +1,8 @@
-"""Motion in time: Runge-Kutta of fourth order on the active coordinates."""
+"""Simulation of a machine with its controller."""
 
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,16 +19,13 @@ from crane.common.errors import (
     suggest_names,
 )
 from crane.common.progress import progress_reporter
-from crane.common.samples import Array, as_number, as_sample
+from crane.common.samples import Array, as_number
 from crane.control import (
     ControlLaw,
     Controller,
-    FunctionController,
     TracedController,
     ValveCommand,
     ValveDrive,
-    ValveSignals,
-    ZeroForce,
     controller_reference,
 )
 from crane.description.external_forces import ExternalForce
@@ -37,20 +33,19 @@ from crane.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
 from crane.formats import load
 from crane.machine import Machine
-from crane.motion.limit_violations import limit_violation_message, passive_limit_violation_message
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
 from crane.simulation.integration.chart_switching import ChartIntegrator, ChartSwitchingIntegrator
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.dormand_prince import DormandPrinceStepper
-from crane.simulation.integration.error_controlled_integrator import ErrorControlledIntegrator
-from crane.simulation.integration.error_controlled_stepper import ErrorControlledStepper
-from crane.simulation.integration.fixed_step_integrator import FixedStepIntegrator
-from crane.simulation.integration.integration_halt import IntegrationHaltError, explain_halt
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.error_controlled_stepper import (
+    DormandPrinceStepper,
+    ErrorControlledStepper,
+)
+from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.python_stepper import IntegrationHaltError, explain_halt
 from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
 from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIntegrator
-from crane.simulation.integration.state_layouts import row_layout
 from crane.simulation.recorded_run import IntegrationResult, record_run, stop_with_recording
 from crane.simulation.run_checks import (
     buried_contact_text,
@@ -58,12 +53,18 @@ from crane.simulation.run_checks import (
     passed_limits_text,
     run_warnings,
 )
-from crane.simulation.static_equilibrium import equilibrium_on_contacts
+from crane.simulation.simulation_setup import (
+    Force,
+    count_steps,
+    equilibrium_on_contacts,
+    initial_motion,
+    machine_under_control,
+    reference_limits_text,
+    resolve_controller,
+)
 
-_MAX_STEPS = 4_000_000  # steps of one recording
-_MIN_TOLERANCE, _MAX_TOLERANCE = 1e-13, 1e-2  # tolerances
+_MIN_TOLERANCE, _MAX_TOLERANCE = 1e-13, 1e-2
 
-Force = Callable[[float, Array, Array], Array]
 StepperFactory = Callable[..., ErrorControlledStepper]
 Progress = Callable[[float], None]
 _COMPILED_METHODS: dict[str, StepperFactory] = {
@@ -74,7 +75,7 @@ _COMPILED_METHODS: dict[str, StepperFactory] = {
 
 
 class _CommandFinishedError(Exception):
-    """What commands the valves has no more to do."""
+    """The command of the valves has ended."""
 
 
 def simulate(
@@ -95,60 +96,59 @@ def simulate(
     """Simulate a machine with its friction, passive forces and end stops.
 
     M_A a_A = tau_A - bias - friction, integrated as an ordinary differential equation in
-    (q_A, v_A), the controller's states and the energies. Within a step the passive joints move
-    with gamma v_A; after every step the loops are closed to rounding.
+    (q_A, v_A), the states of the controller and the energies. Within a step the passive joints
+    move by gamma v_A; after every step the loops are closed to rounding errors.
 
-    Where the active coordinates come to a dead centre the run goes on in others, with the forces
-    of the same drives, and where branches of motion cross it keeps to its own; both are told in a
-    warning (see `crane.simulation.integration.charts` and `passage`).
+    At a dead centre of the active coordinates the run continues in other coordinates, with the
+    forces of the same drives. Where branches of motion cross, it continues on its own branch. Both
+    give a warning (see `crane.simulation.integration.charts` and `branch_crossing`).
 
     Args:
-        machine: The machine, or what `crane.load` takes.
-        controller: A controller, a function (t, q_a, v_a) -> tau_a, or what commands the valves
-            of a hydraulic machine (`ValvePD`, `joystick`, `ValveSignals`, `SampledCommand`). None
-            is no force, and valves at their neutral signal where the machine has any.
-        initial: Active coordinates (n,) [m], [rad] to start at rest from, or a pair (q_a, v_a)
-            with velocities [m/s], [rad/s]; the start of the controller's reference, or of its
-            levers, at rest, or else the home posture. If not given, what stands on contacts
-            starts in static equilibrium on them, see `crane.simulation.static_equilibrium`.
-        duration: [s]; that of the controller's reference or levers if not given, which ends where
-            the last of their phases does.
-        step: [s].
-        label: Name of the motion to put into the recording, as its `task`.
+        machine: The machine, or an argument of `crane.load`.
+        controller: A controller, a function (t, q_a, v_a) -> tau_a, or a valve command of a
+            hydraulic machine (`ValvePD`, `joystick`, `ValveSignals`, `SampledCommand`). None for
+            no force, or for valves at their neutral signals.
+        initial: Initial active coordinates (n,) [m], [rad] at rest, or a pair (q_a, v_a) with
+            velocities [m/s], [rad/s]. The default is the start of the reference or levers of the
+            controller, or else home. By default a machine that stands on contacts starts in static
+            equilibrium, see `crane.simulation.simulation_setup`.
+        duration: Duration [s]; that of the reference or levers of the controller if not given,
+            which ends with the last phase.
+        step: Interval of the output instants, and step size of "rk4" [s].
+        label: Name of the motion, the `task` of the recording.
         backend: "compiled" or "pinocchio", see `Dynamics`.
         method: "DOP853", explicit of order 8 (`DormandPrinceStepper`); "Radau", implicit of order
-            5 for what is stiff (`RadauStepper`); "rosenbrock", of order 3, the one for circuits
-            (`RosenbrockStepper`): their steps are as long as the error allows, and what is between
-            them is recorded every `step`. "rk4", of order 4 with this step. "RK23", "RK45", "BDF",
-            "LSODA" are scipy's, as are DOP853 and Radau for controllers in Python. If not given,
+            5 for stiff machines (`RadauStepper`); "rosenbrock", of order 3, for circuits
+            (`RosenbrockStepper`): these control their step size and record every `step` by dense
+            output. "rk4", of order 4 with fixed steps. "RK23", "RK45", "BDF", "LSODA" are
+            those of scipy, as are DOP853 and Radau for controllers in Python. The default is
             rosenbrock with valves, DOP853 in machine code, rk4 in Python.
-        tolerance: Error of a step per size of the state; 1e-12 for DOP853, 1e-8 for rosenbrock,
-            1e-9 for others if not given.
+        tolerance: Error of a step relative to the size of the state; 1e-12 for DOP853, 1e-8 for
+            rosenbrock, 1e-9 for others if not given.
         formulation: "exact" or "decoupled", see `Dynamics`.
-        loads: Forces from outside besides those of its file: `crane.Wrench` by time,
-            `crane.WrenchFunction` from a function in Python, `crane.ExternalForce` in machine
+        loads: External forces besides those of the machine file: `crane.Wrench` over time,
+            `crane.WrenchFunction` by a function in Python, `crane.ExternalForce` in machine
             code.
-        progress: Called with the finished share, 0 to 1.
+        progress: Function that is called with the finished share, 0 to 1.
 
     Returns:
-        Recording with channels for every passive joint, the tip, the references,
-        friction_<joint>, rest_<joint> where friction sticks (what holds the joint at rest, 0
-        where it slips), and the energies kinetic, potential, work (of the active forces),
-        work_<load> (of each force from outside, with load_<load>_force_x and so on, in the
-        world's axes) and dissipated [J]; all work = change of (kinetic + potential) + dissipated,
+        A recording with channels for every passive joint, the tip, the references,
+        friction_<joint>, rest_<joint> of joints with stiction (friction at rest, 0 where the joint
+        slips), and the energies kinetic, potential, work (of the active forces),
+        work_<load> (of each external force, with load_<load>_force_x and so on, in the axes of
+        the world) and dissipated [J]; all work = change of (kinetic + potential) + dissipated,
         of the exact formulation only.
 
     Raises:
         InputError: Arguments of wrong shape or value.
         LimitError: The start lies outside of the limits.
-        SimulationError: The machine cannot go on: the loops do not close any more, or the motion
-            explodes. Names the time, and the joint beyond its limit or a step that is short
-            enough. What there is of the run is its `recording`, as that of every error which a
+        SimulationError: The simulation halts: the loops do not close, or the motion diverges. The
+            message names the time, and the joint beyond its limit or a sufficient step size. Its
+            attribute `recording` has the run up to there, as that of every error which a
             controller in Python raises.
-        InterruptedRun: It was interrupted; a `KeyboardInterrupt` with its `recording`, likewise.
+        InterruptedRun: The run was interrupted; a `KeyboardInterrupt` with the `recording`.
 
-    A reference that leaves the limits of a joint is a warning before the first step: with an end
-    stop it can be meant.
+    A reference outside of the limits of a joint gives a warning before the first step.
     """
     progress = progress_reporter(progress)
     if not (isinstance(label, str) and label.isprintable()):
@@ -204,10 +204,10 @@ def integrate(
     chart: Chart | None = None,
     ends_with_command: bool = False,
 ) -> IntegrationResult:
-    """What `simulate` computes, without channels; see there for arguments.
+    """Integrate a run without computing its channels; see `simulate`.
 
     Args:
-        dynamics: The machine.
+        dynamics: Dynamics of the machine.
         control: See `resolve_controller`.
         initial: See `simulate`.
         step_count: See `count_steps`.
@@ -215,16 +215,16 @@ def integrate(
         method: See `simulate`.
         progress: See `simulate`.
         tolerance: See `simulate`.
-        chart: The machine in its own coordinates, for who wants to know when what stuck.
-        ends_with_command: Whether to end where what commands the valves has no more to do.
+        chart: The machine in the coordinates of the user; its stick-slip modes record transitions.
+        ends_with_command: Whether the run ends with the command of the valves.
 
     Returns:
-        The run, shorter than asked for where something stopped it, or where levers have ended.
+        The run; it is shorter where it was stopped, or where the command ended.
 
     Raises:
         InputError: As `simulate`.
-        LimitError: Likewise.
-        SimulationError: It cannot begin.
+        LimitError: As `simulate`.
+        SimulationError: The run cannot start.
     """
     machine = dynamics.machine
     q_a, v_a = initial_motion(machine, initial, control)
@@ -232,7 +232,7 @@ def integrate(
     if initial is None:
         q_a, start_text = equilibrium_on_contacts(dynamics, q_a)
     try:
-        # from home, whatever was solved before: a run is the same to the last bit
+        # from home, so that a run does not depend on earlier solutions
         configuration = machine.closure.solve(q_a, initial_guess=machine.home)
         controller_state = _initial_controller_state(control, dynamics, configuration)
     except ClosureError as error:
@@ -253,8 +253,8 @@ def integrate(
     times = step * np.arange(step_count + 1, dtype=np.float64)
     rows = scratch_arrays.empty_array(
         step_count + 1, layout.size
-    )  # recorded by columns, without a copy
-    released_until = 0  # instants until the last release
+    )  # stored by columns, so that channels are views
+    released_until = 0  # instants whose memory pages are released
 
     def report(done: int) -> None:
         nonlocal released_until
@@ -297,12 +297,12 @@ def _is_command_finished(control: Controller) -> bool:
 
 
 def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None) -> bool:
-    """Whether a method makes steps of the recorded length."""
+    """Whether the steps of a method are the output intervals."""
     return (method or _default_method(dynamics, control)) == "rk4"
 
 
 def _default_method(dynamics: Dynamics, control: Controller) -> str:
-    """The method if none is named."""
+    """Name of the default method."""
     if isinstance(control, ValveDrive):
         return "rosenbrock"
     traced = dynamics.backend == "compiled" and isinstance(control, TracedController)
@@ -310,7 +310,7 @@ def _default_method(dynamics: Dynamics, control: Controller) -> str:
 
 
 def _initial_controller_state(control: Controller, dynamics: Dynamics, q: Array) -> Array:
-    """The controller's states at a closed posture; laws look at the machine as it is there."""
+    """Initial states of a controller at a closed configuration."""
     if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
         return control.start_closed(dynamics, q)
     return control.start(q[dynamics.machine.closure.active])
@@ -323,7 +323,18 @@ def integrator_factory(
     requested_method: str | None,
     tolerance: float | None,
 ) -> Callable[[Chart], ChartIntegrator]:
-    """What integrates by a method, or by the usual one."""
+    """Function that creates the integrator of a method in a chart.
+
+    Args:
+        dynamics: Dynamics of the machine.
+        control: Its controller.
+        controller_state_count: Number of states of the controller.
+        requested_method: See `simulate`.
+        tolerance: See `simulate`.
+
+    Raises:
+        InputError: The method is unknown or does not support the machine.
+    """
     valves, method = (
         isinstance(control, ValveDrive),
         requested_method or _default_method(dynamics, control),
@@ -356,7 +367,7 @@ def integrator_factory(
     )
 
     def make(chart: Chart) -> ChartIntegrator:
-        """Machine code, or scipy where there is none."""
+        """A compiled integrator, or one of scipy where the formulas cannot be compiled."""
         compiled = stepper_factory is not None and chart.dynamics.backend == "compiled"
         if compiled and isinstance(control, TracedController):
             assert stepper_factory is not None
@@ -374,130 +385,3 @@ def integrator_factory(
         return ScipyIntegrator(chart, control, controller_state_count, scipys, **options)
 
     return make
-
-
-def resolve_controller(
-    controller: Controller | ValveCommand | Force | None, machine: Machine
-) -> Controller:
-    """What drives a machine, from what `simulate` takes.
-
-    Raises:
-        InputError: It is none of that, or the machine is no machine.
-    """
-    if not isinstance(machine, Machine):
-        raise InputError(f"{machine!r} is not a machine, load it with crane.load")
-    if isinstance(controller, ControlLaw):
-        return controller
-    if controller is None:
-        if machine.hydraulics is not None:
-            neutral = ValveSignals(machine, [0.0], {})
-            neutral.title = "neutral valves"
-            return ValveDrive(machine, neutral)
-        return ZeroForce(machine)
-    if isinstance(controller, ValveCommand):
-        return ValveDrive(machine, controller)
-    if hasattr(controller, "start"):
-        return controller  # type: ignore[return-value]
-    if not callable(controller) or isinstance(controller, type):
-        raise InputError(
-            f"the controller is a {type(controller).__name__}, give a function (t, q_a, v_a) -> "
-            "tau_a or a controller object"
-        )
-    return FunctionController(controller, machine)
-
-
-def machine_under_control(machine: Machine, control: Controller) -> Machine:
-    """The machine with what acts on it by the controller's clock.
-
-    And without seals and brakes where no circuit says what presses them.
-
-    Raises:
-        InputError: A load counts phases, and the controller has none.
-    """
-    clock = control.command.clock if isinstance(control, ValveDrive) else None
-    machine = machine.with_clock(clock)
-    hydraulics = machine.hydraulics
-    if (
-        hydraulics is None
-        or not hydraulics.circuit_friction_joints
-        or isinstance(control, ValveDrive)
-    ):
-        return machine
-    without_friction = {
-        joint: replace(cylinder, seal_friction=0.0, brake=0.0)
-        for joint, cylinder in hydraulics.cylinders.items()
-    }
-    return machine.replace(hydraulics=replace(hydraulics, cylinders=without_friction))
-
-
-def count_steps(control: Controller, duration: float | None, step: float) -> int:
-    """Steps [s] in a duration [s], that of the controller's reference or levers if not given.
-
-    Levers last to the end of a step.
-
-    Raises:
-        InputError: There is no duration, there are too many steps, or no whole number of them.
-    """
-    levers = False
-    if duration is None:
-        duration_source = getattr(control, "reference", None)
-        if (
-            duration_source is None
-            and isinstance(control, ValveDrive)
-            and control.command.duration
-        ):
-            duration_source, levers = control.command, True
-        if duration_source is None:
-            raise InputError("no duration and no reference to take it from, give a duration")
-        duration = duration_source.duration
-    duration = as_number(duration, "the duration", "s", greater_than=0)
-    step = as_number(step, "the step", "s", greater_than=0)
-    if duration / step > _MAX_STEPS:
-        raise InputError(
-            f"{duration:g} s are {duration / step:.3g} steps of {step:g} s, at most {_MAX_STEPS}: "
-            "simulate less, or go on from the last sample of a first part"
-        )
-    steps = int(np.ceil(duration / step - 1e-9)) if levers else round(duration / step)
-    if steps < 1 or not levers and abs(steps * step - duration) > 1e-9 * duration:
-        raise InputError(
-            f"the duration {duration:g} s is no whole number of steps of {step:g} s, change one"
-        )
-    return steps
-
-
-def reference_limits_text(machine: Machine, control: Controller, end_time: float) -> str:
-    """What to say of a reference that leaves the limits before a time [s], else nothing."""
-    reference = controller_reference(control, machine)
-    if reference is None:
-        return ""
-    return limit_violation_message(
-        machine, reference, end_time
-    ) or passive_limit_violation_message(machine, reference, end_time)
-
-
-def initial_motion(
-    machine: Machine,
-    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
-    control: Controller | None = None,
-) -> tuple[Array, Array]:
-    """Active coordinates and velocities (n,) that a simulation starts from, see `simulate`."""
-    size, rest = len(machine.active), np.zeros(len(machine.active))
-    if initial is None:
-        reference = None if control is None else controller_reference(control, machine)
-        if isinstance(control, ValveDrive) and control.command.initial_coordinates is not None:
-            return np.array(control.command.initial_coordinates), rest
-        if reference is not None:
-            return machine.check_limits(
-                reference.position(0.0), "the start of the reference"
-            ), rest
-        return np.array(machine.home[machine.closure.active]), rest
-    if isinstance(initial, tuple) and len(initial) == 2 and np.ndim(initial[0]) == 1:
-        q_a = machine.check_limits(initial[0], "initial q_a")
-        v_a = as_sample(initial[1], size, "initial v_a", machine.active)
-    else:
-        q_a, v_a = machine.check_limits(initial, "initial"), rest  # type: ignore[arg-type]
-    if q_a.ndim != 1:
-        raise InputError(
-            f"initial is a stack, give one sample ({size},) or a pair as a tuple (q_a, v_a)"
-        )
-    return q_a, v_a

@@ -16,8 +16,8 @@ from crane.description import Friction
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.dynamics import Dynamics
 from crane.hydraulics import CircuitEquations, Engine
+from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.power_balance import ROD_POWER, SHAFT_POWER, STORED_POWERS, component_powers
-from crane.hydraulics.supply_and_engine import MAIN_PUMP
 from crane.machine import Machine
 from crane.recordings import Recording
 from crane.recordings.missing_measurements import check_columns_present

@@ -10,7 +10,7 @@ from scipy.interpolate import PPoly
 import crane
 from crane.common.samples import Array
 from crane.control import ValveSignals
-from crane.hydraulics.components import PDGains
+from crane.hydraulics.hydraulic_circuit import PDGains
 from crane.identification.hydraulics.cylinder_friction import (
     CylinderFriction,
     identify_cylinder_friction,

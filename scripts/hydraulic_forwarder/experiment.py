@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 import crane
 from crane.common.samples import Array
-from crane.hydraulics.components import PDGains
+from crane.hydraulics.hydraulic_circuit import PDGains
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 from crane.identification.signals.signal_processing import average_periods
 from crane.recordings import timeseries

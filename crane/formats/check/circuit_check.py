@@ -6,15 +6,16 @@ from collections.abc import Iterator, Sequence
 
 from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
-from crane.hydraulics.circuit_connectivity import (
+from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
+from crane.hydraulics.components import Valve
+from crane.hydraulics.hydraulic_circuit import (
+    Hydraulics,
     connected_nodes,
     full_opening_flow,
     nodes_draining_to_tank,
     nodes_fed_by_pumps,
 )
-from crane.hydraulics.components import Hydraulics, Valve
-from crane.hydraulics.load_sensing_stability import least_sensing_ratio, unstable_frequency_range
-from crane.hydraulics.supply_and_engine import MAIN_PUMP, TANK_NODE
+from crane.hydraulics.pump_equations import least_sensing_ratio, unstable_frequency_range
 
 _MAX_DEMAND_RATIO = 1.01  # of the flow of its valves to the flow of a pump
 _MAX_PRESSURE_RISE = 0.1  # of a line, relative to the pressure of its pump

@@ -13,19 +13,22 @@ from crane.description.findings import FollowUpError, UnknownNames, error_recove
 from crane.formats.machine_file.flow_curves import read_curve
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.hydraulics.circuit_connectivity import connected_nodes, nodes_draining_to_tank
+from crane.hydraulics.circuit_elements import MAIN_PUMP, Supply
 from crane.hydraulics.components import (
     COUNTERBALANCE_KEYS,
     Cylinder,
+    Spool,
+    Valve,
+)
+from crane.hydraulics.hydraulic_circuit import (
     Hydraulics,
     Oil,
     PDGains,
-    Spool,
-    Valve,
     check_relief_pressure,
     check_tank_pressure,
+    connected_nodes,
+    nodes_draining_to_tank,
 )
-from crane.hydraulics.supply_and_engine import MAIN_PUMP, Supply
 
 _JOINTLY_CHECKED = ("tank", "relief")  # checked with other components
 _NAME_CHARACTERS = set(string.ascii_letters + string.digits + "_")

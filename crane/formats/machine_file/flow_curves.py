@@ -9,7 +9,7 @@ from crane.common.errors import InputError
 from crane.common.package_search import read_plain_file
 from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE
 from crane.formats.machine_file.yaml_section import YamlSection
-from crane.hydraulics.opening_curve import OpeningCurve
+from crane.hydraulics.components import OpeningCurve
 
 
 def read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | None:

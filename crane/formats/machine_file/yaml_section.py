@@ -11,7 +11,7 @@ from crane.description.machine_lookup import bundled_machines
 from crane.description.machine_schema import ALL_ITEM, EXTENDS_KEY
 from crane.formats.machine_file.yaml_parser import LocatedMapping, format_value, parse_yaml_file
 from crane.formats.machine_file.yaml_values import YamlValues
-from crane.hydraulics.parameter_checks import CircuitPathError, ComponentParameterError
+from crane.hydraulics.circuit_elements import CircuitPathError, ComponentParameterError
 
 Item = TypeVar("Item")
 

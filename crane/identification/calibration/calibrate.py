@@ -52,7 +52,7 @@ from crane.recordings.recording_reader import (
     select_time_span,
 )
 from crane.recordings.timeseries import Table, parse_heading
-from crane.simulation.simulated_readings import simulated_columns
+from crane.simulation.recorded_run import simulated_columns
 
 AUTO = "auto"  # what is fitted if nobody says what
 _MAX_CORRELATION = 0.95  # correlation of two numbers of which the data know a combination alone

@@ -24,6 +24,7 @@ from crane.identification.calibration.unknowns import SENSOR_PARAMETER_DEFAULTS,
 from crane.machine import Machine
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, correct_readings
 from crane.recordings.timeseries import TIME, Table, table_column
+from crane.simulation.recorded_run import read_simulation
 from crane.simulation.recorded_run import record_run as recording_of
 from crane.simulation.recording_replay import ReplayInputs, replay_inputs
 from crane.simulation.sensitivity.rate_formulas import observed_frames
@@ -33,8 +34,8 @@ from crane.simulation.sensitivity.simulation_constants import (
     simulation_constants_of,
 )
 from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
-from crane.simulation.simulated_readings import read_simulation
-from crane.simulation.simulation_run import initial_motion, simulate
+from crane.simulation.simulation_run import simulate
+from crane.simulation.simulation_setup import initial_motion
 
 DERIVATIVE_TOLERANCE = 1e-4  # error of derivatives
 _DIFFERENCE_STEP = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation

@@ -8,8 +8,8 @@ from crane.codegen import Scalar
 from crane.common.samples import Array
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValveCommand, require_circuit
+from crane.hydraulics.circuit_elements import Supply
 from crane.hydraulics.components import Cylinder, Valve
-from crane.hydraulics.supply_and_engine import Supply
 from crane.machine import Machine
 
 

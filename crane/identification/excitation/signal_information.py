@@ -25,7 +25,7 @@ from crane.identification.excitation.fisher_information import (
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import TIME, Table
-from crane.simulation.simulated_readings import read_simulation, simulated_columns, simulated_units
+from crane.simulation.recorded_run import read_simulation, simulated_columns, simulated_units
 
 # Standard deviations of usual sensors, by unit.
 _DEFAULT_NOISE = {"rad": 1e-3, "m": 5e-4, "rad/s": 5e-3, "m/s": 2e-3, "Pa": 3e4}

@@ -4,17 +4,18 @@ Each integrates in one chart (`charts`); `ChartSwitchingIntegrator` goes from on
 """
 
 from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.dormand_prince import DormandPrinceStepper
-from crane.simulation.integration.error_controlled_integrator import ErrorControlledIntegrator
-from crane.simulation.integration.fixed_step_integrator import FixedStepIntegrator
-from crane.simulation.integration.integration_halt import IntegrationHaltError, explain_halt
-from crane.simulation.integration.python_stepper import PythonStepper
+from crane.simulation.integration.charts import Chart, row_layout, state_layout
+from crane.simulation.integration.error_controlled_stepper import DormandPrinceStepper
+from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.python_stepper import (
+    IntegrationHaltError,
+    PythonStepper,
+    explain_halt,
+)
 from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
 from crane.simulation.integration.runge_kutta import RungeKuttaStepper
 from crane.simulation.integration.scipy_integrator import SCIPY_METHODS, ScipyIntegrator
-from crane.simulation.integration.state_layouts import row_layout, state_layout
 
 __all__ = [
     "SCIPY_METHODS",

@@ -1,9 +1,9 @@
-"""Motion across postures in which a linkage could go on in several ways.
+"""Extrapolation of a motion across a configuration in which branches of motion cross.
 
-Where links come in line (a parallelogram folded flat, a slider crank of equal lengths) the loop
-equations lose rank: several branches of motion cross, and no coordinates lead through. The motion
-is smooth along its own branch, so state and observations are polynomials of time there: their
-rates at instants before, and then at one behind the crossing, are integrated across it.
+Where links become collinear (a folded parallelogram, a slider crank of equal lengths) the loop
+equations lose rank: several branches of motion cross, and no chart is regular. The motion is
+smooth along its own branch, so state and outputs are polynomials of time: their rates at instants
+before the crossing, and then also behind it, are integrated across it.
 """
 
 from collections.abc import Callable
@@ -14,19 +14,19 @@ import numpy as np
 from crane.common.samples import Array
 from crane.machine import Machine
 
-NODES_BEFORE = 7  # instants before the crossing
-STEPS_BEFORE, STEPS_BEHIND = 2, 4  # steps between the last of them and the crossing, and behind it
-NODES_BEHIND = 3  # nodes behind it
-MAX_MOTION_PER_STEP = 1e-2  # way of the fastest joint in a step [rad], share of the machine's size
-MAX_RELATIVE_RANK = 0.05  # rank of the loop equations there, as a share of that at home
+NODES_BEFORE = 7  # nodes before the crossing
+STEPS_BEFORE, STEPS_BEHIND = 2, 4  # steps from the last node to the crossing, and from there
+NODES_BEHIND = 3  # nodes behind the crossing
+MAX_MOTION_PER_STEP = 1e-2  # displacement of the fastest joint in coordinate units
+MAX_RELATIVE_RANK = 0.05  # `relative_rank` at a crossing, as a share of that at home
 _CORRECTOR_ITERATIONS = 6
 
 RateFunction = Callable[[float, Array], tuple[Array, Array]]
-"""(time, state) -> rate of the state, observations."""
+"""(time, state) -> rate of the state, outputs."""
 
 
 def relative_rank(machine: Machine, q: Array) -> float:
-    """Least singular value of the loop equations at a posture (nq,), as a share of the largest."""
+    """Least over largest singular value of the loop equations at a configuration (nq,)."""
     equations, rows = machine.closure.equations, machine.closure.structure.independent_rows
     scaled_jacobian = equations.evaluate(q)[1][rows] * equations.motion_scales
     values = np.linalg.svd(scaled_jacobian, compute_uv=False)
@@ -35,13 +35,13 @@ def relative_rank(machine: Machine, q: Array) -> float:
 
 @dataclass(frozen=True)
 class CrossingPolynomial:
-    """State and observations as polynomials of time.
+    """State and outputs as polynomials of time.
 
     Attributes:
         times: (k,) nodes [s].
         start_state: State at the last node before the crossing.
-        rates: (k, size) of the state at the nodes.
-        outputs: (k, .) observations there.
+        rates: (k, size) rates of the state at the nodes.
+        outputs: (k, .) outputs at the nodes.
         nodes_before: Number of nodes before the crossing.
     """
 
@@ -60,20 +60,18 @@ class CrossingPolynomial:
         weights = np.linalg.solve(
             (at[:, None] ** powers).T, until ** (powers + 1.0) / (powers + 1.0)
         )
-        found: Array = self.start_state + unit * (weights @ self.rates)
-        return found
+        return self.start_state + unit * (weights @ self.rates)
 
     def outputs_at(self, time: float) -> Array:
-        """What is observed at an instant [s]."""
+        """The outputs at an instant [s]."""
         unit = self.times[1] - self.times[0]
         at, until = (self.times - time) / unit, np.zeros(len(self.times))
         until[0] = 1.0
-        found: Array = np.linalg.solve((at[:, None] ** np.arange(len(at))).T, until) @ self.outputs
-        return found
+        return np.linalg.solve((at[:, None] ** np.arange(len(at))).T, until) @ self.outputs
 
 
 def extrapolate_states(times: Array, states: Array, rate: RateFunction) -> CrossingPolynomial:
-    """The path that goes on from states (k, size) at times (k,) [s]."""
+    """Extrapolation from states (k, size) at times (k,) [s]."""
     rates_and_outputs = [rate(time, state) for time, state in zip(times, states, strict=True)]
     rates, outputs = (np.array(part) for part in zip(*rates_and_outputs, strict=True))
     return CrossingPolynomial(times, states[-1], rates, outputs, len(times))
@@ -82,9 +80,9 @@ def extrapolate_states(times: Array, states: Array, rate: RateFunction) -> Cross
 def correct_polynomial(
     polynomial: CrossingPolynomial, time: float, rate: RateFunction
 ) -> CrossingPolynomial:
-    """The path with the rates at an instant [s] behind the crossing and after it among its nodes.
+    """The polynomial with further nodes from an instant [s] behind the crossing on.
 
-    Then it is interpolation that leads across, not extrapolation, which errors grow in.
+    It interpolates across the crossing; errors of an extrapolation would grow.
     """
     original, unit = polynomial, polynomial.times[1] - polynomial.times[0]
     node_times_behind = time + unit * np.arange(NODES_BEHIND)

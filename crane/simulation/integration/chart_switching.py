@@ -1,4 +1,4 @@
-"""Motion through dead centres: in other coordinates where those at hand fail."""
+"""Integration through dead centres and branch crossings by a change of the chart."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -21,25 +21,25 @@ from crane.simulation.integration.branch_crossing import (
     extrapolate_states,
     relative_rank,
 )
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.integration_halt import IntegrationHaltError
-from crane.simulation.integration.python_stepper import PythonStepper, StepProgress
-from crane.simulation.integration.state_layouts import row_layout
-
-_LIMIT_RELAXATION = np.array([2.0, 0.1])  # how limits move where nothing is better
-_MAX_RECENT_STATES = 500  # states that are kept
-_CONFIGURATION_TOLERANCE = 1e-6  # rad, machine's size, between a posture as foreseen and as closed
-_DEAD_CENTRE_IMPROVEMENT = 10.0  # how many times better others are at a dead centre
-_HALT_IMPROVEMENT = (
-    1.5  # how many times better other coordinates are that are tried where it halts
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.python_stepper import (
+    IntegrationHaltError,
+    PythonStepper,
+    StepProgress,
 )
+
+_LIMIT_RELAXATION = np.array([2.0, 0.1])  # factors of the limits where no chart is better
+_MAX_RECENT_STATES = 500
+_CONFIGURATION_TOLERANCE = 1e-6  # between predicted and closed configuration, coordinate units
+# least ratios of condition numbers: at a dead centre, and of a chart that is tried after a halt
+_DEAD_CENTRE_IMPROVEMENT, _HALT_IMPROVEMENT = 10.0, 1.5
 
 
 class ChartIntegrator(Protocol):
     """An integrator in one chart, such as `FixedStepIntegrator` or `ScipyIntegrator`."""
 
     done: int
-    offset: float  # when the state is, after the next instant without a row [s]
+    offset: float  # time of the state after the next instant without a row [s]
     python_stepper: PythonStepper
 
     @property
@@ -62,20 +62,20 @@ class ChartIntegrator(Protocol):
 
 
 class ChartSwitchingIntegrator:
-    """Steps in the user's coordinates, and in others where these come to a dead centre.
+    """Integrator in the coordinates of the user, and in other charts near their dead centres.
 
-    Rows are in the user's coordinates throughout: a velocity of theirs is C v_B, a friction of
-    theirs C^-T times that of the chart, see `crane.simulation.integration.charts`.
+    Rows are in the coordinates of the user: velocities are C v_B, and friction is C^-T times that
+    of the chart, see `crane.simulation.integration.charts`.
 
     Args:
-        chart: The machine in the user's coordinates.
+        chart: The machine in the coordinates of the user.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
-        make_integrator: What integrates in a chart.
+        controller_state_count: Number of states of the controller.
+        make_integrator: Creates the integrator of a chart.
 
     Attributes:
-        done: Number of instants that have their row, after a run or where it halted.
-        notes: What is to be said of the motion.
+        done: Number of instants with a row, after a run or a halt.
+        notes: Notes for the user about the motion.
     """
 
     def __init__(
@@ -98,10 +98,10 @@ class ChartSwitchingIntegrator:
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
     ) -> None:
-        """Integrate from each time to the next; arguments as of `FixedStepIntegrator.run`.
+        """Integrate from each time to the next; see `FixedStepIntegrator.run` for arguments.
 
         Raises:
-            HaltedError: The machine cannot go on, in no coordinates.
+            IntegrationHaltError: The integration halts in all charts.
         """
         with single_threaded_blas(self._chart.machine.model.nv):
             self._run(times, state, step, rows, progress)
@@ -119,7 +119,7 @@ class ChartSwitchingIntegrator:
                 )
             except IntegrationHaltError as error:
                 steps_made, halt = self._integrator.next_instant, error
-            finally:  # also where it is interrupted
+            finally:  # also after an interrupt
                 self.done = i + self._integrator.done
                 last = rows[
                     i + max(steps_made - _MAX_RECENT_STATES, 0) : i + steps_made, : len(state)
@@ -158,7 +158,7 @@ class ChartSwitchingIntegrator:
         return None if progress is None else lambda done: progress(first + done)
 
     def _switch_chart(self, time: float, state: Array, halt: IntegrationHaltError | None) -> bool:
-        """Whether there are better coordinates, which the state then is in."""
+        """Change to a better chart and transform the state; returns whether there is one."""
         at = self._row_layout.view(np.resize(state, self._row_layout.size))
         chart = self._chart
         better_chart = (
@@ -187,17 +187,17 @@ class ChartSwitchingIntegrator:
     def _pass_branch_crossing(
         self, times: Array, i: int, state: Array, step: float, rows: Array
     ) -> int | None:
-        """Go on across a posture where branches of motion cross, if there is one ahead.
+        """Pass a branch crossing, if there is one ahead.
 
         Args:
             times: See `run`.
-            i: The first instant not before the state.
-            state: Replaced by that at the instant that is returned, if it is one.
+            i: Index of the first instant not before the state.
+            state: Replaced by the state at the returned instant.
             step: [s].
             rows: See `run`.
 
         Returns:
-            The first instant behind the crossing.
+            Index of the first instant behind the crossing; None without a crossing.
         """
         chart, integrator, size, recent = (
             self._chart,
@@ -223,7 +223,7 @@ class ChartSwitchingIntegrator:
         first = int((last_node_time - NODES_BEFORE * stride * fine_step - times[0]) // step)
         if not i - len(recent) <= first < i:
             return None
-        # again up to it, with nodes far enough from it
+        # repeat the motion up to nodes at a sufficient distance from the crossing
         saved_state, offset = state.copy(), integrator.offset
         state[:], integrator.offset = recent[first - i], 0.0
         integrator.set_chart_limits(np.array([np.inf, -np.inf]))
@@ -262,12 +262,12 @@ class ChartSwitchingIntegrator:
     def _predict_crossing(
         self, now: float, state: Array, last_time: float
     ) -> tuple[float, float] | None:
-        """When branches cross ahead of a state, and how fast the fastest joint moves there.
+        """Time of a branch crossing ahead of a state, and speed of the fastest joint; else None.
 
         Args:
             now: Time of the state [s].
             state: The state.
-            last_time: Time of the last of the recent states [s].
+            last_time: Time of the last recent state [s].
         """
         chart, closure = self._chart, self._chart.machine.closure
         if not closure.is_compiled or not len(self._recent_states):
@@ -305,10 +305,10 @@ class ChartSwitchingIntegrator:
         step: float,
         rows: Array,
     ) -> int:
-        """Record a path across a crossing, and go on to the first instant behind it.
+        """Record a path across a crossing, and integrate to the first instant behind it.
 
         Raises:
-            HaltedError: It does not go on there.
+            IntegrationHaltError: The integration halts behind the crossing.
         """
         first = int(np.searchsorted(times, path.times[path.nodes_before - 1], side="right"))
         i = int(np.searchsorted(times, behind_time))
@@ -335,13 +335,13 @@ class ChartSwitchingIntegrator:
     def _enter_chart(
         self, chart_and_integrator: tuple[Chart, ChartIntegrator], offset: float
     ) -> None:
-        """Go on in a chart, from so long after the next instant [s]."""
+        """Continue in a chart, at an offset after the next instant [s]."""
         self._chart, self._integrator = chart_and_integrator
         self._chart_limits, self._integrator.offset = self._chart.chart_limits, offset
         self._integrator.set_chart_limits(self._chart_limits)
 
     def _transform_states(self, states: Array, previous_chart: Chart) -> Array:
-        """States (N, .) in the present chart that are in the one before."""
+        """States (N, .) in the present chart, from those in the previous chart."""
         nq, n = previous_chart.machine.model.nv, len(previous_chart.user_columns)
         out = states.copy()
         gamma = previous_chart.machine.closure.gamma(states[:, :nq])[
@@ -351,7 +351,7 @@ class ChartSwitchingIntegrator:
         return out
 
     def _find_integrator(self, chart: Chart, q: Array) -> tuple[Chart, ChartIntegrator]:
-        """A chart of the same coordinates and branch that was there before, or this one."""
+        """A known chart of the same coordinates and branch with its integrator, or this one."""
         active = chart.machine.closure.active
         for known_chart, integrator in self._known_integrators:
             closure = known_chart.machine.closure
@@ -362,7 +362,7 @@ class ChartSwitchingIntegrator:
         return chart_and_integrator
 
     def _orientation_at(self, q: Array) -> float:
-        """The sign of det C at a closed posture (nq,): it changes at the user's dead centres."""
+        """Sign of det C at a closed configuration (nq,); it changes at dead centres."""
         return (
             1.0
             if self._chart.has_user_coordinates
@@ -370,7 +370,7 @@ class ChartSwitchingIntegrator:
         )
 
     def _to_user_coordinates(self, times: Array, rows: Array) -> None:
-        """Put rows (N, .) at times (N,) [s] into the user's coordinates."""
+        """Transform rows (N, .) at times (N,) [s] into the coordinates of the user."""
         chart = self._chart
         if chart.has_user_coordinates or not len(rows):
             return
@@ -398,7 +398,7 @@ class ChartSwitchingIntegrator:
 
     @property
     def _uses_inverse_dynamics(self) -> bool:
-        """Whether the controller asks for inverse dynamics or weight, of its own coordinates."""
+        """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
         control, call_count = self._control, 0
         if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
             return False
@@ -409,13 +409,13 @@ class ChartSwitchingIntegrator:
             call_count += 1
             return tape.load_vector(
                 5, n * call_count, n
-            )  # others each time: laws divide by differences
+            )  # different at each call, as laws divide by differences
 
         def gravity() -> list[Scalar]:
             return inverse([], False)
 
         columns = control.references(np.zeros(1)).shape[1]
-        sizes = n, n, self._row_layout.parts["own"], len(control.settings), columns
+        sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
         q_a, v_a, state, settings, reference = (
             tape.load_vector(i, 0, x) for i, x in enumerate(sizes)
         )
@@ -425,7 +425,7 @@ class ChartSwitchingIntegrator:
     def _dead_centre_error(
         self, time: float, q: Array, better_chart: Chart
     ) -> IntegrationHaltError:
-        """What to say of coordinates that the controller cannot do without."""
+        """Halt at a dead centre of coordinates that the controller requires."""
         machine = self._chart.machine
         left_columns = np.setdiff1d(machine.closure.active, better_chart.machine.closure.active)
         names = " and ".join(f"'{machine.joints[i]}'" for i in left_columns)

@@ -1,13 +1,13 @@
-"""Independent coordinates of a motion: those of the user, or others where these fail.
+"""Independent coordinates of a simulation: those of the user, or others where these fail.
 
-A machine's active coordinates q_A do not describe it everywhere: at a dead centre they turn back
-and gamma = dq/dq_A is infinite, though the motion goes on as if nothing were there. In other
-independent coordinates q_B, with gamma_B = dq/dq_B and C its rows that belong to q_A,
+The active coordinates q_A of a machine are not valid everywhere: at a dead centre they turn back
+and gamma = dq/dq_A is infinite, although the motion is regular. In other independent coordinates
+q_B, with gamma_B = dq/dq_B and C the rows of gamma_B that belong to q_A,
 
     v_A = C v_B,    tau_B = C^T tau_A.
 
-A set of coordinates with an assembly branch around a posture is a chart of the machine's closed
-postures (generalized coordinate partitioning, Wehage and Haug 1982).
+A set of coordinates together with a branch around a configuration is a chart of the closed
+configurations of a machine (generalized coordinate partitioning, Wehage and Haug 1982).
 """
 
 from collections.abc import Sequence
@@ -19,33 +19,38 @@ import numpy as np
 from crane.closure.active_joint_selection import null_space_basis, select_columns
 from crane.closure.constraint_structure import Indices
 from crane.closure.kinematics_formulas import folding_pattern
+from crane.codegen import Layout
 from crane.codegen.symbolic import Scalar, SymbolicExpression, dot
 from crane.common.errors import ClosureError, InputError, MechanismError
 from crane.common.samples import Array
+from crane.control import Controller, ValveDrive
+from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics import Dynamics
-from crane.dynamics.external_forces import ExternalForces, ExternalForceValues, formula_key
+from crane.dynamics.external_forces import (
+    ExternalForces,
+    ExternalForceValues,
+    formula_key,
+    state_count,
+)
+from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.machine import Machine
 from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
-MAX_GAMMA_ENTRY = (
-    5.0  # entries of gamma, in shares of the machine's size, from which others are looked for
-)
-_MIN_IMPROVEMENT = 3.0  # times smaller has a condition to be that changes coordinates
-_SINGULAR_DETERMINANT_SHARE = (
-    1e-2  # share of the determinant at home, where the edge of a branch is near
-)
+MAX_GAMMA_ENTRY = 5.0  # entry of gamma in coordinate units from which another chart is sought
+_MIN_IMPROVEMENT = 3.0  # least ratio of the condition numbers of the present and a new chart
+_SINGULAR_DETERMINANT_SHARE = 1e-2  # share of the determinant at home near the end of a branch
 _RANK_TOLERANCE = 1e-12  # share of the largest singular value that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A machine in independent coordinates, and those that its controller and its user see.
+    """A machine in independent coordinates, with the coordinates of its user and controller.
 
     Attributes:
-        dynamics: Of the machine in the chart's coordinates.
-        user_columns: (n,) columns of the joints whose coordinates and forces are the user's.
-        stick_slip: What the joints do whose friction sticks, the same in all charts of a run.
-        free_joints: Those of the user's joints that nothing drives.
+        dynamics: Dynamics of the machine in the coordinates of the chart.
+        user_columns: (n,) columns of the active joints of the user.
+        stick_slip: Stick-slip modes of the joints, shared by all charts of a run.
+        free_joints: Free joints among the active joints of the user.
     """
 
     dynamics: Dynamics
@@ -55,24 +60,24 @@ class Chart:
 
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics) -> "Chart":
-        """The user's coordinates of a machine."""
+        """The chart of the coordinates of the user."""
         machine = dynamics.machine
         sticking = StickSlipModes(machine, dynamics.forces.sticking)
         return cls(dynamics, machine.closure.active, sticking, machine.free)
 
     @property
     def machine(self) -> Machine:
-        """The machine in the chart's coordinates."""
+        """The machine in the coordinates of the chart."""
         return self.dynamics.machine
 
     @cached_property
     def has_user_coordinates(self) -> bool:
-        """Whether the chart's coordinates are the user's."""
+        """Whether the coordinates of the chart are those of the user."""
         return np.array_equal(self.machine.closure.active, self.user_columns)
 
     @property
     def formula_key(self) -> tuple:
-        """What formulas of the chart depend on besides its loops."""
+        """Properties on which the formulas of the chart depend, besides its loops."""
         dynamics = self.dynamics
         outside = formula_key(self.machine)
         return (
@@ -83,7 +88,11 @@ class Chart:
         )
 
     def check_free_joints(self, tau: Sequence[Scalar], when: str = "") -> None:
-        """See that no free joint gets a force (n,), in numbers or formulas.
+        """Check that no free joint has a force.
+
+        Args:
+            tau: (n,) forces, floats or formulas.
+            when: End of the message.
 
         Raises:
             InputError: One does.
@@ -101,12 +110,11 @@ class Chart:
             )
 
     def velocity_map(self, q: Array) -> Array:
-        """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""
-        rows: Array = self.machine.closure.gamma(q)[..., self.user_columns, :]
-        return rows
+        """C (n, n) at closed configurations (nq,) or (N, nq): v_A = C v_B."""
+        return self.machine.closure.gamma(q)[..., self.user_columns, :]
 
     def user_velocities(self, q: Array, v: Array) -> Array:
-        """v_A, (n,) or (N, n), of the chart's velocities at closed postures."""
+        """v_A, (n,) or (N, n), from velocities of the chart at closed configurations."""
         return (
             v
             if self.has_user_coordinates
@@ -114,15 +122,19 @@ class Chart:
         )
 
     def chart_forces(self, q: Array, tau: Array) -> Array:
-        """Forces (n,) along the chart's coordinates of the user's at a closed posture."""
+        """Forces (n,) along coordinates of the chart, from those of the user."""
         return tau if self.has_user_coordinates else self.velocity_map(q).T @ tau
 
     def external_forces(
         self, time: float, q: Array, v: Array, contact_states: Array
     ) -> ExternalForceValues:
-        """What forces from outside do along the chart's coordinates.
+        """External forces along the coordinates of the chart.
 
-        At a time [s], a closed posture (nq,), velocities (n,) and states of theirs.
+        Args:
+            time: [s].
+            q: (nq,) closed configuration.
+            v: (n,) velocities of the chart.
+            contact_states: States of the external forces.
         """
         if not self.machine.external_forces:
             empty: Array = np.zeros(0)
@@ -146,7 +158,7 @@ class Chart:
 
     @cached_property
     def chart_limits(self) -> Array:
-        """(2,) what is much for `largest_gamma_entry`, and a determinant that is little."""
+        """(2,) largest accepted `largest_gamma_entry`, and least accepted determinant."""
         closure = self.machine.closure
         home_determinant = (
             closure.compiled_closure.least_determinant(closure.home)
@@ -161,7 +173,7 @@ class Chart:
         )
 
     def largest_gamma_entry(self, q: Array) -> float:
-        """The largest entry of gamma at a closed posture (nq,), in rad and the machine's size."""
+        """Largest entry of gamma at a closed configuration (nq,), in coordinate units."""
         closure = self.machine.closure
         try:
             gamma = closure.gamma(q)
@@ -173,9 +185,9 @@ class Chart:
     def find_better_chart(
         self, q: Array, min_improvement: float = _MIN_IMPROVEMENT
     ) -> "Chart | None":
-        """A chart around a closed posture (nq,) whose condition is that many times smaller.
+        """A chart at a closed configuration (nq,) whose condition number is smaller by a factor.
 
-        Joints that are independent and move no other one much stay.
+        Independent coordinates with small entries of gamma are kept.
         """
         machine = self.machine
         closure, scale = machine.closure, machine.closure.equations.motion_scales
@@ -190,7 +202,7 @@ class Chart:
             return 1.0 / max(float(least), 1e-300)
 
         now, everything = condition(active), range(machine.model.nv)
-        # of the present coordinates those that move the others little
+        # keep those of the present coordinates that have small entries of gamma
         try:
             largest_motions = np.abs(basis @ np.linalg.inv(basis[active])).max(axis=0)
         except np.linalg.LinAlgError:
@@ -212,13 +224,58 @@ class Chart:
         return None
 
     def chart_with_columns(self, q: Array, columns: Indices) -> "Chart | None":
-        """The chart of some coordinates around a closed posture (nq,), None where it has none."""
+        """The chart of some coordinates at a configuration (nq,); None if it is singular."""
         names = tuple(self.machine.joints[i] for i in columns)
         try:
             machine = self.machine.with_home_configuration(q, names)
         except MechanismError:
             return None
-        # cylinders act, and grip, whatever the coordinates
+        # the circuit acts in any coordinates
         machine = replace(machine, hydraulics=self.machine.hydraulics)
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
         return Chart(dynamics, self.user_columns, self.stick_slip, self.free_joints)
+
+
+def state_layout(machine: Machine, controller_state_count: int) -> Layout:
+    """Layout of the state: q (nv), v_a (n), contacts, controller, work, dissipated [J].
+
+    `contacts` are the states of external forces: tangential deformations of tyres. `work` is that
+    of the active forces, then of each external force.
+    """
+    n, work_count = len(machine.active), 1 + len(machine.external_forces)
+    contact_state_count = state_count(machine.external_forces)
+    return Layout(
+        q=machine.model.nv,
+        v_a=n,
+        contacts=contact_state_count,
+        controller=controller_state_count,
+        work=work_count,
+        dissipated=1,
+    )
+
+
+def output_layout(machine: Machine, control: Controller) -> Layout:
+    """Layout of the outputs.
+
+    They are tau (n), friction (n), kinetic and potential energy [J], friction of joints at rest,
+    wrench and channels of each external force, accelerations of all joints where the machine has
+    supports, and channels of circuits.
+    """
+    n, rest = len(machine.active), len(find_stick_slip_columns(machine))
+    channels = len(control.channels) if isinstance(control, ValveDrive) else 0
+    external_force_outputs = sum(
+        len(WRENCH_COMPONENTS) + len(force.channels) for force in machine.external_forces
+    )
+    return Layout(
+        tau=n, friction=n, kinetic=1, potential=1, friction_at_rest=rest,
+        external=external_force_outputs, a=machine.model.nv if machine.supports else 0,
+        channels=channels,
+    )  # fmt: skip
+
+
+def row_layout(machine: Machine, control: Controller, controller_state_count: int) -> Layout:
+    """Layout of a recorded row: the state, then the outputs."""
+    return Layout(
+        **state_layout(machine, controller_state_count).parts,
+        **output_layout(machine, control).parts,
+    )

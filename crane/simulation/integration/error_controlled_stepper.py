@@ -1,12 +1,18 @@
-"""Steps in machine code of a length that their error chooses: what such methods have in common."""
+"""Compiled methods with step-size control: base class, and the method of Dormand and Prince.
+
+The method of order 8 with embedded methods of order 5 and 3 and an interpolant of order 7 is that
+of Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, II.5 and II.6; the
+coefficients are those of scipy.
+"""
 
 from abc import abstractmethod
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
 
-from crane.codegen import Program, Scalar, Tape
+from crane.closure.kinematics_formulas import largest_scaled_value
+from crane.codegen import Program, RoutineValue, Scalar, Tape
 from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
@@ -15,41 +21,41 @@ from crane.codegen.symbolic import (
     maximum,
     minimum,
     scale_vector,
+    subtract_vectors,
 )
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.machine_formulas import (
-    MachineCodeStepper,
-    reference_samples,
-    wrap_rotations,
-)
-from crane.simulation.integration.step_loop import StepCode, StepLoop, StepWriter
+from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
+from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
+from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepCode, StepLoop, StepWriter
 
-MAX_REFERENCE_SPACING = 5e-4  # [s] between the instants that references are known at, at most
-MIN_SCALE = (
-    0.1  # what is taken for no smaller: rad, machine's size, per `Closure.characteristic_time`
-)
-ENERGY_TOLERANCE_FACTOR = 10.0  # times the tolerance, of energies
-_MAX_ROTATION_PER_STEP = 2.5  # [rad] of a step, of bodies that float
+MAX_REFERENCE_SPACING = 5e-4  # largest interval between the samples of references [s]
+MIN_SCALE = 0.1  # least scale of states: rad, characteristic lengths, per characteristic time
+ENERGY_TOLERANCE_FACTOR = 10.0  # tolerance of energies, relative to that of other states
+STAGES, INTERPOLATION_STAGES = 12, 3  # of the method of Dormand and Prince
+DORMAND_PRINCE_TOLERANCE = 1e-12  # error of a step, relative to the size of the state
+_DORMAND_PRINCE_MAX_STEP_RATIO = 5.0
+_SAFETY_FACTOR = 0.9  # of proposed step sizes
+_MAX_ROTATION_PER_STEP = 2.5  # largest rotation of floating bodies in a step [rad]
 _MAX_REFERENCE_PAIRS = 1000  # pairs of references of a call
-_STEP_REDUCTION_AFTER_EVENT = 0.2  # of a step's length, the first behind an event
-_TIME_TOLERANCE = 1e-9  # of a recorded step, between instants that are one
+_STEP_REDUCTION_AFTER_EVENT = 0.2  # ratio of the first step size after an event
+_TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
 
 
 def characteristic_energy(chart: Chart) -> float:
-    """Of a machine as heavy and as fast as this one [J]."""
+    """Kinetic energy of the mass of a machine at its characteristic speed, doubled [J]."""
     closure = chart.machine.closure
     mass = sum(inertia.mass for inertia in chart.machine.model.inertias)
     return float(mass * (closure.characteristic_length / closure.characteristic_time) ** 2)
 
 
 def error_tolerances(chart: Chart, controller_state_count: int, tolerance: float) -> Array:
-    """(k + 1,) least errors that matter of all states, and the tolerance they are of.
+    """Absolute tolerances (k,) of all states, and then the relative tolerance.
 
-    Work and dissipation, which nothing depends on, count `ENERGY_TOLERANCE_FACTOR` times less.
+    Those of work and dissipation, which do not act back, are larger by `ENERGY_TOLERANCE_FACTOR`.
     """
     closure = chart.machine.closure
     rates = closure.units[closure.active] / closure.characteristic_time
@@ -67,7 +73,7 @@ def error_tolerances(chart: Chart, controller_state_count: int, tolerance: float
 
 
 def weighted_sum(tape: Tape, argument: int, size: int, weights: Array) -> list[Scalar]:
-    """A weighted sum of vectors of some size that are in an argument one after the other."""
+    """Weighted sum of the vectors of a size that an argument holds one after another."""
     out: list[Scalar] = [0.0] * size
     for j, weight in enumerate(weights):
         if weight:
@@ -78,22 +84,23 @@ def weighted_sum(tape: Tape, argument: int, size: int, weights: Array) -> list[S
 
 
 class ErrorControlledStepper(MachineCodeStepper):
-    """Many steps at once in machine code, with references and recorded instants within them.
+    """Base class of compiled methods with step-size control and dense output.
 
-    A method writes `_add_method` and `_write_step`. Steps end at the controller's breaks, those of
-    circuits at recorded instants, too: what is between keeps no balance of oil.
+    A method implements `_add_method` and `_write_step`. Steps end at the break times of the
+    controller. Those of circuits also end at the output instants, as dense output does not keep
+    the oil balance.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
-        method: What the method's code depends on besides them.
-        fold_settings: Whether zeros and ones among the controller's settings become part of the
-            code.
-        tolerance: What tells the method which error matters.
+        controller_state_count: Number of states of the controller.
+        method: Further properties on which the code depends.
+        fold_settings: Whether zeros and ones among the settings of the controller become part of
+            the code.
+        tolerance: Error tolerances of the method.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: The formulas are too long to be compiled.
     """
 
     def __init__(
@@ -108,30 +115,29 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._steps_end_at_outputs = isinstance(control, ValveDrive)
         super().__init__(chart, control, controller_state_count, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
-        self._step_state, self._break_times = (
-            np.zeros(6),
-            np.append(break_times(chart.machine, control), np.inf),
-        )
+        self._step_state = np.zeros(6)  # see `StepLoop`
+        self._break_times = np.append(break_times(chart.machine, control), np.inf)
 
     def reset_step_size(self) -> None:
-        """Begin with a short step, whatever was integrated before."""
+        """Start the next run with a short step."""
         self._step_state[0] = 0.0
 
     def run(
         self, first: float, state: Array, offset: float, step: float, rows: Array
     ) -> tuple[int, float]:
-        """Steps up to the instant behind the last of some that are recorded.
+        """Integrate over output instants, up to the instant behind the last.
 
         Args:
-            first: The first instant that is recorded [s].
-            state: The state; replaced by that where it has got to.
-            offset: When that is, after the first instant and at most a step before [s].
-            step: [s] between instants.
-            rows: (N, .) in any order, filled; none to come to the next instant.
+            first: The first output instant [s].
+            state: State, replaced by the final one.
+            offset: Time of the state after the first instant; at least minus one interval [s].
+            step: Interval of the output instants [s].
+            rows: (N, row_size) in any memory order, filled; empty to integrate to the next
+                instant.
 
         Returns:
-            How many have their row, and when the state is, after the next of them [s]. Fewer than
-            all where the next step needs a closer look or other coordinates.
+            Number of filled rows, and time of the state after the next instant without a row [s].
+            Fewer than all rows are filled where a step fails or another chart is needed.
         """
         lengths, pair = self._step_state, min(step, 2.0 * MAX_REFERENCE_SPACING)
         lengths[5] = 0.0
@@ -178,49 +184,31 @@ class ErrorControlledStepper(MachineCodeStepper):
                 lengths[1] *= _STEP_REDUCTION_AFTER_EVENT
                 break
             if time_left > _TIME_TOLERANCE * step:
-                lengths[0] = 0.0  # it may have got as short as can be
+                lengths[0] = 0.0  # the step size may have become minimal
                 break
         return done, offset
 
     def _reference_rows(self, start_time: float, end_time: float, pairs: int) -> Array:
-        """Rows (2 pairs + 1, c) between two times [s], at the ends as between them."""
+        """References (2 pairs + 1, c) between two times [s], with one-sided limits at both."""
         grid = np.linspace(start_time, end_time, 2 * pairs + 1)
         grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - start_time) * np.array([1.0, -1.0])
         return reference_samples(self._chart.machine, self._control, grid)
 
     @property
     def event(self) -> float:
-        """Whether a joint starts or stops at the state."""
+        """Whether a stick-slip transition is at the state."""
         return float(self._step_state[5])
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
             machine, inputs, tau, _ = self._trace_controlled_machine(Tape())
-            channels = (
-                self._control.channel_values(inputs)
-                if isinstance(self._control, ValveDrive)
-                else []
-            )
-            outputs_seen, margin = (
-                machine.outputs(tau, with_joints_at_rest),
-                machine.accelerations(tau, with_joints_at_rest).transition_margin,
-            )
-            program.add_formula(
-                "observe" + suffix, 5, {"seen": [*outputs_seen, *channels], "margin": [margin]}
-            )
+            outputs = machine.outputs(tau, with_joints_at_rest)
+            if isinstance(self._control, ValveDrive):
+                outputs += self._control.channel_values(inputs)
+            margin = machine.accelerations(tau, with_joints_at_rest).transition_margin
+            program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
             machine, _, tau, controller_rate = self._trace_controlled_machine(Tape())
-            accelerations, coordinate_rates = (
-                machine.accelerations(tau, with_joints_at_rest),
-                machine.dynamics_formulas.coordinate_derivatives,
-            )
-            contact_rates = machine.external_forces.state_rates
-            rate = [
-                *coordinate_rates,
-                *accelerations.a_a,
-                *contact_rates,
-                *controller_rate,
-                *machine.powers(tau),
-            ]
+            rate, margin = machine.state_rate(tau, controller_rate, with_joints_at_rest)
             closure = self._chart.machine.closure
             event_distances = machine.dynamics_formulas.end_stop_distances(
                 closure.units.tolist(), closure.characteristic_length
@@ -228,20 +216,22 @@ class ErrorControlledStepper(MachineCodeStepper):
             event_distances += scale_vector(
                 1.0 / closure.characteristic_length, machine.external_forces.event_lengths
             )
-            outputs = {
-                "rate": rate,
-                "margin": [accelerations.transition_margin],
-                "edges": event_distances,
-            }
-            program.add_formula("rate" + suffix, 5, outputs)
+            parts = {"rate": rate, "margin": [margin], "event_distances": event_distances}
+            program.add_formula("rate" + suffix, 5, parts)
         if self.external_callback is not None:
-            program.add_formula("asked", 5, machine.external_forces.callback_inputs)
+            program.add_formula("callback_inputs", 5, machine.external_forces.callback_inputs)
             with program.add_routine(
-                "ask", functions=("answer",), arrays=("asked", "outside")
+                "external", functions=("callback",), arrays=("callback_inputs", "results")
             ) as r:
-                r.return_value(r.call("answer", r.asked, r.outside))
+                r.return_value(r.call("callback", r.callback_inputs, r.results))
         self._add_event_formulas(program, len(event_distances))
-        # the parabola through rows at 0, 1/2, 1
+        self._add_method(program)
+        self._add_interpolation(program)
+        self._add_run(program)
+
+    def _add_interpolation(self, program: Program) -> None:
+        """reference(rows, s), interpolate(state, dense, x), wrap(state)."""
+        # the parabola through references at 0, 1/2, 1
         tape = Tape()
         s, columns = tape.load(1, 0), self.reference_columns
         rows = [tape.load_vector(0, columns * row, columns) for row in range(3)]
@@ -249,7 +239,6 @@ class ErrorControlledStepper(MachineCodeStepper):
         program.add_formula(
             "reference", 2, [dot(shares, values) for values in zip(*rows, strict=True)]
         )
-        self._add_method(program)
         # s + x (c0 + (1 - x) (c1 + x (c2 + ...)))
         tape, size = Tape(), self.state_layout.size
         state, x = tape.load_vector(0, 0, size), tape.load(2, 0)
@@ -260,73 +249,188 @@ class ErrorControlledStepper(MachineCodeStepper):
         program.add_formula("interpolate", 3, wrap_rotations(self._chart, add_vectors(state, out)))
         tape = Tape()
         program.add_formula("wrap", 1, wrap_rotations(self._chart, tape.load_vector(0, 0, size)))
-        self._add_run(program)
 
     def _inverse_error_scales(
-        self, tape: Tape, argument: int, one: list[Scalar], other: list[Scalar]
+        self, tape: Tape, argument: int, start: list[Scalar], end: list[Scalar]
     ) -> list[Scalar]:
-        """One over the errors that matter of all states between two, by `error_tolerances`."""
+        """One over the tolerated errors of all states of a step, by `error_tolerances`."""
         out: list[Scalar] = []
-        for i, (x, y) in enumerate(zip(one, other, strict=True)):
+        for i, (x, y) in enumerate(zip(start, end, strict=True)):
             size = maximum(apply_function("abs", x), apply_function("abs", y))
-            size = (
-                size
-                if i < self.state_layout.start_index("work")
-                else ENERGY_TOLERANCE_FACTOR * size
-            )
-            out.append(1.0 / maximum(tape.load(argument, i), tape.load(argument, len(one)) * size))
+            if i >= self.state_layout.start_index("work"):
+                size = ENERGY_TOLERANCE_FACTOR * size
+            tolerance = tape.load(argument, len(start)) * size
+            out.append(1.0 / maximum(tape.load(argument, i), tolerance))
         return out
 
-    def _limit_rotation(self, error: Scalar, largest_move: Scalar) -> Scalar:
-        """An error, above 1 where a floating body turns so far that nobody knows how often."""
-        floating = self._chart.machine.coordinates.floating_base_columns
-        return maximum(error, largest_move * (1.0 / _MAX_ROTATION_PER_STEP)) if floating else error
+    def _largest_move(self, tape: Tape, displacements: Sequence[Scalar]) -> Scalar:
+        """Largest displacement of a joint [rad], [characteristic lengths]."""
+        is_length = [not turns for turns in self.closure_code.geometry.is_revolute[1:]]
+        inverse_length = self.closure_code.inverse_characteristic_length(tape)
+        return largest_scaled_value(displacements, is_length, inverse_length)
+
+    def _finish_outputs(
+        self,
+        after: list[Scalar],
+        error: Scalar,
+        largest_move: Scalar,
+        order: float,
+        max_step_ratio: float,
+    ) -> dict[str, list[Scalar]]:
+        """Outputs of the formula `finish`, with the ratio of the next step size.
+
+        Args:
+            after: State after the step.
+            error: Error over its tolerance.
+            largest_move: See `_largest_move`.
+            order: Order of the error.
+            max_step_ratio: Largest ratio of step sizes.
+        """
+        if self.has_floating_base:  # larger rotations are not unique
+            error = maximum(error, largest_move * (1.0 / _MAX_ROTATION_PER_STEP))
+        log_error = apply_function("log", minimum(maximum(error, 1e-9), 1e9))
+        step_ratio = _SAFETY_FACTOR * apply_function("exp", (-1.0 / order) * log_error)
+        step_ratio = minimum(maximum(step_ratio, MIN_STEP_RATIO), max_step_ratio)
+        return {"state": after, "error": [error], "change": [step_ratio], "move": [largest_move]}
 
     def _add_event_formulas(self, program: Program, count: int) -> None:
-        """sides(rate): the signs of edges; crossed(rate, sides): the least of edge times sign."""
-        start = program.formula_outputs("rate").start_index("edges")
+        """event_signs(rate), and least_distance(rate, signs), of event distance times sign."""
+        start = program.formula_outputs("rate").start_index("event_distances")
         if not count:
             return
+        signs = [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
+        program.add_formula("event_signs", 1, signs)
         tape = Tape()
-        signs = [copysign(1.0, x) for x in tape.load_vector(0, start, count)]
-        program.add_formula("sides", 1, signs)
-        tape = Tape()
+        distances = tape.load_vector(0, start, count)
         smallest: Scalar = 1.0
-        for edge, side in zip(
-            tape.load_vector(0, start, count), tape.load_vector(1, 0, count), strict=True
-        ):
-            smallest = minimum(smallest, edge * side)
-        program.add_formula("crossed", 2, [smallest])
+        for distance, sign in zip(distances, tape.load_vector(1, 0, count), strict=True):
+            smallest = minimum(smallest, distance * sign)
+        program.add_formula("least_distance", 2, [smallest])
 
     @abstractmethod
     def _add_method(self, program: Program) -> None:
-        """Add formulas, among them `finish` and `dense`.
+        """Add the formulas of a method, among them `finish` and `dense`.
 
-        `finish` has the parts state; error, at most 1; change of the length for the next; move.
-        `dense` has the c of what is between two states.
+        For `finish` see `_finish_outputs`; `dense` has the coefficients of the dense output.
         """
 
     @abstractmethod
     def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
-        """What makes a step up to `finish`, and what calls `dense` behind one."""
+        """Writers of a step up to `finish`, and of `dense` after a step."""
 
     def _add_run(self, program: Program) -> None:
-        functions = ("close",) if self.external_callback is None else ("close", "answer")
+        functions = ("close",) if self.external_callback is None else ("close", "callback")
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
         with program.add_routine("run", counts=("steps",), functions=functions, arrays=names) as r:
-            loop = StepLoop(self, program, r, self._steps_end_at_outputs)
-            loop.write(self._write_step)
+            StepLoop(self, program, r, self._steps_end_at_outputs).write(self._write_step)
 
 
 def break_times(machine: Machine, control: TracedController) -> Array:
-    """Times (k,) [s] at which what a controller or a force refers to turns sharply, in order.
+    """Break times (k,) [s] of a controller, or its reference, and of external forces, in order."""
+    sources: list[Any] = [control, getattr(control, "reference", None)]
+    sources = [*machine.external_forces, *[x for x in sources if hasattr(x, "breaks")][:1]]
+    times = {time for source in sources for time in np.asarray(source.breaks()).tolist()}
+    return np.array(sorted(times), dtype=np.float64)
 
-    As they say themselves (`breaks`), or its reference.
+
+def _scipy_method() -> Any:
+    """The coefficients of the method, needed only where the program is not cached."""
+    from scipy.integrate import DOP853  # slow to import
+
+    return DOP853
+
+
+class DormandPrinceStepper(ErrorControlledStepper):
+    """Compiled steps of the method of Dormand and Prince of order 8.
+
+    Args:
+        chart: The machine in a chart.
+        control: Its controller.
+        controller_state_count: Number of states of the controller.
+        tolerance: Error of a step, relative to the size of the state.
+
+    Raises:
+        FormulaTooLongError: The formulas are too long to be compiled.
     """
-    all_times = [force.breaks() for force in machine.external_forces]
-    sources: tuple[Any, ...] = control, getattr(control, "reference", None)
-    for one in sources:
-        if hasattr(one, "breaks"):
-            all_times.append(np.asarray(one.breaks(), dtype=np.float64))
-            break
-    return np.array(sorted({time for times in all_times for time in times.tolist()}), dtype=float)
+
+    def __init__(
+        self,
+        chart: Chart,
+        control: TracedController,
+        controller_state_count: int,
+        tolerance: float = DORMAND_PRINCE_TOLERANCE,
+    ):
+        errors = error_tolerances(chart, controller_state_count, tolerance)
+        super().__init__(chart, control, controller_state_count, ("explicit",), False, errors)
+
+    def _add_method(self, program: Program) -> None:
+        """stage1(s, k, h) to stage11, extra0 to extra2; finish(constants, s, k, h, tol); dense."""
+        size, method = self.state_layout.size, _scipy_method()
+        stages = {f"stage{i}": method.A[i] for i in range(1, STAGES)}
+        stages |= {f"extra{i}": row for i, row in enumerate(method.A_EXTRA)}
+        for name, weights in stages.items():
+            tape = Tape()
+            displaced = scale_vector(tape.load(2, 0), weighted_sum(tape, 1, size, weights))
+            program.add_formula(name, 3, add_vectors(tape.load_vector(0, 0, size), displaced))
+        tape = Tape()
+        state, h = tape.load_vector(1, 0, size), tape.load(3, 0)
+        after = add_vectors(state, scale_vector(h, weighted_sum(tape, 2, size, method.B)))
+        fifth: Scalar = 0.0
+        third: Scalar = 0.0
+        errors = weighted_sum(tape, 2, size, method.E5), weighted_sum(tape, 2, size, method.E3)
+        scales = self._inverse_error_scales(tape, 4, state, after)
+        for error5, error3, scale in zip(*errors, scales, strict=True):
+            fifth = fifth + error5 * scale * (error5 * scale)
+            third = third + error3 * scale * (error3 * scale)
+        denominator = maximum(fifth + 0.01 * third, 1e-300)
+        error = (
+            apply_function("abs", h) * fifth / apply_function("sqrt", denominator * float(size))
+        )
+        rates = tape.load_vector(2, 0, self.state_layout.parts["q"])
+        largest_move = h * self._largest_move(tape, rates)
+        ratio = _DORMAND_PRINCE_MAX_STEP_RATIO
+        outputs = self._finish_outputs(after, error, largest_move, 8.0, ratio)
+        program.add_formula("finish", 5, outputs)
+        # dense output: from the states and rates at both ends, and the extra stages
+        tape = Tape()
+        state, h = tape.load_vector(0, 0, size), tape.load(2, 0)
+        after = tape.load_vector(3, 0, size)
+        first, last = tape.load_vector(1, 0, size), tape.load_vector(1, STAGES * size, size)
+        displacement = subtract_vectors(after, state)
+        parts = [
+            *displacement,
+            *subtract_vectors(scale_vector(h, first), displacement),
+            *subtract_vectors(
+                scale_vector(2.0, displacement), scale_vector(h, add_vectors(first, last))
+            ),
+        ]
+        for weights in method.D:
+            parts += scale_vector(h, weighted_sum(tape, 1, size, weights))
+        program.add_formula("dense", 4, parts)
+
+    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+        """See `ErrorControlledStepper`."""
+        r, size, method = step.routine, self.state_layout.size, _scipy_method()
+        # rates have further outputs, which the next rate overwrites
+        further = program.formula_outputs("rate").size - size
+        k = r.local_array("k", (STAGES + 1 + INTERPOLATION_STAGES) * size + further)
+        stage = r.local_array("stage", size)
+
+        def attempt(t: RoutineValue, length: RoutineValue) -> None:
+            r.copy(k, step.start_rate, size)
+            for i in range(1, STAGES):
+                r.call(f"stage{i}", r.state, k, step.length, stage)
+                step.call(
+                    "rate", t + length * float(method.C[i]), stage, k.element_pointer(i * size)
+                )
+            r.call("finish", r.geometry, r.state, k, step.length, r.tol, step.step_result)
+
+        def interpolate(t: RoutineValue, length: RoutineValue) -> None:
+            r.copy(k.element_pointer(STAGES * size), step.end_rate, size)
+            for i in range(INTERPOLATION_STAGES):
+                r.call(f"extra{i}", r.state, k, step.length, stage)
+                rate = k.element_pointer((STAGES + 1 + i) * size)
+                step.call("rate", t + length * float(method.C_EXTRA[i]), stage, rate)
+            r.call("dense", r.state, k, step.length, step.step_result, step.dense_output)
+
+        return attempt, interpolate

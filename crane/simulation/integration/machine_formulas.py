@@ -1,25 +1,22 @@
-"""A machine and its controller as formulas of the state."""
+"""Formulas of a machine with its controller, and their machine code."""
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from crane.closure import spatial_vectors
 from crane.closure.compiled_closure import CompiledClosure
 from crane.closure.kinematics_formulas import FormulaConstants
+from crane.closure.spatial_vectors import wrap_rotation_vector
 from crane.codegen import (
     Layout,
     LayoutView,
     Program,
-    RoutineValue,
     Scalar,
     SymbolicExpression,
     Tape,
 )
 from crane.codegen.differentiation import differentiate
-from crane.codegen.intermediate_representation import ArrayPointer as Place
-from crane.codegen.intermediate_representation import Routine
 from crane.codegen.symbolic import add_vectors, dot, subtract_vectors
 from crane.common.errors import InputError
 from crane.common.samples import Array
@@ -28,41 +25,32 @@ from crane.dynamics import external_forces
 from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state_layouts import output_layout, state_layout
 
-HELD_INDEX = 5  # of `MachineCodeStepper.bounds`, whether joints are at rest
-_AT_REST_SUFFIX = "_rest"
-
-
-def exceeds_chart_limits(routine: Routine, closure_result: Place) -> RoutineValue:
-    """Whether a closed posture is beyond a chart's limits, see `MachineCodeStepper.bounds`."""
-    return (closure_result["largest_gamma"] > routine.bounds[3]) | (
-        closure_result["determinant"] < routine.bounds[4]
-    )
+AT_REST_SUFFIX = "_rest"  # of formulas for machines with joints at rest
 
 
 def reference_samples(machine: Machine, control: TracedController, times: Array) -> Array:
-    """All that depends on time alone (N, c): the controller's, then those of `external`."""
+    """References (N, c), which depend on time alone: of the controller, then of loads."""
     external_samples = external_forces.reference_samples(machine.external_forces, times)
     return np.ascontiguousarray(np.hstack([control.references(times), external_samples]))
 
 
 def reference_count(control: TracedController) -> int:
-    """Length of a controller's row of references."""
+    """Number of references of a controller."""
     return control.references(np.zeros(1)).shape[1]
 
 
 @dataclass(frozen=True)
 class MachineFormulas:
-    """A machine at a state.
+    """Formulas of a machine at a state.
 
     Attributes:
-        chart: What the state is in.
-        dynamics_formulas: Its dynamics.
-        state_parts: Of the state.
-        q_a: (n,) coordinates that the controller sees.
+        chart: Chart of the state.
+        dynamics_formulas: Dynamics of the machine.
+        state_parts: Parts of the state.
+        q_a: (n,) active coordinates of the user.
         v_a: (n,) their velocities.
-        external_forces: What forces from outside do.
+        external_forces: External forces.
     """
 
     chart: Chart
@@ -75,69 +63,87 @@ class MachineFormulas:
     def controller_inputs(
         self, settings: list[Scalar], reference: list[Scalar]
     ) -> ControllerInputs:
-        """What a controller sees."""
-        inverse = (
-            self.dynamics_formulas.inverse_dynamics
-            if self.chart.has_user_coordinates
-            else _raise_undetermined
-        )
-        gravity = (
-            (lambda: list(self.dynamics_formulas.gravity_force))
-            if self.chart.has_user_coordinates
-            else _raise_undetermined
-        )
+        """Inputs of a controller."""
+        states = self.q_a, self.v_a, self.state_parts.controller
+        if not self.chart.has_user_coordinates:
+            return ControllerInputs(
+                *states, settings, reference, _raise_undetermined, _raise_undetermined
+            )
+        dynamics = self.dynamics_formulas
         return ControllerInputs(
-            self.q_a, self.v_a, self.state_parts.own, settings, reference, inverse, gravity
+            *states,
+            settings,
+            reference,
+            dynamics.inverse_dynamics,
+            lambda: list(dynamics.gravity_force),
         )
 
     def with_circuit_friction(
         self, control: TracedController, inputs: ControllerInputs
     ) -> "MachineFormulas":
-        """The machine with the Coulomb friction that seals and brakes of a circuit add."""
-        if not self.dynamics_formulas.formula_structure.circuit_friction_columns or not isinstance(
-            control, ValveDrive
-        ):
+        """The machine with the Coulomb friction of seals and brakes of a circuit."""
+        dynamics = self.dynamics_formulas
+        has_friction = bool(dynamics.formula_structure.circuit_friction_columns)
+        if not has_friction or not isinstance(control, ValveDrive):
             return self
-        return replace(
-            self,
-            dynamics_formulas=self.dynamics_formulas.with_circuit_friction(
-                control.circuit_friction(inputs)
-            ),
-        )
+        friction = control.circuit_friction(inputs)
+        return replace(self, dynamics_formulas=dynamics.with_circuit_friction(friction))
 
     def accelerations(
         self, tau: Sequence[Scalar], with_joints_at_rest: bool
     ) -> StickSlipAccelerations:
-        """What it does under a controller's forces, with joints at rest or without."""
+        """Accelerations under the forces of a controller, with or without joints at rest."""
         return self.dynamics_formulas.accelerations_with_stick_slip(
             self._applied_forces(tau), with_joints_at_rest
         )
 
+    def state_rate(
+        self, tau: Sequence[Scalar], controller_rate: Sequence[Scalar], with_joints_at_rest: bool
+    ) -> tuple[list[Scalar], Scalar]:
+        """Rate of the state, and the margin of stick-slip transitions.
+
+        Args:
+            tau: (n,) forces of the controller.
+            controller_rate: (k,) rates of its states.
+            with_joints_at_rest: Whether joints can be at rest.
+        """
+        accelerations = self.accelerations(tau, with_joints_at_rest)
+        rate = [
+            *self.dynamics_formulas.coordinate_derivatives,
+            *accelerations.a_a,
+            *self.external_forces.state_rates,
+            *controller_rate,
+            *self._powers(tau),
+        ]
+        return rate, accelerations.transition_margin
+
     def _applied_forces(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """Forces along the chart's coordinates, a controller's and those from outside."""
+        """Forces of a controller and external forces along the coordinates of the chart."""
         return add_vectors(
             self.chart.trace_chart_forces(self.dynamics_formulas.gamma, tau),
             self.external_forces.active_forces,
         )
 
     def outputs(self, tau: Sequence[Scalar], with_joints_at_rest: bool) -> list[Scalar]:
-        """What is seen, but for a circuit's channels; see `output_layout`."""
-        moved, sweep = self.accelerations(tau, with_joints_at_rest), self.dynamics_formulas
-        base_outputs = [
-            *tau,
-            *moved.active_friction,
-            sweep.kinetic,
-            sweep.potential,
-            *moved.friction_at_rest,
-        ]
+        """Outputs without the channels of circuits; see `output_layout`."""
+        accelerations = self.accelerations(tau, with_joints_at_rest)
+        dynamics = self.dynamics_formulas
         a: list[Scalar] = []
         if self.chart.machine.supports:
-            rows = sorted(sweep.gamma.items())
-            a = [dot(row, moved.a_a) + sweep.drift[i] for i, row in rows]
-        return [*base_outputs, *self.external_forces.outputs, *a]
+            rows = sorted(dynamics.gamma.items())
+            a = [dot(row, accelerations.a_a) + dynamics.drift[i] for i, row in rows]
+        return [
+            *tau,
+            *accelerations.active_friction,
+            dynamics.kinetic,
+            dynamics.potential,
+            *accelerations.friction_at_rest,
+            *self.external_forces.outputs,
+            *a,
+        ]
 
     def forces_without_gravity(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """What acts along the chart's coordinates, inertia and weight apart."""
+        """All forces along the coordinates of the chart except for inertia and gravity."""
         return subtract_vectors(
             add_vectors(self._applied_forces(tau), self.dynamics_formulas.passive_force),
             self.dynamics_formulas.friction_force,
@@ -146,21 +152,19 @@ class MachineFormulas:
     def stiffness(
         self, controller_rate: Sequence[Scalar], tau: Sequence[Scalar]
     ) -> list[list[Scalar]]:
-        """What rates of a controller's states and forces along the chart change with q_B.
+        """Derivatives of controller rates and forces by the coordinates q_B of the chart.
 
-        At frozen gamma, without weight and what moves.
+        They are taken at constant gamma, without gravity and velocity-dependent forces.
 
         Args:
-            controller_rate: (k,) of the controller.
-            tau: (n,) of the controller.
+            controller_rate: (k,) rates of the states of the controller.
+            tau: (n,) forces of the controller.
 
         Returns:
             (k + n, n).
         """
-        gamma, user_coordinates = (
-            self.dynamics_formulas.gamma,
-            [x for x in self.q_a if isinstance(x, SymbolicExpression)],
-        )
+        gamma = self.dynamics_formulas.gamma
+        user_coordinates = [x for x in self.q_a if isinstance(x, SymbolicExpression)]
         outputs = [*controller_rate, *self.chart.trace_chart_forces(gamma, tau)]
         rows = differentiate(outputs, user_coordinates)
         if not self.chart.has_user_coordinates:
@@ -174,8 +178,8 @@ class MachineFormulas:
             *(add_vectors(one, other) for one, other in passive),
         ]
 
-    def powers(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """What forces put in, a controller's and each from outside, and what is taken out [W]."""
+    def _powers(self, tau: Sequence[Scalar]) -> list[Scalar]:
+        """Power of the controller, of each external force, and dissipated power [W]."""
         return [
             dot(tau, self.v_a),
             *self.external_forces.powers,
@@ -195,11 +199,16 @@ def trace_machine(
     external_references: Sequence[Scalar],
     folded_constants: tuple[Array, Array] | None = None,
 ) -> MachineFormulas:
-    """The machine at the state in an argument.
+    """Trace the formulas of a machine.
 
-    Geometry and numbers of the machine are the arguments 0 and 1; `external_references` are
-    references of forces from there; `folded_constants` has geometry and numbers with NaN where
-    none may become part of the formulas, the machine's own if not given.
+    Args:
+        chart: The machine in a chart.
+        tape: The tape; its arguments 0 and 1 are geometry and constants of the dynamics.
+        layout: Layout of the state.
+        state_argument: Number of the argument that holds the state.
+        external_references: References of the external forces.
+        folded_constants: Geometry and constants that become part of the formulas, with NaN for
+            those that remain arguments; those of the machine if not given.
     """
     dynamics, closure = chart.dynamics, chart.machine.closure
     geometry, pattern = folded_constants or (None, dynamics.constant_pattern)
@@ -217,177 +226,18 @@ def trace_machine(
         else [dynamics_formulas.joint_velocities[i + 1] for i in chart.user_columns]
     )
     applied = external_forces.trace_external_forces(
-        chart.machine, dynamics_formulas, external_references, parts.shear
+        chart.machine, dynamics_formulas, external_references, parts.contacts
     )
     return MachineFormulas(
         chart, dynamics_formulas, parts, [q[i] for i in chart.user_columns], v_a, applied
     )
 
 
-class MachineCodeStepper:
-    """A machine and its controller in machine code: what all methods have in common.
-
-    A method writes `_build`, which adds formulas `observe` with the parts `seen` and `margin`,
-    and `observe_rest` where joints can stick.
-
-    Args:
-        chart: The machine.
-        control: Its controller.
-        controller_state_count: Number of the controller's states.
-        method: What the method's code depends on besides them.
-        fold_settings: Whether zeros and ones among the controller's settings become part of the
-            code.
-
-    Attributes:
-        bounds: See `CompiledClosure`; where other coordinates are better, see
-            `Chart.chart_limits`; whether joints are at rest.
-        external_callback: What calls those external forces that are functions in Python, if there
-            are some.
-        state_layout: Parts of the state.
-        output_layout: Parts of what a row has besides.
-        reference_columns: Length of a row of references.
-        controller_columns: Of these, the first ones that are the controller's.
-        has_stick_slip: Whether joints have friction that sticks.
-        closure_code: The loops in machine code.
-
-    Raises:
-        TooLongError: It would take too long to compile.
-    """
-
-    def __init__(
-        self,
-        chart: Chart,
-        control: TracedController,
-        controller_state_count: int,
-        method: tuple,
-        fold_settings: bool,
-    ):
-        machine = chart.machine
-        self.closure_code, self._dynamics_constants = (
-            machine.closure.compiled_closure,
-            chart.dynamics.formula_constants,
-        )
-        self._chart, self._control = chart, control
-        self.bounds = np.concatenate([self.closure_code.tolerances, chart.chart_limits, [0.0]])
-        controller_columns = self.controller_columns = reference_count(control)
-        self.reference_columns, self._fold_settings = (
-            controller_columns + sum(external_forces.reference_counts(machine.external_forces)),
-            fold_settings,
-        )
-        self.external_callback = (
-            None
-            if machine.has_traceable_forces
-            else external_forces.ExternalForceCallback(machine.external_forces)
-        )
-        self.has_stick_slip = bool(chart.stick_slip.columns)
-        self.state_layout, self.output_layout = (
-            state_layout(machine, controller_state_count),
-            output_layout(machine, control),
-        )
-        formula_key = controller_formula_key(
-            control, controller_columns, chart, controller_state_count, fold_settings
-        )
-        key = (
-            *method,
-            formula_key,
-            controller_state_count,
-            bool(machine.supports),
-            *chart.formula_key,
-        )
-        if key not in self.closure_code.programs:
-            self.closure_code.programs[key] = machine_program(
-                machine, control, self.closure_code, key, self._build
-            )
-        self._program = self.closure_code.programs[key]
-
-    def _build(self, program: Program) -> None:
-        """Add formulas and routines."""
-        raise NotImplementedError
-
-    def _trace_controlled_machine(
-        self, tape: Tape
-    ) -> tuple[MachineFormulas, ControllerInputs, Sequence[Scalar], Sequence[Scalar]]:
-        """Machine, what the controller sees, its forces and rates.
-
-        References and state are the arguments 3 and 4.
-        """
-        references, controller_columns = (
-            tape.load_vector(3, 0, self.reference_columns),
-            reference_count(self._control),
-        )
-        machine = trace_machine(
-            self._chart, tape, self.state_layout, 4, references[controller_columns:]
-        )
-        settings = controller_settings(self._control, tape, 2, self._fold_settings)
-        inputs = machine.controller_inputs(settings, references[:controller_columns])
-        tau, rates = self._control.trace(inputs)
-        return machine.with_circuit_friction(self._control, inputs), inputs, tau, rates
-
-    @property
-    def has_floating_base(self) -> bool:
-        """Whether a body floats."""
-        return bool(self._chart.machine.coordinates.floating_base_columns)
-
-    @property
-    def row_size(self) -> int:
-        """Length of a row."""
-        return self.state_layout.size + self.output_layout.size
-
-    def adopt_modes(self) -> None:
-        """Take over what the joints do whose friction sticks."""
-        if self.has_stick_slip:
-            self._chart.stick_slip.apply_to(self._chart.dynamics)
-            self.bounds[HELD_INDEX] = self._chart.stick_slip.is_held.any()
-
-    @property
-    def _rest_variants(self) -> tuple[tuple[str, bool], ...]:
-        """What to add to a formula's name without joints at rest, and with some."""
-        return (("", False), (_AT_REST_SUFFIX, True)) if self.has_stick_slip else (("", False),)
-
-    def call_formula(self, routine: Routine, formula: str, *arguments: Place) -> None:
-        """Call a formula for what the joints do that stick."""
-        if not self.has_stick_slip:
-            routine.call(formula, *arguments)
-            return
-        with routine.if_then(routine.bounds[HELD_INDEX] > 0.5):
-            routine.call(formula + _AT_REST_SUFFIX, *arguments)
-        with routine.if_else():
-            routine.call(formula, *arguments)
-
-    @property
-    def _common_arguments(self) -> tuple[Array, Array, Array]:
-        """What all formulas begin with: geometry, numbers of the machine, settings."""
-        settings = np.ascontiguousarray(self._control.settings)
-        return self.closure_code.geometry.constants, self._dynamics_constants, settings
-
-    def observe(self, time: float, state: Array) -> tuple[Array, float]:
-        """Outputs (.,) and the transition margin at a time [s] and a state."""
-        reference = reference_samples(self._chart.machine, self._control, np.array([time]))
-        if self.external_callback is not None:
-            callback_inputs = np.empty(self._program.formula_outputs("asked").size)
-            self._program.call("asked", *self._common_arguments, reference, state, callback_inputs)
-            controller_columns = reference_count(self._control)
-            self._program.call(
-                "ask",
-                self.external_callback.address,
-                callback_inputs,
-                reference[0, controller_columns:],
-            )
-            self.external_callback.raise_pending()
-        layout = self._program.formula_outputs("observe")
-        out = np.empty(layout.size)
-        name = "observe" + _AT_REST_SUFFIX if self.bounds[HELD_INDEX] else "observe"
-        self._program.call(name, *self._common_arguments, reference, state, out)
-        return out[layout["seen"]], float(out[layout.start_index("margin")])
-
-
 def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
-    """A state, q first, with rotation vectors of at most pi."""
+    """A state with rotation vectors of at most pi; its first part is q."""
     out = list(state)
     for column in chart.machine.coordinates.floating_base_columns:
-        out[column + 3 : column + 6] = spatial_vectors.wrap_rotation_vector(
-            out[column + 3 : column + 6]
-        )
+        out[column + 3 : column + 6] = wrap_rotation_vector(out[column + 3 : column + 6])
     return out
 
 
@@ -398,34 +248,37 @@ def controller_formula_key(
     controller_state_count: int,
     fold_settings: bool,
 ) -> Hashable:
-    """All that a controller's formulas are, so that equal ones share their machine code.
+    """Formulas of a controller as a key, so that equal ones share their machine code.
 
-    They are traced by themselves, for rows of so many references, the active joints of a chart's
-    user and so many states, what the machine makes of accelerations left open. With
-    `fold_settings`, zeros and ones of the settings become part of them.
+    The controller is traced without the machine: the results of inverse dynamics and gravity are
+    arguments.
+
+    Args:
+        control: The controller.
+        reference_columns: Number of its references.
+        chart: The machine in a chart.
+        controller_state_count: Number of states of the controller.
+        fold_settings: Whether zeros and ones among the settings become part of the formulas.
 
     Raises:
-        InputError: There are too few or too many of them, or a free joint gets a force.
+        InputError: The number of forces or rates is wrong, or a free joint gets a force.
     """
     tape, n = Tape(), len(chart.user_columns)
     requested_accelerations: list[Scalar] = []
 
     def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
-        answer = tape.load_vector(5, len(requested_accelerations), n)
+        forces = tape.load_vector(5, len(requested_accelerations), n)
         requested_accelerations.extend([*a_a, float(friction)])
-        return answer
+        return forces
 
-    q_a, v_a, controller_state = (
-        tape.load_vector(0, 0, n),
-        tape.load_vector(1, 0, n),
-        tape.load_vector(2, 0, controller_state_count),
-    )
-    settings, reference = (
-        controller_settings(control, tape, 3, fold_settings),
-        tape.load_vector(4, 0, reference_columns),
-    )
     inputs = ControllerInputs(
-        q_a, v_a, controller_state, settings, reference, inverse, lambda: tape.load_vector(6, 0, n)
+        q_a=tape.load_vector(0, 0, n),
+        v_a=tape.load_vector(1, 0, n),
+        state=tape.load_vector(2, 0, controller_state_count),
+        settings=controller_settings(control, tape, 3, fold_settings),
+        reference=tape.load_vector(4, 0, reference_columns),
+        inverse=inverse,
+        gravity=lambda: tape.load_vector(6, 0, n),
     )
     tau, rates = control.trace(inputs)
     if (len(tau), len(rates)) != (n, controller_state_count):
@@ -452,20 +305,20 @@ def machine_program(
     key: tuple,
     build: Callable[[Program], None],
 ) -> Program:
-    """Machine code of a machine and its controller.
+    """Machine code of a machine with its controller.
 
-    Found by what it depends on only where the package wrote the controller and the forces from
-    outside: what a user's class does with a machine may depend on more than its formulas tell.
+    It is cached only if controller and external forces are classes of this package: the code of a
+    class of the user may depend on more than the key.
 
     Args:
         machine: The machine.
         control: The controller.
-        compiled_closure: Of the machine.
-        key: What the code depends on, `controller_formula_key` among it.
-        build: Adds formulas and routines.
+        compiled_closure: The compiled closure of the machine.
+        key: Properties on which the code depends, with `controller_formula_key`.
+        build: Function that adds formulas and routines.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: The formulas are too long to be compiled.
     """
     parts: list[object] = [control, *machine.external_forces]
     if isinstance(control, ValveDrive):
@@ -478,7 +331,7 @@ def machine_program(
 def controller_settings(
     control: TracedController, tape: Tape, argument: int, fold_settings: bool
 ) -> list[Scalar]:
-    """The controller's settings, read from an argument."""
+    """Settings of a controller, read from an argument."""
     size = len(control.settings)
     if fold_settings:
         return FormulaConstants(tape, argument, control.settings).vector(0, size)

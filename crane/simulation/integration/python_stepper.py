@@ -1,36 +1,124 @@
-"""Steps of the classical Runge-Kutta method in Python."""
+"""Observation and steps of a controlled machine in Python, and halts of an integration."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from crane.codegen import LayoutView
-from crane.common.errors import ClosureError, InputError
+from crane.common.errors import ClosureError, InputError, SimulationError
 from crane.common.samples import Array
 from crane.control import Controller, ValveDrive
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.integration_halt import IntegrationHaltError
-from crane.simulation.integration.state_layouts import state_layout
+from crane.machine import Machine
+from crane.motion.limit_violations import limit_tolerances
+from crane.motion.trajectory import Trajectory
+from crane.simulation.integration.charts import Chart, state_layout
 
-_EXTRAPOLATION_TIME = (
-    1e-3  # of `Closure.characteristic_time`: how far a machine is thought on that stops
-)
+
+class IntegrationHaltError(SimulationError):
+    """A halt: the integration cannot continue.
+
+    Args:
+        time: Time of the halt [s].
+        q_a: (n,) active coordinates of the user.
+        description: The cause, a continuation of the message after the time.
+        default_remedy: Remedy if no joint passed a limit and no shorter step helps.
+
+    Attributes:
+        time: Time of the halt [s].
+        q_a: (n,) active coordinates of the user.
+        default_remedy: See the arguments.
+    """
+
+    def __init__(
+        self,
+        time: float,
+        q_a: Array,
+        description: str,
+        default_remedy: str = ", with all active joints within their limits: keep away "
+        "from there, 'crane workspace' shows where the loops close",
+    ):
+        super().__init__(f"at t = {time:.6g} s{description}")
+        self.time, self.q_a, self.default_remedy = time, np.array(q_a), default_remedy
+
+
+def explain_halt(
+    machine: Machine,
+    halt: IntegrationHaltError,
+    times: Array,
+    q_a: Array,
+    reference: Trajectory | None = None,
+    finer_step: float = 0.0,
+) -> SimulationError:
+    """Error of a run that halted, with the probable cause and a remedy.
+
+    Args:
+        machine: The machine.
+        halt: The halt.
+        times: (N,) instants of the motion up to the halt [s]; may be empty.
+        q_a: (N, n) active coordinates at these instants.
+        reference: The reference trajectory, or None.
+        finer_step: A step size with which the motion continues [s]; 0 if unknown.
+    """
+    if finer_step:
+        hint = f"; with a step of {finer_step:g} s it goes on: shorten the step"
+        return SimulationError(f"{halt}{hint}")
+    limit_text = _passed_limit_text(machine, halt, times, q_a, reference)
+    return SimulationError(f"{halt}{limit_text or halt.default_remedy}")
+
+
+def _passed_limit_text(
+    machine: Machine,
+    halt: IntegrationHaltError,
+    times: Array,
+    q_a: Array,
+    reference: Trajectory | None,
+) -> str:
+    """Text about the active joint farthest beyond its limit; empty if none is."""
+    lower, upper = machine.lower, machine.upper
+    excess = np.maximum(lower - halt.q_a, halt.q_a - upper)
+    active = machine.closure.active
+    span = np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
+    i = int(np.argmax(excess / span))
+    slack = limit_tolerances(machine)[active[i]]
+    if not excess[i] > slack:
+        return ""
+    joint, unit, value = machine.active[i], machine.unit(machine.active[i]), halt.q_a[i]
+    limit = lower[i] if value < lower[i] else upper[i]
+    text = f"; '{joint}' is at {value:.6g} {unit}, beyond its limit {limit:.6g} {unit}"
+    if len(times):
+        outside = (q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)
+        inside = np.flatnonzero(~outside)
+        first = int(inside[-1]) + 1 if len(inside) else 0
+        passed_time = times[first] if first < len(times) else halt.time
+        text += f" since t = {passed_time:.4g} s"
+    has_end_stop = any(stop.joint == joint for stop in machine.end_stops)
+    remedy = "stiffen its end stop" if has_end_stop else "give it an end stop"
+    if reference is not None:
+        reference_value = float(reference.position(halt.time)[i])
+        if not lower[i] - slack <= reference_value <= upper[i] + slack:
+            remedy = (
+                f"keep its reference ({reference_value:.6g} {unit}) within the limits, or {remedy}"
+            )
+    return f"{text}: {remedy}"
+
+
+_EXTRAPOLATION_TIME = 1e-3  # extrapolation of a halted motion [characteristic times]
 
 StepProgress = Callable[[int], None] | None
-"""What is told the number of finished steps."""
+"""Called with the number of finished steps."""
 
 
 class PythonStepper:
-    """One step at a time, for any controller and on any backend of `Dynamics`.
+    """Single steps in Python, for any controller and any backend of `Dynamics`.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
+        controller_state_count: Number of states of the controller.
 
     Attributes:
-        state_layout: Parts of the state.
-        chart_limits: Where other coordinates are looked for, see `Chart.chart_limits`.
+        state_layout: Layout of the state.
+        chart_limits: See `Chart.chart_limits`.
         transition_margin: See `StickSlipAccelerations.transition_margin`, at the state whose rate
             was computed last.
     """
@@ -41,15 +129,15 @@ class PythonStepper:
         self.chart_limits, self.transition_margin = chart.chart_limits, 1.0
 
     def find_modes(self, time: float, state: Array, outputs: Array | None = None) -> None:
-        """Find which joints stick at a state, whose velocities are made those of rest.
+        """Determine the stick-slip modes at a state; sets the velocities of joints at rest to 0.
 
         Args:
             time: [s].
-            state: Then.
-            outputs: What is observed there, if that is known.
+            state: State at this time.
+            outputs: Its outputs, if they are known.
 
         Raises:
-            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
         """
         at, chart = self.state_layout.view(state), self._chart
         try:
@@ -58,13 +146,13 @@ class PythonStepper:
                 tau, _ = self._controller_output(time, at, chart.user_velocities(at.q, at.v_a))
             self._set_circuit_friction(time, at, chart.user_velocities(at.q, at.v_a))
             forces = chart.chart_forces(at.q, tau)
-            forces += chart.external_forces(time, at.q, at.v_a, at.shear).generalized_forces
+            forces += chart.external_forces(time, at.q, at.v_a, at.contacts).generalized_forces
             at.v_a[:] = chart.stick_slip.find_modes(self._dynamics, at.q, at.v_a, forces)
         except ClosureError as error:
             raise IntegrationHaltError(time, self.user_coordinates(state), f": {error}") from None
 
     def exceeds_chart_limits(self, state: Array) -> bool:
-        """Whether a state is beyond the limits."""
+        """Whether a state is outside of the limits of the chart."""
         closure, q = self._chart.machine.closure, self.state_layout.view(state).q
         if self._chart.largest_gamma_entry(q) > self.chart_limits[0]:
             return True
@@ -74,18 +162,18 @@ class PythonStepper:
         )
 
     def user_coordinates(self, state: Array) -> Array:
-        """(n,) coordinates of the user's."""
+        """(n,) active coordinates of the user."""
         return self.state_layout.view(state).q[self._chart.user_columns]
 
     def observe(self, time: float, state: Array) -> tuple[Array, Array]:
-        """Rate of the state, and [tau, friction, kinetic, potential, its channels].
+        """Rate of the state, and outputs (see `output_layout`).
 
         Raises:
-            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+            IntegrationHaltError: The loops do not close, or the configuration is singular.
         """
         rate, tau = self._state_rate(time, state)
         at = self.state_layout.view(state)
-        external_values = self._chart.external_forces(time, at.q, at.v_a, at.shear)
+        external_values = self._chart.external_forces(time, at.q, at.v_a, at.contacts)
         forces = self._chart.chart_forces(at.q, tau) + external_values.generalized_forces
         observation = self._dynamics.evaluate_closed("observation", at.q, at.v_a, forces)
         channels: Array = np.zeros(0)
@@ -97,15 +185,21 @@ class PythonStepper:
         if isinstance(self._control, ValveDrive):
             control = self._control
             v_a = self._chart.user_velocities(at.q, at.v_a)
-            inputs = control.inputs_at(time, self.user_coordinates(state), v_a, at.own)
+            inputs = control.inputs_at(time, self.user_coordinates(state), v_a, at.controller)
             channels = np.array(control.channel_values(inputs), dtype=np.float64)
         return rate, np.concatenate([tau, observation, external_values.outputs, a, channels])
 
     def advance(self, time: float, state: Array, start_rate: Array, step: float) -> Array:
-        """The state one step later, its rate at the start given.
+        """The state after one step of the classical Runge-Kutta method.
+
+        Args:
+            time: [s].
+            state: State at this time.
+            start_rate: Its rate.
+            step: Step size [s].
 
         Raises:
-            HaltedError: The motion explodes, or the loops cannot be closed any more.
+            IntegrationHaltError: The motion diverges, or the loops do not close.
         """
         rate_sum = rate = start_rate
         units = self._dynamics.machine.closure.units
@@ -134,7 +228,7 @@ class PythonStepper:
         return after
 
     def halt_error(self, time: float, state: Array) -> IntegrationHaltError:
-        """Why the machine cannot go on, whatever the step."""
+        """The halt of a machine that cannot continue with any step size."""
         at, closure = self.state_layout.view(state), self._chart.machine.closure
         try:
             closure.solve(
@@ -157,7 +251,7 @@ class PythonStepper:
             v_a = chart.user_velocities(at.q, at.v_a)
             tau, controller_rate = self._controller_output(time, at, v_a)
             self._set_circuit_friction(time, at, v_a)
-            external_values = chart.external_forces(time, at.q, at.v_a, at.shear)
+            external_values = chart.external_forces(time, at.q, at.v_a, at.contacts)
             forces = chart.chart_forces(at.q, tau) + external_values.generalized_forces
             rates = self._dynamics.evaluate_closed("rates", at.q, at.v_a, forces)
         except ClosureError as error:
@@ -169,10 +263,12 @@ class PythonStepper:
         ), tau
 
     def _set_circuit_friction(self, time: float, state: LayoutView, v_a: Array) -> None:
-        """Tell the dynamics what seals and brakes of a circuit add to friction."""
+        """Set the circuit friction of the dynamics."""
         control = self._control
         if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
-            inputs = control.inputs_at(time, state.q[self._chart.user_columns], v_a, state.own)
+            inputs = control.inputs_at(
+                time, state.q[self._chart.user_columns], v_a, state.controller
+            )
             self._dynamics.set_circuit_friction(
                 np.array(control.circuit_friction(inputs), dtype=np.float64)
             )
@@ -180,13 +276,13 @@ class PythonStepper:
     def _controller_output(
         self, time: float, state: LayoutView, v_a: Array
     ) -> tuple[Array, Array]:
-        """What the controller answers, (n,) and (k,)."""
-        tau, rate = self._control(time, state.q[self._chart.user_columns], v_a, state.own)
-        if np.shape(tau) != v_a.shape or np.shape(rate) != state.own.shape:
+        """Forces (n,) and state rates (k,) of the controller."""
+        tau, rate = self._control(time, state.q[self._chart.user_columns], v_a, state.controller)
+        if np.shape(tau) != v_a.shape or np.shape(rate) != state.controller.shape:
             raise InputError(
                 f"{type(self._control).__name__} gives forces of the shape {np.shape(tau)} and "
-                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {state.own.shape}: "
-                "one per active joint, one per state"
+                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and "
+                f"{state.controller.shape}: one per active joint, one per state"
             )
         if self._chart.free_joints:
             self._chart.check_free_joints(np.asarray(tau).tolist(), f" at t = {time:g} s")

@@ -1,8 +1,7 @@
-"""Steps of a Rosenbrock method in machine code, which nothing stiff shortens."""
+"""Compiled steps of ROS34PW2, a Rosenbrock method of order 3 for stiff machines and circuits."""
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import largest_scaled_value
 from crane.codegen import Program, RoutineValue, Scalar, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.differentiation import differentiate
 from crane.codegen.matrix_factorization import (
@@ -16,7 +15,6 @@ from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
     matvec,
-    minimum,
     scale_vector,
     subtract_vectors,
 )
@@ -30,7 +28,7 @@ from crane.simulation.integration.error_controlled_stepper import (
     characteristic_energy,
     weighted_sum,
 )
-from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepCode, StepWriter
+from crane.simulation.integration.step_loop import StepCode, StepWriter
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -53,7 +51,7 @@ EMBEDDED_WEIGHTS = np.array(
 )
 STAGES = len(WEIGHTS)
 
-# in the transformed variables; rounding above the diagonal would read what is not there
+# coefficients in the transformed variables; tril removes rounding errors above the diagonal
 _INVERSE_GAMMA_MATRIX = np.tril(np.linalg.inv(GAMMA_MATRIX))
 _STAGE_COEFFICIENTS = ALPHA @ _INVERSE_GAMMA_MATRIX
 _RIGHT_SIDE_COEFFICIENTS = np.diag(np.diag(_INVERSE_GAMMA_MATRIX)) - _INVERSE_GAMMA_MATRIX
@@ -62,21 +60,21 @@ _FINAL_WEIGHTS, _EMBEDDED_WEIGHTS = (
     EMBEDDED_WEIGHTS @ _INVERSE_GAMMA_MATRIX,
 )
 
-ROSENBROCK_TOLERANCE = 1e-8  # error of a step, per size of the state
-# accuracy that matters [rad], [machine's size], that per `Closure.characteristic_time`, and of a
-# law's states
+ROSENBROCK_TOLERANCE = 1e-8  # error of a step, relative to the size of the state
+# required accuracy [rad], [characteristic lengths], of velocities per characteristic time, and of
+# the states of a control law
 _COORDINATE_ACCURACY, _VELOCITY_ACCURACY, _CONTROLLER_ACCURACY = 1e-11, 1e-9, 1e-9
-_MAX_STEP_RATIO, _SAFETY_FACTOR = 6.0, 0.9  # change of the step's length from one to the next
+_MAX_STEP_RATIO = 6.0
 
 
 class RosenbrockStepper(ErrorControlledStepper):
-    """Steps of ROS34PW2.
+    """Compiled steps of ROS34PW2.
 
-    The Jacobian of y' = f(y) is exact for the controller's states and for what forces, friction
-    and passive forces do to the velocities; of coordinates it has what springs, stops, gas and
-    the controller do with them, along the active ones and at frozen gamma; and none for the rest
-    (weight, centrifugal forces, integrals): the order does not depend on it. In the transformed
-    variables u = sum gamma_ij k_j, stage i solves
+    The Jacobian of y' = f(y) is exact for the states of the controller, and for the effect of
+    forces, friction and passive forces on the velocities. For coordinates it has the effect of
+    springs, end stops, gas springs and the controller, along the active coordinates and at
+    constant gamma; it neglects gravity, velocity-dependent terms and integrals, on which the order
+    does not depend. In the transformed variables u = sum gamma_ij k_j, stage i solves
 
         (1 / (h gamma) - J) u_i = f(y + sum a_ij u_j) + sum c_ij / h u_j,
 
@@ -84,17 +82,17 @@ class RosenbrockStepper(ErrorControlledStepper):
 
         [M_A - h gamma D - (h gamma)^2 K] u_v - h gamma B u_o = h gamma (M_A r_v + h gamma K r_qA)
 
-    and the rows of the controller's states o. With circuits J has nothing of coordinates. (Hairer
-    and Wanner, Solving Ordinary Differential Equations II, IV.7.)
+    and the rows of the states o of the controller. With circuits J has no derivatives by
+    coordinates. (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.7.)
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
-        tolerance: Error of a step, per size of the state.
+        controller_state_count: Number of states of the controller.
+        tolerance: Error of a step, relative to the size of the state.
 
     Raises:
-        TooLongError: It would take too long to compile.
+        FormulaTooLongError: The formulas are too long to be compiled.
     """
 
     def __init__(
@@ -111,14 +109,12 @@ class RosenbrockStepper(ErrorControlledStepper):
         )
         self._stiff_state_count = int(np.isfinite(scales).sum())
         closure = chart.machine.closure
+        contact_accuracy = _COORDINATE_ACCURACY * closure.characteristic_length
         accuracies = np.concatenate(
             [
                 _COORDINATE_ACCURACY * closure.units,
                 _VELOCITY_ACCURACY * closure.units[closure.active] / closure.characteristic_time,
-                np.full(
-                    state_count(chart.machine.external_forces),
-                    _COORDINATE_ACCURACY * closure.characteristic_length,
-                ),
+                np.full(state_count(chart.machine.external_forces), contact_accuracy),
                 scales,
             ]
         )
@@ -130,63 +126,17 @@ class RosenbrockStepper(ErrorControlledStepper):
         super().__init__(chart, control, controller_state_count, method, True, errors)
 
     def _add_method(self, program: Program) -> None:
-        """combine(s, u), prepare(..., h), solve(rate, u, factors, h) of stages; finish; dense."""
-        for added, rest in self._rest_variants:
-            self._add_stage_solvers(program, added, rest)
-        size, q = self.state_layout.size, self.state_layout.parts["q"]
+        """combine(state, u), prepare(..., h), solve(rate, u, factors, h), finish, dense."""
+        for suffix, with_joints_at_rest in self._rest_variants:
+            self._add_stage_solvers(program, suffix, with_joints_at_rest)
+        size = self.state_layout.size
         for i in range(1, STAGES):
             tape = Tape()
             state = tape.load_vector(0, 0, size)
-            program.add_formula(
-                f"combine{i}",
-                2,
-                add_vectors(state, weighted_sum(tape, 1, size, _STAGE_COEFFICIENTS[i])),
-            )
-        tape = Tape()
-        state = tape.load_vector(1, 0, size)
-        after = add_vectors(state, weighted_sum(tape, 2, size, _FINAL_WEIGHTS))
-        error_vector = weighted_sum(tape, 2, size, _FINAL_WEIGHTS - _EMBEDDED_WEIGHTS)
-        checked_states, energies = (
-            self.state_layout.start_index("own") + self._stiff_state_count,
-            self.state_layout.start_index("work"),
-        )
-        relative = tape.load(3, energies)
-        shares = [
-            error_vector[i] / (1.0 / tape.load(3, i) + relative * apply_function("abs", after[i]))
-            for i in range(checked_states)
-        ]
-        if not self._steps_end_at_outputs:
-            shares += [
-                error_vector[i]
-                / (
-                    1.0 / tape.load(3, energies + 1)
-                    + ENERGY_TOLERANCE_FACTOR * relative * apply_function("abs", after[i])
-                )
-                for i in range(energies, size)
-            ]
-        # the other integrals count only so far as that NaN and infinity anywhere show
-        error = maximum(
-            max_abs(shares), max_abs(scale_vector(1e-30, error_vector[checked_states:]))
-        )
-        is_length = [not turns for turns in self.closure_code.geometry.is_revolute[1:]]
-        displacement = subtract_vectors(after[:q], state[:q])
-        largest_move = largest_scaled_value(
-            displacement, is_length, self.closure_code.inverse_characteristic_length(tape)
-        )
-        error = self._limit_rotation(error, largest_move)
-        clipped_error = minimum(maximum(error, 1e-9), 1e9)
-        step_ratio = _SAFETY_FACTOR * apply_function(
-            "exp", (-1.0 / 3.0) * apply_function("log", clipped_error)
-        )
-        step_ratio = minimum(maximum(step_ratio, MIN_STEP_RATIO), _MAX_STEP_RATIO)
-        outputs = {
-            "state": after,
-            "error": [error],
-            "change": [step_ratio],
-            "move": [largest_move],
-        }
-        program.add_formula("finish", 4, outputs)
-        # the cubic through both ends and their slopes
+            stage = add_vectors(state, weighted_sum(tape, 1, size, _STAGE_COEFFICIENTS[i]))
+            program.add_formula(f"combine{i}", 2, stage)
+        self._add_finish(program)
+        # dense output: the cubic through both ends and their slopes
         tape = Tape()
         h = tape.load(2, 0)
         displacement = subtract_vectors(tape.load_vector(3, 0, size), tape.load_vector(0, 0, size))
@@ -198,120 +148,141 @@ class RosenbrockStepper(ErrorControlledStepper):
         )
         program.add_formula("dense", 5, list(parts))
 
-    def _add_stage_solvers(self, program: Program, suffix: str, with_joints_at_rest: bool) -> None:
-        """prepare(..., h): elimination of 1 - h gamma J, rows of the velocities times M_A.
+    def _add_finish(self, program: Program) -> None:
+        """finish(constants, state, u, tol)."""
+        size, q = self.state_layout.size, self.state_layout.parts["q"]
+        tape = Tape()
+        state = tape.load_vector(1, 0, size)
+        after = add_vectors(state, weighted_sum(tape, 2, size, _FINAL_WEIGHTS))
+        errors = weighted_sum(tape, 2, size, _FINAL_WEIGHTS - _EMBEDDED_WEIGHTS)
+        checked_count = self.state_layout.start_index("controller") + self._stiff_state_count
+        energies = self.state_layout.start_index("work")
+        tolerance = tape.load(3, energies)
 
-        And solve(rate, u, factors, h) of each stage. Joints at rest get the accelerations that
-        they have in `rate`, whatever the Jacobian says: a row Gamma x = Gamma b for each of them.
+        def share(i: int, inverse_accuracy: int, relative: Scalar) -> Scalar:
+            absolute = 1.0 / tape.load(3, inverse_accuracy)
+            return errors[i] / (absolute + relative * apply_function("abs", after[i]))
+
+        shares = [share(i, i, tolerance) for i in range(checked_count)]
+        if not self._steps_end_at_outputs:
+            shares += [
+                share(i, energies + 1, ENERGY_TOLERANCE_FACTOR * tolerance)
+                for i in range(energies, size)
+            ]
+        # the errors of other integrals only have to be finite
+        error = maximum(max_abs(shares), max_abs(scale_vector(1e-30, errors[checked_count:])))
+        largest_move = self._largest_move(tape, subtract_vectors(after[:q], state[:q]))
+        outputs = self._finish_outputs(after, error, largest_move, 3.0, _MAX_STEP_RATIO)
+        program.add_formula("finish", 4, outputs)
+
+    def _add_stage_solvers(self, program: Program, suffix: str, with_joints_at_rest: bool) -> None:
+        """Add prepare(..., h), which factorizes 1 - h gamma J, and the solvers of the stages.
+
+        Joints at rest keep the accelerations that they have in `rate`: each adds an equation
+        Gamma x = Gamma b.
         """
         tape = Tape()
-        machine, _, tau, own_rate = self._trace_controlled_machine(tape)
-        sweep, parts, stiff_state_count = (
-            machine.dynamics_formulas,
-            machine.state_parts,
-            self._stiff_state_count,
-        )
-        own_rate, mass, n = list(own_rate[:stiff_state_count]), sweep.mass_matrix, len(parts.v_a)
+        machine, _, tau, controller_rate = self._trace_controlled_machine(tape)
+        dynamics, n = machine.dynamics_formulas, len(machine.state_parts.v_a)
+        mass, k = dynamics.mass_matrix, self._stiff_state_count
         step_gamma = GAMMA * tape.load(5, 0)
-        unknown = [
-            x
-            for x in (*parts.own[:stiff_state_count], *parts.v_a)
-            if isinstance(x, SymbolicExpression)
+        rates = list(controller_rate[:k])
+        parts = machine.state_parts
+        variables = [
+            x for x in (*parts.controller[:k], *parts.v_a) if isinstance(x, SymbolicExpression)
         ]
-        jacobian = differentiate([*own_rate, *machine.forces_without_gravity(tau)], unknown)
-        coordinate_jacobian: Matrix = [[0.0] * n for _ in range(stiff_state_count + n)]
-        coordinate_directions: Matrix = [[0.0] * n for _ in parts.q]
-        if (
-            not self._steps_end_at_outputs
-        ):  # sums of oil and strokes stay what they are where J has neither
-            coordinate_jacobian = [
-                scale_vector(step_gamma, row) for row in machine.stiffness(own_rate, tau)
+        jacobian = differentiate([*rates, *machine.forces_without_gravity(tau)], variables)
+        # the balances of oil and strokes stay exact where J has derivatives of neither
+        by_coordinates: Matrix = [[0.0] * n for _ in range(k + n)]
+        coordinate_directions: Matrix = [[0.0] * n for _ in machine.state_parts.q]
+        if not self._steps_end_at_outputs:
+            by_coordinates = [
+                scale_vector(step_gamma, row) for row in machine.stiffness(rates, tau)
             ]
-            coordinate_directions = [scale_vector(step_gamma, row) for row in sweep.rate_jacobian]
-        matrix = [scale_vector(-1.0 * step_gamma, row) for row in jacobian]
-        for i in range(stiff_state_count):
-            matrix[i][i] = matrix[i][i] + 1.0
-        for i, row in enumerate(mass):
-            for j, entry in enumerate(row):
-                matrix[stiff_state_count + i][stiff_state_count + j] = (
-                    matrix[stiff_state_count + i][stiff_state_count + j] + entry
-                )
-        for row, slopes in zip(matrix, coordinate_jacobian, strict=True):
-            for j, slope in enumerate(slopes):
-                row[stiff_state_count + j] = row[stiff_state_count + j] - step_gamma * slope
-        constraints = sweep.stick_slip_rows if with_joints_at_rest else []
+            coordinate_directions = [
+                scale_vector(step_gamma, row) for row in dynamics.rate_jacobian
+            ]
+        matrix = self._system_matrix(jacobian, by_coordinates, mass, step_gamma)
+        constraints = dynamics.stick_slip_rows if with_joints_at_rest else []
         constraint_rows = [scale_vector(held, row) for held, row in constraints]
-        for row in matrix:
-            row += [0.0] * len(constraint_rows)
-        for k, row in enumerate(constraint_rows):
-            for j, entry in enumerate(row):
-                matrix[stiff_state_count + j][stiff_state_count + n + k] = entry
-            others: list[Scalar] = [0.0] * len(constraint_rows)
-            others[k] = constraints[k][0] - 1.0
-            matrix.append([*([0.0] * stiff_state_count), *row, *others])
-        factors = lu_factorize(matrix)
+        _append_constraints(matrix, k, constraint_rows, [held - 1.0 for held, _ in constraints])
         tables: dict[str, Matrix] = {
-            "factors": factors,
+            "factors": lu_factorize(matrix),
             "mass": mass,
             "rows": constraint_rows,
-            "by_q": coordinate_jacobian,
-            "ways": coordinate_directions,
-            "free": [sweep.active_motion_factors] if with_joints_at_rest else [[1.0] * n],
+            "by_coordinates": by_coordinates,
+            "directions": coordinate_directions,
+            "free": [dynamics.active_motion_factors if with_joints_at_rest else [1.0] * n],
         }
         outputs = {name: symbolic_entries(table) for name, table in tables.items()}
         program.add_formula(f"prepare{suffix}", 6, outputs)
-        starts = program.formula_outputs(f"prepare{suffix}")
-        size, active = self.state_layout.size, self._chart.machine.closure.active
         for i in range(STAGES):
-            tape = Tape()
-            right = scale_vector(GAMMA * tape.load(3, 0), tape.load_vector(0, 0, size))
-            right = add_vectors(
-                right,
-                scale_vector(GAMMA, weighted_sum(tape, 1, size, _RIGHT_SIDE_COEFFICIENTS[i])),
-            )
-            there = {
-                name: load_matrix(table, tape, 2, starts.start_index(name))
-                for name, table in tables.items()
-            }
-            part = self.state_layout.view(right)
-            pulls = matvec(there["by_q"], [part.q[column] for column in active])
-            wanted = add_vectors(
-                [*part.own[:stiff_state_count], *matvec(there["mass"], part.v_a)], pulls
-            )
-            x = lu_solve(there["factors"], [*wanted, *matvec(there["rows"], part.v_a)])
-            v_a = [
-                w * y
-                for w, y in zip(
-                    there["free"][0], x[stiff_state_count : stiff_state_count + n], strict=True
-                )
-            ]
-            own = [*x[:stiff_state_count], *part.own[stiff_state_count:]]
-            q = add_vectors(part.q, matvec(there["ways"], v_a))
-            program.add_formula(
-                f"solve{i}{suffix}", 4, [*q, *v_a, *part.shear, *own, *part.work, *part.lost]
-            )
+            self._add_stage_solver(program, i, suffix, tables)
+
+    def _system_matrix(
+        self, jacobian: Matrix, by_coordinates: Matrix, mass: Matrix, step_gamma: Scalar
+    ) -> Matrix:
+        """1 - h gamma J of stiff controller states and velocities, the latter times M_A."""
+        k = self._stiff_state_count
+        matrix = [scale_vector(-1.0 * step_gamma, row) for row in jacobian]
+        for i in range(k):
+            matrix[i][i] = matrix[i][i] + 1.0
+        for row, mass_row in zip(matrix[k:], mass, strict=True):
+            row[k:] = add_vectors(row[k:], mass_row)
+        for row, derivatives in zip(matrix, by_coordinates, strict=True):
+            for j, derivative in enumerate(derivatives):
+                row[k + j] = row[k + j] - step_gamma * derivative
+        return matrix
+
+    def _add_stage_solver(
+        self, program: Program, stage: int, suffix: str, tables: dict[str, Matrix]
+    ) -> None:
+        """solve(rate, u, factors, h) of a stage."""
+        size, k = self.state_layout.size, self._stiff_state_count
+        active, starts = (
+            self._chart.machine.closure.active,
+            program.formula_outputs(f"prepare{suffix}"),
+        )
+        tape = Tape()
+        right = scale_vector(GAMMA * tape.load(3, 0), tape.load_vector(0, 0, size))
+        previous = weighted_sum(tape, 1, size, _RIGHT_SIDE_COEFFICIENTS[stage])
+        part = self.state_layout.view(add_vectors(right, scale_vector(GAMMA, previous)))
+        loaded = {
+            name: load_matrix(table, tape, 2, starts.start_index(name))
+            for name, table in tables.items()
+        }
+        by_coordinates = matvec(loaded["by_coordinates"], [part.q[i] for i in active])
+        right_side = add_vectors(
+            [*part.controller[:k], *matvec(loaded["mass"], part.v_a)], by_coordinates
+        )
+        solution = lu_solve(loaded["factors"], [*right_side, *matvec(loaded["rows"], part.v_a)])
+        free = loaded["free"][0]
+        v_a = [factor * x for factor, x in zip(free, solution[k : k + len(free)], strict=True)]
+        q = add_vectors(part.q, matvec(loaded["directions"], v_a))
+        controller = [*solution[:k], *part.controller[k:]]
+        outputs = [*q, *v_a, *part.contacts, *controller, *part.work, *part.dissipated]
+        program.add_formula(f"solve{stage}{suffix}", 4, outputs)
 
     def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
         r, size = step.routine, self.state_layout.size
         u, stage = r.local_array("u", STAGES * size), r.local_array("stage", size)
-        slope = r.local_array("slope", program.formula_outputs("rate"))
-        # the last has the most
+        stage_rate = r.local_array("slope", program.formula_outputs("rate"))
+        # the last variant has the most outputs
         factors = r.local_array(
             "factors", program.formula_outputs("prepare" + self._rest_variants[-1][0])
         )
 
         def attempt(t: RoutineValue, length: RoutineValue) -> None:
             step.call("prepare", t, r.state, step.length, factors)
-            for k in range(STAGES):
-                now = step.start_rate
-                if k:
-                    now = slope
-                    r.call(f"combine{k}", r.state, u, stage)
-                    step.call("rate", t + length * float(ALPHA[k].sum()), stage, slope)
-                self.call_formula(
-                    r, f"solve{k}", now, u, factors, step.length, u.element_pointer(k * size)
-                )
+            rate = step.start_rate
+            for i in range(STAGES):
+                if i:
+                    rate = stage_rate
+                    r.call(f"combine{i}", r.state, u, stage)
+                    step.call("rate", t + length * float(ALPHA[i].sum()), stage, rate)
+                solution = u.element_pointer(i * size)
+                self.call_formula(r, f"solve{i}", rate, u, factors, step.length, solution)
             r.call("finish", r.geometry, r.state, u, r.tol, step.step_result)
 
         def interpolate(t: RoutineValue, length: RoutineValue) -> None:
@@ -319,3 +290,17 @@ class RosenbrockStepper(ErrorControlledStepper):
             r.call("dense", r.state, *ends, step.dense_output)
 
         return attempt, interpolate
+
+
+def _append_constraints(
+    matrix: Matrix, first_column: int, rows: list[list[Scalar]], diagonal: list[Scalar]
+) -> None:
+    """Append equations of joints at rest to a matrix, with their multipliers."""
+    for row in matrix:
+        row += [0.0] * len(rows)
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            matrix[first_column + j][first_column + len(row) + i] = entry
+        multipliers: list[Scalar] = [0.0] * len(rows)
+        multipliers[i] = diagonal[i]
+        matrix.append([*([0.0] * first_column), *row, *multipliers])

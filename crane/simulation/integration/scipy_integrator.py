@@ -1,4 +1,4 @@
-"""Motion in time by scipy's adaptive methods."""
+"""Integration by the methods of scipy with step-size control."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,29 +10,27 @@ from crane.common.errors import ClosureError
 from crane.common.samples import Array
 from crane.control import Controller
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.integration_halt import IntegrationHaltError
-from crane.simulation.integration.python_stepper import StepProgress
-from crane.simulation.integration.stick_slip_integrator import StickSlipIntegrator
+from crane.simulation.integration.integrators import StickSlipIntegrator
+from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
 
-# of a passive joint in rad and shares of the machine's size per `Closure.characteristic_time`:
-# where the branch
-# ends they grow beyond bounds
+# limit of passive velocities [coordinate units per characteristic time]: they are infinite at the
+# end of a branch
 _MAX_PASSIVE_VELOCITY = 300.0
-SCIPY_TOLERANCE = 1e-9  # error of a step, per size of the state
-_ABSOLUTE_TOLERANCE_SHARE = 1e-2  # of that what matters, likewise; of all else in SI units
+SCIPY_TOLERANCE = 1e-9  # error of a step, relative to the size of the state
+_ABSOLUTE_TOLERANCE_SHARE = 1e-2  # absolute over relative tolerance, in coordinate or SI units
 SCIPY_METHODS = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 
 
 class ScipyIntegrator(StickSlipIntegrator):
-    """An adaptive method with dense output, loops closed to rounding at the recorded instants.
+    """A method of scipy with dense output; loops are closed at the recorded instants.
 
     Args:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
+        controller_state_count: Number of states of the controller.
         method: One of `SCIPY_METHODS`.
-        tolerance: Error of a step, per size of the state.
+        tolerance: Error of a step, relative to the size of the state.
     """
 
     def __init__(
@@ -54,7 +52,7 @@ class ScipyIntegrator(StickSlipIntegrator):
         """See `FixedStepIntegrator.run`.
 
         Raises:
-            HaltedError: The method gives up, or the loops cannot be closed any more.
+            IntegrationHaltError: The method fails, or the loops do not close.
         """
         first = times[0] if len(times) else self._end_time
         self.done = self.next_instant = 0
@@ -71,10 +69,10 @@ class ScipyIntegrator(StickSlipIntegrator):
     def _integrate_until(
         self, start_time: float, instants: Array, state: Array, rows: Array, progress: StepProgress
     ) -> bool:
-        """Integrate to the last instant, or to where a joint starts or stops.
+        """Integrate to the last instant, or to a stick-slip transition.
 
         Returns:
-            False where other coordinates are better.
+            False where another chart is needed.
         """
         from scipy import integrate
 
@@ -86,9 +84,9 @@ class ScipyIntegrator(StickSlipIntegrator):
         )
 
         def rate(time: float, state: Array) -> Array:
-            closed = state.copy()  # at postures that are none gamma is not that of the machine
+            closed = state.copy()  # gamma is valid at closed configurations alone
             q = view(closed).q
-            with suppress(ClosureError):  # of a trial beyond where they close
+            with suppress(ClosureError):  # of a trial state beyond the branch
                 q[:] = closure.solve(q[closure.active])
             return self.python_stepper.observe(time, closed)[0]
 
@@ -99,10 +97,10 @@ class ScipyIntegrator(StickSlipIntegrator):
         solver = method(
             rate, start_time, state.copy(), end, rtol=self._tolerance, atol=absolute_tolerances
         )
-        rate(start_time, state)  # the solver's last look may have been beside
+        rate(start_time, state)  # the last evaluation of the solver may be at another state
         before = self.python_stepper.transition_margin
         while solver.status == "running":
-            with np.errstate(all="ignore"):  # where a trial explodes the method gives up by itself
+            with np.errstate(all="ignore"):  # the method fails by itself where a trial diverges
                 message = solver.step()
             if message is not None:
                 what = f" {self._method} gives up: {message.rstrip('.').lower()}"
@@ -114,9 +112,9 @@ class ScipyIntegrator(StickSlipIntegrator):
             dense_output, start = solver.dense_output(), float(solver.t_old)
 
             def trial(part: float, within: Any = dense_output, start: float = start) -> Any:
-                there = within(start + part)
-                rate(start + part, there)
-                return there, self.python_stepper.transition_margin
+                displaced = within(start + part)
+                rate(start + part, displaced)
+                return displaced, self.python_stepper.transition_margin
 
             rate(solver.t, solver.y)
             after, until, event_state = (
@@ -150,10 +148,10 @@ class ScipyIntegrator(StickSlipIntegrator):
         return True
 
     def _check_passive_velocities(self, time: float, state: Array) -> None:
-        """See that no passive joint moves beyond bounds.
+        """Check the velocities of the passive joints.
 
         Raises:
-            HaltedError: One does.
+            IntegrationHaltError: One is too large.
         """
         closure, at = self._closure, self.python_stepper.state_layout.view(state)
         speed = np.inf
@@ -181,7 +179,7 @@ class ScipyIntegrator(StickSlipIntegrator):
         state: Array,
         rows: Array,
     ) -> None:
-        """Fill the rows of the instants up to one [s], and go on to the last of them."""
+        """Fill the rows of the instants up to a time [s]; sets the state to that at the last."""
         for k in range(self.done, len(instants)):
             time = instants[k]
             if time > end_time:
@@ -195,10 +193,10 @@ class ScipyIntegrator(StickSlipIntegrator):
                 self.done = k + 1
 
     def _close_loops(self, time: float, state: Array) -> None:
-        """Close a state's loops.
+        """Close the loops of a state.
 
         Raises:
-            HaltedError: They do not close.
+            IntegrationHaltError: They do not close.
         """
         q, closure = self.python_stepper.state_layout.view(state).q, self._closure
         try:

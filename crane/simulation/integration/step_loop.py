@@ -1,12 +1,11 @@
-"""The loop over the steps of a method with step-size control, as a routine in machine code."""
+"""The loop over the steps of a method with step-size control, as a compiled routine."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from crane.codegen import Program, RoutineValue, select
-from crane.codegen.intermediate_representation import ArrayPointer as Place
-from crane.codegen.intermediate_representation import Routine
-from crane.simulation.integration.machine_formulas import (
+from crane.codegen.intermediate_representation import ArrayPointer, Routine
+from crane.simulation.integration.machine_code_stepper import (
     HELD_INDEX,
     MachineCodeStepper,
     exceeds_chart_limits,
@@ -14,45 +13,41 @@ from crane.simulation.integration.machine_formulas import (
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE
 
 MIN_STEP_RATIO = 0.2  # least ratio of a step size to the one before
-_MIN_CLOSABLE_MOVE = (
-    0.02  # move of a step beyond whose end the loops may not close: rad, machine's size
-)
-_MIN_STEP_SHARE = 1e-9  # of the output interval: the least step size
-_MIN_TRIAL_SHARE, _SECANT_TRIALS = (
-    0.02,
-    8,
-)  # share of a step that is tried to find an event; trials until halving
-_END_SHARE = 1.0 - 2.0**-41  # of what is left: all of it
+_MIN_CLOSABLE_MOVE = 0.02  # displacement in coordinate units up to which the loops have to close
+_MIN_STEP_SHARE = 1e-9  # least step size, as a share of the output interval
+_MIN_TRIAL_SHARE = 0.02  # least share of a step that is tried to locate an event
+_SECANT_TRIALS = 8  # trials before bisection
+_END_SHARE = 1.0 - 2.0**-41  # share of the remaining time from which a step ends at its goal
 
 FormulaCaller = Callable[..., None]
-"""Calls a formula by its name, at a time relative to that of `run`, with a state and arrays."""
+"""Writes the call of a formula by name, at a time relative to `run`, with state and arrays."""
 
 
 StepWriter = Callable[[RoutineValue, RoutineValue], None]
-"""Adds what happens from a time on, over a length."""
+"""Writes code for a start time and a step size."""
 
 
 @dataclass(frozen=True)
 class StepCode:
-    """What a step is made of, in machine code.
+    """Code elements of a step.
 
     Attributes:
-        routine: What it is added to.
+        routine: The routine.
         call: See `FormulaCaller`.
-        start_rate: Rate at its beginning.
+        start_rate: Rate at the start of the step.
         end_rate: Rate at its end.
-        length: (1,) its length.
+        length: (1,) step size.
         step_result: Outputs of the formula `finish`.
         dense_output: Outputs of the formula `dense`.
     """
 
     routine: Routine
     call: FormulaCaller
-    start_rate: Place
-    end_rate: Place
-    length: Place
-    step_result: Place
-    dense_output: Place
+    start_rate: ArrayPointer
+    end_rate: ArrayPointer
+    length: ArrayPointer
+    step_result: ArrayPointer
+    dense_output: ArrayPointer
 
 
 @dataclass(frozen=True)
@@ -63,7 +58,7 @@ class _StepVariables:
         length: Step size.
         last: Whether it ends at its goal.
         goal: The time at which it has to end at the latest.
-        sure: 1 where an event is taken for located.
+        sure: 1 where an event counts as located.
         proposed: The step size that error control proposes.
     """
 
@@ -79,7 +74,7 @@ class StepLoop:
 
     Elements of its argument h: output interval; step size to try; time of the state, relative to
     the first output instant before, and to the next one behind; spacing of references; end;
-    whether a joint starts or stops there.
+    whether a stick-slip transition is there.
 
     A step that passes an event is rejected. The secant method locates the event; steps that end
     before it are accepted.
@@ -131,7 +126,9 @@ class StepLoop:
             self._reference,
         )
         if stepper.external_callback is not None:
-            self._callback_inputs = routine.local_array("asked", program.formula_outputs("asked"))
+            self._callback_inputs = routine.local_array(
+                "callback_inputs", program.formula_outputs("callback_inputs")
+            )
             self._callback_results = self._reference.element_pointer(stepper.controller_columns)
         self._output_interval, self._reference_spacing, self._end_time = (
             routine.new_variable(routine.h[0]),
@@ -143,12 +140,12 @@ class StepLoop:
             routine.new_variable(0),
             routine.new_variable(0.0),
         )
-        # the references that a step begins among
+        # references at the start of the step
         self._reference_index, self._reference_time = (
             routine.new_variable(0),
             routine.new_variable(self._time),
         )
-        self._event_distance_count = program.formula_outputs("rate").parts["edges"]
+        self._event_distance_count = program.formula_outputs("rate").parts["event_distances"]
 
     def write(
         self, make_step: Callable[[Program, StepCode], tuple[StepWriter, StepWriter]]
@@ -156,7 +153,7 @@ class StepLoop:
         """Write the routine.
 
         Args:
-            make_step: Returns what makes a step up to `finish`, and what calls `dense` behind one.
+            make_step: Returns the writers of a step up to `finish`, and of `dense` after a step.
         """
         r = self._r
         self._attempt_step, self._interpolate = make_step(
@@ -178,7 +175,7 @@ class StepLoop:
         self._write_return()
 
     def _begin_location(self) -> None:
-        """Variables of event location: how far ahead the event is, margins here and there."""
+        """Variables of event location: time to the event, and margins before and behind it."""
         r = self._r
         self._time_to_event, self._margin_before, self._margin_behind = (
             r.new_variable(0.0),
@@ -187,11 +184,11 @@ class StepLoop:
         )
         self._trial_count = r.new_variable(0)
         self._event_signs, self._signed_distance = (
-            r.local_array("sides", max(1, self._event_distance_count)),
-            r.local_array("crossed", 1),
+            r.local_array("event_signs", max(1, self._event_distance_count)),
+            r.local_array("least_distance", 1),
         )
         if self._event_distance_count:
-            r.call("sides", self._start_rate, self._event_signs)
+            r.call("event_signs", self._start_rate, self._event_signs)
         if self._has_stick_slip:
             r.assign(self._margin_before, self._start_rate["margin"])
             with r.if_then(self._margin_before < -EVENT_TOLERANCE):
@@ -211,7 +208,7 @@ class StepLoop:
         with r.if_then(self._step_result["error"] <= 1.0):
             closed = r.call("close", r.geometry, self._step_result, self._closure_result, r.bounds)
             with r.if_then(closed < 1):
-                # nearer to where the branch ends, if it does
+                # a shorter step, which comes nearer to the end of a branch
                 r.store(r.h, 1, step.length * MIN_STEP_RATIO)
                 with r.if_then(self._step_result["move"] < _MIN_CLOSABLE_MOVE):
                     self._write_return()
@@ -244,7 +241,7 @@ class StepLoop:
             with r.if_then((r.bounds[HELD_INDEX] > 0.5) & (proposed > output_interval)):
                 r.assign(
                     proposed, output_interval
-                )  # what is at rest does not tell how soon it starts
+                )  # the margin of joints at rest does not limit the step size
         if self._has_stick_slip or self._event_distance_count:
             with r.if_then(self._time_to_event > 0.0):
                 self._locate_event(time_left, is_located)
@@ -257,7 +254,7 @@ class StepLoop:
         return _StepVariables(length, last, goal, is_located, proposed)
 
     def _locate_event(self, time_left: RoutineValue, is_located: RoutineValue) -> None:
-        """Shorten what is left to where the secant method expects the event."""
+        """Shorten the remaining time to where the secant method expects the event."""
         r, time_to_event = self._r, self._time_to_event
         share = r.new_variable(
             (self._margin_before + 1.5 * EVENT_TOLERANCE)
@@ -278,7 +275,7 @@ class StepLoop:
         r.assign(self._trial_count, self._trial_count + 1)
 
     def _finish_step(self, step: _StepVariables, next_length: RoutineValue) -> None:
-        """Behind a step whose error is small and whose end is closed."""
+        """Detect events and record outputs after an accepted step whose loops are closed."""
         r = self._r
         self._call_formula("rate", self._time + step.length, self._step_result, self._end_rate)
         is_beyond_event, event = r.new_variable(0), r.new_variable(0)
@@ -295,14 +292,14 @@ class StepLoop:
         event: RoutineValue,
         least_margin: RoutineValue,
     ) -> None:
-        """Whether an event lies within the step (beyond_it) or at its end."""
+        """Detect whether an event is within the step (is_beyond_event) or at its end (event)."""
         r = self._r
         if self._has_stick_slip:
             r.assign(least_margin, self._end_rate["margin"])
             with r.if_then(least_margin < -EVENT_TOLERANCE):
                 r.assign(event, 1)
         if self._event_distance_count:
-            r.call("crossed", self._end_rate, self._event_signs, self._signed_distance)
+            r.call("least_distance", self._end_rate, self._event_signs, self._signed_distance)
             with r.if_then(self._signed_distance[0] < least_margin):
                 r.assign(least_margin, self._signed_distance[0])
         if self._has_stick_slip or self._event_distance_count:
@@ -362,14 +359,14 @@ class StepLoop:
         event: RoutineValue,
         least_margin: RoutineValue,
     ) -> None:
-        """Go on from the end of the step."""
+        """Continue from the end of the step."""
         r, time_to_event = self._r, self._time_to_event
-        # a part that was cut short says nothing against the length it was cut from
+        # a step that was shortened to its goal keeps the proposed size
         keeps_proposal = step.last & (step.proposed > next_length)
         r.store(r.h, 1, select(keeps_proposal, step.proposed, next_length))
         at_goal = step.last & (time_to_event <= 0.0)
         r.assign(self._time, select(at_goal, step.goal, self._time + step.length))
-        if self._stepper.has_floating_base:  # other coordinates have other slopes
+        if self._stepper.has_floating_base:  # rates depend on the rotation vector
             r.call("wrap", self._step_result, r.state)
             self._call_formula("rate", self._time, r.state, self._start_rate)
         else:
@@ -382,8 +379,8 @@ class StepLoop:
             r.assign(time_to_event, time_to_event - step.length)
             r.assign(self._margin_before, least_margin)
         if self._event_distance_count:
-            r.call("sides", self._end_rate, self._event_signs)
-            with r.if_then(least_margin < -EVENT_TOLERANCE):  # an edge, behind which it goes on
+            r.call("event_signs", self._end_rate, self._event_signs)
+            with r.if_then(least_margin < -EVENT_TOLERANCE):  # a passed event distance
                 r.assign(time_to_event, 0.0)
                 r.assign(self._trial_count, 0)
                 r.assign(self._margin_before, 1.0)
@@ -393,7 +390,7 @@ class StepLoop:
     def _advance_references(
         self, index: RoutineValue, start_time: RoutineValue, time: RoutineValue
     ) -> None:
-        """Move the references that are interpolated to those around a time."""
+        """Move the interpolated references to those around a time."""
         r = self._r
         with r.loop_forever():
             with r.if_then(
@@ -407,7 +404,7 @@ class StepLoop:
             r.assign(start_time, start_time + self._reference_spacing)
 
     def _interpolate_references(self, time: RoutineValue) -> None:
-        """Put the references at a time behind the step's beginning into `reference`."""
+        """Interpolate the references at a time within the step."""
         r = self._r
         index, start_time = (
             r.new_variable(self._reference_index),
@@ -418,13 +415,13 @@ class StepLoop:
         row = r.refs.row_pointer(index, 2 * self._columns)
         r.call("reference", row, self._relative_time, self._reference)
 
-    def _call_formula(self, formula: str, time: RoutineValue, *arrays: Place) -> None:
+    def _call_formula(self, formula: str, time: RoutineValue, *arrays: ArrayPointer) -> None:
         r = self._r
         if self._columns:
             self._interpolate_references(time)
         if self._stepper.external_callback is not None:
-            r.call("asked", *self._machine_arguments, arrays[0], self._callback_inputs)
-            r.call("answer", self._callback_inputs, self._callback_results)
+            r.call("callback_inputs", *self._machine_arguments, arrays[0], self._callback_inputs)
+            r.call("callback", self._callback_inputs, self._callback_results)
         self._stepper.call_formula(r, formula, *self._machine_arguments, *arrays)
 
     def _write_return(self) -> None:

@@ -1,17 +1,17 @@
-"""Joints that stick: which of them slip and which are at rest, and when that changes.
+"""Stick-slip modes of joints: which of them slip and which are at rest, and when that changes.
 
-Friction of a joint k that sticks is set-valued, F_k sign(v_k) with sign(0) = [-1, 1]. The
-accelerations of those at rest are the unique ones of least
+The friction of a joint k with stiction is set-valued, F_k sign(v_k) with sign(0) = [-1, 1]. The
+accelerations of joints at rest are the unique minimum of
 
     1/2 a^T M a - a^T f + sum F_k |Gamma_k a + d_k|,
 
-with Gamma_k their rows of gamma and d_k their drift; a convex problem with an answer always, also
-where more joints stick than there are freedoms. Its dual are the forces at rest r,
+with Gamma_k their rows of gamma and d_k their drift. This convex problem always has a solution,
+also with more joints at rest than degrees of freedom. Its dual variables are the forces at rest r,
 
     min 1/2 |C^-1 (f - Gamma^T r)|^2 - d^T r,    |r_k| <= F_k,    M = C C^T,
 
-bounded least squares (Moreau 1988; Glocker, Set-Valued Force Laws, 2001). Between the instants
-where a joint starts or stops, the motion is that of an ordinary differential equation.
+a bounded least-squares problem (Moreau 1988; Glocker, Set-Valued Force Laws, 2001). Between the
+transitions the motion is that of an ordinary differential equation.
 """
 
 from collections.abc import Callable
@@ -26,30 +26,27 @@ from crane.dynamics import Dynamics
 from crane.dynamics.joint_forces import REST_VELOCITY
 from crane.machine import Machine
 
-# how far beyond a margin an event is that has been found; see
-# `StickSlipAccelerations.transition_margin`
+# accuracy of located events; see `StickSlipAccelerations.transition_margin`
 EVENT_TOLERANCE = 1e-10
-_MAX_VELOCITY_CHANGE = (
-    1e-6  # of velocities, what no joint at rest changes when it is brought to it
-)
-_MAX_LIMIT_SHARE = 1.0 - 1e-12  # share of its limit from which a joint at rest gives way
-_RANK_TOLERANCE = 1e-9  # of the largest, or of its own size, what rows that are independent have
-_MAX_NAMED_JOINTS = 4  # joints that are named
-_MAX_TRIALS = 200  # trials until an event is found
+_MAX_VELOCITY_CHANGE = 1e-6  # relative change of velocities by stopping a joint at rest
+_MAX_LIMIT_SHARE = 1.0 - 1e-12  # share of its breakaway force at which a joint slips
+_RANK_TOLERANCE = 1e-9  # share of the largest singular value, or of its norm, of zero rows
+_MAX_NAMED_JOINTS = 4  # joints that a message names
+_MAX_TRIALS = 200  # trial steps to locate an event
 
 TrialStep = Callable[[float], tuple[Array, float]]
-"""Length of a step [s] -> the state behind it and the margin there."""
+"""Step size [s] -> state and margin after the step."""
 
 
 class StickSlipTransition(NamedTuple):
-    """A joint that starts or stops.
+    """A stick-slip transition.
 
     Attributes:
         time: [s].
-        state: Then.
-        slip_signs: (k,) see `StickSlipModes`, from then on.
-        is_held: (k,) likewise.
-        is_moving: Likewise.
+        state: State at the transition.
+        slip_signs: (k,) see `StickSlipModes`, after the transition.
+        is_held: (k,) see `StickSlipModes`, after the transition.
+        is_moving: See `StickSlipModes`, after the transition.
     """
 
     time: float
@@ -60,21 +57,21 @@ class StickSlipTransition(NamedTuple):
 
 
 class StickSlipModes:
-    """What the joints of a machine do whose friction sticks.
+    """Stick-slip modes of the joints with stiction.
 
     Args:
         machine: The machine, in any coordinates.
-        columns: Of these joints.
+        columns: Columns of these joints.
 
     Attributes:
-        columns: The same.
-        slip_signs: (k,) signs of slips; of a joint at rest, the share of its limit, where others
-            take what is left.
-        is_held: (k,) whether a joint is kept at rest by whatever that takes.
-        is_moving: Whether anything moves.
-        has_modes: Whether all this has been found.
-        is_undetermined: Whether forces at rest were, of joints that hold the same.
-        transitions: What has happened, the start first, of who asks for it by an empty list.
+        columns: Columns of the joints.
+        slip_signs: (k,) signs of the slip velocities; of a joint at rest that is not held, its
+            friction as a share of its breakaway force.
+        is_held: (k,) whether a joint is held at rest by a constraint.
+        is_moving: Whether the machine moves.
+        has_modes: Whether the modes are known.
+        is_undetermined: Whether the forces at rest were not unique.
+        transitions: Transitions with the start as the first, if set to a list; else None.
     """
 
     def __init__(self, machine: Machine, columns: tuple[int, ...]):
@@ -89,7 +86,7 @@ class StickSlipModes:
 
     @property
     def notes(self) -> list[str]:
-        """What is to be said of them."""
+        """Notes for the user of a run."""
         if not self.is_undetermined:
             return []
         names = [f"'{joint}'" for joint in self._joints]
@@ -106,7 +103,7 @@ class StickSlipModes:
         ]
 
     def record_transition(self, time: float, state: Array) -> None:
-        """Remember what has changed at a time [s] and a state, if asked to."""
+        """Record the present modes as a transition at a time [s] and a state."""
         if self.transitions is not None:
             transition = StickSlipTransition(
                 time,
@@ -118,7 +115,7 @@ class StickSlipModes:
             self.transitions.append(transition)
 
     def apply_to(self, dynamics: Dynamics) -> None:
-        """Make the present modes those of a machine's dynamics."""
+        """Set the modes of the dynamics of a machine."""
         dynamics.set_stick_slip_modes(
             self.slip_signs,
             self.is_held.astype(np.float64),
@@ -127,17 +124,16 @@ class StickSlipModes:
         )
 
     def find_modes(self, dynamics: Dynamics, q: Array, v_a: Array, tau: Array) -> Array:
-        """Find the modes at a closed posture.
+        """Determine the modes at a closed configuration.
 
         Args:
-            dynamics: Of the machine; it is told the modes, and knows what a circuit adds to
-                friction.
-            q: (nq,).
-            v_a: (n,).
+            dynamics: Dynamics of the machine, whose modes are set; it has the circuit friction.
+            q: (nq,) configuration.
+            v_a: (n,) active velocities.
             tau: (n,) forces along the same coordinates.
 
         Returns:
-            (n,) velocities, in which what is at rest is so to the last bit.
+            (n,) velocities, exactly 0 for joints at rest.
         """
         closure, n, k = dynamics.machine.closure, len(v_a), len(self.columns)
         parts = dynamics.evaluate_closed("resting", q, v_a, tau)
@@ -185,9 +181,9 @@ class StickSlipModes:
         v: Array,
         v_a: Array,
     ) -> Array:
-        """Velocities without those of joints at rest, by the least impulses.
+        """Velocities after joints at rest are stopped by least impulses.
 
-        A joint that turns while others move on is not at rest.
+        A joint at a reversal while others move is not at rest.
         """
         impulse_directions = np.linalg.solve(cholesky_factor, rows.T)
         momentum = cholesky_factor.T @ v_a
@@ -210,13 +206,13 @@ class StickSlipModes:
 
 
 def _bounded_least_squares(matrix: Array, right_side: Array) -> Array:
-    """Shares (k,) of the limits, least |net - reach shares|; of many the smallest."""
+    """The x (k,) within -1 and 1 of least |right_side - matrix x|, and of these the smallest."""
     shares, _, rank, _ = np.linalg.lstsq(matrix, right_side, rcond=None)
     is_bounded = np.abs(shares) > 1.0
     if not is_bounded.any():
         return shares.astype(np.float64)
-    # those beyond their limits on them, and the others anew: the least if these are within theirs
-    # and no slope leads back from a limit (Karush, Kuhn and Tucker's conditions)
+    # set violated bounds active and solve for the others: optimal under the conditions of Karush,
+    # Kuhn and Tucker
     solution = np.where(is_bounded, np.sign(shares), 0.0)
     solution[~is_bounded] = np.linalg.lstsq(
         matrix[:, ~is_bounded], right_side - matrix @ solution, rcond=None
@@ -231,13 +227,13 @@ def _bounded_least_squares(matrix: Array, right_side: Array) -> Array:
 
 
 def _independent_columns(columns: Array) -> tuple[Indices, int]:
-    """Indices of columns that span them all, and how many there are.
+    """Indices of independent columns, and the rank.
 
-    Each is looked at in its own size: a limit may be next to nothing, of a brake that is released.
+    Columns are compared with their own norm: a breakaway force may be small.
     """
     count = columns.shape[1]
     column_norms = np.linalg.norm(columns, axis=0)
-    # a column of length 1 is no nearer to what others span than their least singular value
+    # the distance of a unit column from the span of others is at least the singular value
     if count <= len(columns) and column_norms.all():
         least_singular_value = np.linalg.svd(columns / column_norms, compute_uv=False).min(
             initial=1.0
@@ -255,17 +251,17 @@ def _independent_columns(columns: Array) -> tuple[Indices, int]:
 def locate_event(
     trial: TrialStep, margin_before: float, length: float, margin_behind: float
 ) -> tuple[float, Array]:
-    """The step that ends where a joint starts or stops, by the secant method with safeguards.
+    """The step that ends at a stick-slip transition, by the secant method with bisection.
 
     Args:
-        trial: Makes a step of some length.
-        margin_before: Margin at its beginning, not below -`EVENT_TOLERANCE`.
-        length: Of a step beyond the event [s].
-        margin_behind: Margin behind it, below -`EVENT_TOLERANCE`.
+        trial: Makes a step of a given size.
+        margin_before: Margin at the start, at least -`EVENT_TOLERANCE`.
+        length: Size of a step beyond the transition [s].
+        margin_behind: Margin after this step, below -`EVENT_TOLERANCE`.
 
     Returns:
-        Length [s] and the state then, from 1 to 2 `EVENT_TOLERANCE` beyond the margin, or where it
-        jumps.
+        Step size [s] and state, with a margin between -1 and -2 `EVENT_TOLERANCE`, or where the
+        margin jumps.
     """
     lower, low, upper, high = 0.0, margin_before, length, margin_behind
     target_margin, side = -1.5 * EVENT_TOLERANCE, 0
@@ -276,7 +272,7 @@ def locate_event(
         gap = low - high
         share = (low - target_margin) / gap if 0.0 < gap < np.inf else 0.5
         middle = lower + min(max(share, 1e-3), 1.0 - 1e-3) * (upper - lower)
-        if abs(side) >= 3:  # one end stays: halve
+        if abs(side) >= 3:  # one end does not move: bisect
             middle, side = 0.5 * (lower + upper), 0
         if not lower < middle < upper or upper - lower < 1e-14 * length:
             break

@@ -1,4 +1,4 @@
-"""What acts on a machine that is linearized: forces, or a circuit with its valves."""
+"""Drive of a machine that is linearized: forces, or a circuit with valves."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,23 +12,23 @@ from crane.common.samples import Array
 from crane.control import ControllerInputs, ValveDrive, ValveSignals
 from crane.dynamics import Dynamics, JointForces
 from crane.dynamics.joint_force_formulas import friction_sign
-from crane.hydraulics.circuit_equations import BALANCE_UNITS
+from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.integration.machine_formulas import controller_settings
 
-_MIN_OPENING = 1e-6  # of a spool's stroke, beyond the dead band
+_MIN_OPENING = 1e-6  # share of the spool stroke beyond the dead band
 
 
 class LinearizedDrive:
-    """What acts on the machine, its states and inputs: forces, or a circuit with its valves.
+    """Forces of a linearized machine with their states and inputs: free forces, or a circuit.
 
     Attributes:
-        state_units: Names and units of the drive's own states.
-        input_units: Names and units.
-        output_units: Names and units of what else can be an output.
+        state_units: Names and units of the states of the drive.
+        input_units: Names and units of its inputs.
+        output_units: Names and units of further outputs.
         initial_states: (k,) states where the machine stands still.
-        initial_inputs: (m,) inputs there.
+        initial_inputs: (m,) inputs where the machine stands still.
     """
 
     def __init__(
@@ -46,8 +46,8 @@ class LinearizedDrive:
             for joint, driven in zip(machine.active, machine.is_driven, strict=True)
             if driven
         }
-        self.seen: dict[str, str] = {}
-        self.own, self.u = np.zeros(0), np.zeros(len(self.input_units))
+        self.output_units: dict[str, str] = {}
+        self.initial_states, self.initial_inputs = np.zeros(0), np.zeros(len(self.input_units))
         self.scales, self._vapour_pressure, self._engine_droop = np.zeros(0), 0.0, 0.0
         self._valve_drive: ValveDrive | None = None
         self._input_matrix = np.eye(n)[:, machine.is_driven]
@@ -74,16 +74,16 @@ class LinearizedDrive:
                 for name in list(self.state_units)[first:last]
             }
             self.input_units = {f"voltage_{name}": "V" for name in circuit.spools}
-            self.seen = dict(control.channels) | {
+            self.output_units = dict(control.channels) | {
                 f"{joint}_force": FORCE_UNITS[machine.unit(joint)] for joint in circuit.joints
             }
             self._active_indices = [machine.active.index(joint) for joint in circuit.joints]
-            self.own = control.start_closed(dynamics, q)[: self._state_count]
-            self.u = control.references(np.zeros(1))[0]
+            self.initial_states = control.start_closed(dynamics, q)[: self._state_count]
+            self.initial_inputs = control.references(np.zeros(1))[0]
             self._program = self._build_program(machine)
 
     def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
-        """(k + m,) which states and signals belong to joints that move, or perhaps to no joint."""
+        """(k + m,) whether states and signals belong to moving joints, or to none if shared."""
         assert self._valve_drive is not None
         joints = self._valve_drive.circuit.joints
         moving = {x for x, i in zip(joints, self._active_indices, strict=True) if v_a[i]}
@@ -98,7 +98,7 @@ class LinearizedDrive:
         return mask
 
     def load_bearing_mask(self, forces: Array) -> Any:
-        """(k,) which states are pressures of the chambers that bear forces (n,)."""
+        """(k,) whether states are pressures of the chambers that carry forces (n,)."""
         assert self._valve_drive is not None
         is_load_bearing = np.zeros(len(self.state_units), dtype=bool)
         for i, first in zip(
@@ -108,16 +108,16 @@ class LinearizedDrive:
         return is_load_bearing
 
     def opened_valves(self, v_a: Array, share: float) -> tuple[Array, Array, Array, Array]:
-        """States and signals z with valves open by a share of their stroke, and where they may go.
+        """States and signals z with valves open by a share of their stroke.
 
         Returns:
-            z (k + m,); how it depends on pressures and openings (k + m, r); least and most of
-            these (r,), which keep valves open and pumps within their droop.
+            z (k + m,); its derivatives (k + m, r) by pressures and openings; lower and upper
+            bounds (r,) of these, which keep valves open and pumps within their droop.
         """
         assert self._valve_drive is not None
         hydraulics, names = self._valve_drive.circuit.hydraulics, list(self.state_units)
         supply, k = hydraulics.supply, len(names)
-        z = np.concatenate([self.own, self.u])
+        z = np.concatenate([self.initial_states, self.initial_inputs])
         directions: list[Array] = []
         bounds: list[tuple[float, float]] = []
 
@@ -132,7 +132,7 @@ class LinearizedDrive:
             top = pump.pressure - self._vapour_pressure
             if pump.control == "pressure":
                 free(f"pressure_{name}", top - 0.5 * pump.droop, top - pump.droop, top)
-            elif pump.control == "load-sensing":  # above the loads that are guessed below
+            elif pump.control == "load-sensing":  # above the guessed loads
                 base = 0.3 * supply.pressure + pump.margin - 0.5 * pump.droop
                 free(f"pressure_{name}", base, base - 0.5 * pump.droop, base + 0.5 * pump.droop)
                 line_pressure_indices[name] = names.index(f"pressure_{name}")
@@ -141,12 +141,22 @@ class LinearizedDrive:
             if f"share_{name}" in names:
                 free(f"share_{name}", 0.5, 0.0, 1.0)
         for name in hydraulics.lines:
-            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            free(
+                f"pressure_{name}",
+                self.initial_states[names.index(f"pressure_{name}")],
+                0.0,
+                np.inf,
+            )
         for name in hydraulics.accumulators:
-            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            free(
+                f"pressure_{name}",
+                self.initial_states[names.index(f"pressure_{name}")],
+                0.0,
+                np.inf,
+            )
             if f"oil_{name}" in names:
                 at = names.index(f"oil_{name}")
-                free(f"oil_{name}", self.own[at], -np.inf, np.inf)
+                free(f"oil_{name}", self.initial_states[at], -np.inf, np.inf)
         if "engine" in names:
             free("engine", 1.0 + 0.5 * self._engine_droop, 1.0, 1.0 + self._engine_droop)
         for i, (joint, valve) in enumerate(hydraulics.valves.items()):
@@ -166,7 +176,7 @@ class LinearizedDrive:
                 valve.dead_band + share * (1.0 - valve.dead_band),
             )
             direction = np.zeros(len(z))
-            for name, spool in valve.spools.items():  # two open alike
+            for name, spool in valve.spools.items():  # both spools open equally
                 opening_ratio = (1.0 - spool.dead_band) / (1.0 - dead_band)
                 at = k + self._valve_drive.circuit.spools.index(name)
                 direction[at] = side * opening_ratio * (spool.full - spool.neutral)
@@ -182,7 +192,7 @@ class LinearizedDrive:
 
     @property
     def pressure_offsets(self) -> Array:
-        """(k,) what states are to be added for pressures to count from a vacuum."""
+        """(k,) offsets that make pressure states absolute."""
         return np.array(
             [self._vapour_pressure * name.startswith("pressure_") for name in self.state_units]
         )
@@ -244,7 +254,7 @@ class LinearizedDrive:
     def _friction_forces(
         machine: Machine, circuit_friction: Sequence[Scalar], v_a: Sequence[Scalar]
     ) -> list[Scalar]:
-        """Friction (n,) that seals and brakes add, F_K sign(v), that of joints at rest being 0."""
+        """Circuit friction (n,), F_K sign(v); 0 for joints at rest."""
         out: list[Scalar] = [0.0] * len(v_a)
         forces = JointForces(machine)
         for column, force in zip(forces.circuit_friction_columns, circuit_friction, strict=True):
@@ -256,7 +266,7 @@ class LinearizedDrive:
     def evaluate(
         self, q_a: Array, v_a: Array, states: Array, inputs: Array
     ) -> tuple[Array, Array]:
-        """Forces (n,), rates (k,) and what is seen, and their derivatives by all arguments."""
+        """Forces (n,), rates (k,) and further outputs, and their derivatives by all arguments."""
         n = self._mobility
         if self._valve_drive is None:
             jacobian = np.zeros((n, 2 * n + len(inputs)))

@@ -1,4 +1,4 @@
-"""x' = A x + B u, y = C x + D u: modes, responses, files."""
+"""Linear model x' = A x + B u, y = C x + D u: modes, responses, files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,15 +18,11 @@ from crane.common.samples import Array, as_sample
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
-_FRAMES_PER_SECOND, _SWING_AMPLITUDE = (
-    50,
-    0.05,
-)  # per second; of a stroke, rad and machine's size, as modes are shown
-_MIN_IMAGINARY_SHARE = (
-    1e-3  # share of a pole that is no imaginary part: the root of rounding, and more
-)
-_DAMPING_ROUNDING = 1e-13  # share of the fastest pole that is no damping: rounding
-_INTEGRATOR_ROUNDING = 1e-7  # share of the fastest pole that is none: rounding of a pole at zero
+_FRAMES_PER_SECOND = 50  # of mode animations
+_SWING_AMPLITUDE = 0.05  # of mode animations [share of the range], [coordinate units]
+_MIN_IMAGINARY_SHARE = 1e-3  # least imaginary part of an oscillatory pole, relative to its size
+_DAMPING_ROUNDING = 1e-13  # real part by rounding, as a share of the fastest pole
+_INTEGRATOR_ROUNDING = 1e-7  # size of a pole at zero by rounding, as a share of the fastest pole
 
 
 class Mode(NamedTuple):
@@ -36,8 +32,8 @@ class Mode(NamedTuple):
         pole: The eigenvalue, of a pair that with a positive imaginary part [1/s].
         frequency: |pole| / 2 pi [Hz].
         damping: -Re(pole) / |pole|; 1 of a real stable one, 0 at zero.
-        shape: (nq,) complex, how all joints move, the largest share of its unit being 1.
-        state: (k,) complex, eigenvector in the states of the model.
+        shape: (nq,) complex motion of all joints; the largest in coordinate units is 1.
+        state: (k,) complex eigenvector.
     """
 
     pole: complex
@@ -48,7 +44,7 @@ class Mode(NamedTuple):
 
     @property
     def is_oscillatory(self) -> bool:
-        """Whether it swings, and is no pair of real poles that rounding took apart."""
+        """Whether it oscillates, and is no pair of real poles separated by rounding errors."""
         return self.pole.imag > _MIN_IMAGINARY_SHARE * abs(self.pole)
 
 
@@ -68,10 +64,10 @@ class LinearModel(Result):
         x: (k,) operating point.
         u: (m,).
         y: (p,).
-        rate: (k,) x' there, 0 of an equilibrium.
+        rate: (k,) x' at the operating point, 0 for an equilibrium.
         machine: The machine.
-        configuration: (nq,) of all joints.
-        gamma: (nq, n) d posture / d q_A.
+        configuration: (nq,) configuration of the operating point.
+        gamma: (nq, n) its derivatives by q_A.
     """
 
     A: Array
@@ -91,7 +87,7 @@ class LinearModel(Result):
     gamma: Array
 
     def _one_line(self) -> str:
-        """Its sizes, and where it rings."""
+        """Its sizes, and the frequencies of oscillatory modes."""
         rings = [mode.frequency for mode in self.modes if mode.is_oscillatory]
         ends = dict.fromkeys(f"{frequency:.3g}" for frequency in rings[:1] + rings[-1:])
         words = f", rings at {' to '.join(ends)} Hz" if rings else ""
@@ -102,7 +98,7 @@ class LinearModel(Result):
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
-        """From the slowest to the fastest."""
+        """Modes from the slowest to the fastest."""
         from scipy.linalg import eig
 
         poles, vectors = eig(self.A)
@@ -134,8 +130,7 @@ class LinearModel(Result):
         for frequency in frequencies:
             resolvent = np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B)
             found.append(self.C @ resolvent + self.D)
-        out: Array = np.array(found)
-        return out
+        return np.array(found)
 
     def simulate(self, times: ArrayLike, start: ArrayLike, inputs: ArrayLike) -> Array:
         """Deviations y (N, p) from a start x (k,) under constant inputs u (m,), exactly.
@@ -153,11 +148,10 @@ class LinearModel(Result):
         whole[:k, :k], whole[:k, k:] = self.A, self.B
         first = np.concatenate([start, u])
         rows = [expm(whole * time) @ first for time in np.asarray(times, dtype=np.float64)]
-        out: Array = np.array([self.C @ row[:k] + self.D @ u for row in rows])
-        return out
+        return np.array([self.C @ row[:k] + self.D @ u for row in rows])
 
     def dominant_state(self, mode: Mode) -> str:
-        """The state that a mode moves most: a joint, or where none moves a pressure or spool."""
+        """The state that a mode moves most: a joint, or else a pressure or spool."""
         n = self.gamma.shape[1]
         units = self.machine.closure.units
         if np.abs(mode.shape / units).max() > 0.5:
@@ -194,14 +188,14 @@ class LinearModel(Result):
         return "\n".join(lines)
 
     def mode_animation(self, seconds: float = 3.0, max_modes: int = 8) -> Recording | None:
-        """What rings, one mode after the other in slow motion, as a recording to look at.
+        """Animation of the oscillatory modes in slow motion, one after another, as a recording.
 
         Args:
-            seconds: Of each mode, in which it swings three times.
-            max_modes: Modes, from the slowest.
+            seconds: Duration of each mode, which oscillates three times [s].
+            max_modes: Largest number of modes, from the slowest.
 
         Returns:
-            The recording, whose channel `mode_frequency` says which; None where nothing rings.
+            The recording with the channel `mode_frequency`; None without oscillatory modes.
         """
         machine, n = self.machine, self.gamma.shape[1]
         oscillatory_modes = [mode for mode in self.modes if mode.is_oscillatory][:max_modes]
@@ -240,7 +234,7 @@ class LinearModel(Result):
         )
 
     def to_control(self) -> Any:
-        """The same as python-control's `StateSpace`.
+        """The model as a `StateSpace` of python-control.
 
         Raises:
             InputError: python-control is not installed.

@@ -1,4 +1,4 @@
-"""From a machine to its linear model."""
+"""Linear model of a machine about an operating point."""
 
 import itertools
 import warnings
@@ -13,14 +13,68 @@ from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_samples
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics import Dynamics
+from crane.dynamics.external_forces import ExternalForces
 from crane.formats import load
 from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.simulation.linear.external_force_derivatives import LinearizedExternalForces
 from crane.simulation.linear.linear_drive import LinearizedDrive
 from crane.simulation.linear.linear_model import LinearModel
 from crane.simulation.linear.trim import find_trim
+
+_DIFFERENCE_STEP = 2e-4  # in coordinate units: nine digits remain
+
+
+class LinearizedExternalForces:
+    """External forces of a machine along its active joints at time 0.
+
+    Forces with states (`ExternalForce.state_count`) are left out, with a warning.
+
+    Args:
+        machine: The machine.
+    """
+
+    def __init__(self, machine: Machine):
+        memoryless = [force for force in machine.external_forces if not force.state_count]
+        excluded_names = [force.name for force in machine.external_forces if force.state_count]
+        if excluded_names:
+            warnings.warn(
+                f"{machine.name}: forces that remember their way have no linear model, left out: "
+                f"{', '.join(excluded_names)}",
+                CraneWarning,
+                stacklevel=3,
+            )
+        self._closure, self._has_forces = machine.closure, bool(memoryless)
+        self._forces = ExternalForces(machine, memoryless)
+        units = self._closure.units[self._closure.active]
+        self._steps = (
+            np.concatenate([units, units / self._closure.characteristic_time]) * _DIFFERENCE_STEP
+        )
+
+    def active_forces(self, q_a: Array, v_a: Array) -> Array:
+        """gamma^T J^T w (n,)."""
+        if not self._has_forces:
+            return np.zeros(len(q_a))
+        q = self._closure.solve(q_a)
+        gamma = self._closure.gamma(q)
+        return np.asarray(
+            gamma.T
+            @ self._forces.generalized_forces(0.0, q, gamma @ v_a, np.zeros(0)).generalized_forces
+        )
+
+    def jacobian(self, q_a: Array, v_a: Array) -> Array:
+        """Derivatives (n, 2 n) by q_A and v_A, by differences of fourth order."""
+        n, x = len(q_a), np.concatenate([q_a, v_a])
+        derivatives = np.zeros((n, 2 * n))
+        for i, step in enumerate(self._steps if self._has_forces else ()):
+            displacement = step * np.eye(2 * n)[i]
+
+            def force(steps: int, displacement: Array = displacement) -> Array:
+                displaced = x + steps * displacement
+                return self.active_forces(displaced[:n], displaced[n:])
+
+            derivatives[:, i] = (8 * (force(1) - force(-1)) - (force(2) - force(-2))) / (12 * step)
+        return derivatives
 
 
 def linearize(
@@ -32,24 +86,24 @@ def linearize(
     outputs: Sequence[str] | None = None,
     pressures: Mapping[str, tuple[float, float]] | None = None,
 ) -> LinearModel:
-    """A machine in small motion about an operating point: x' = A x + B u, y = C x + D u.
+    """Linear model of a machine about an operating point: x' = A x + B u, y = C x + D u.
 
-    The operating point is trimmed: forces, or pressures and valve signals, are those at which the
-    velocities stay what they are. Matrices are exact derivatives through the closed loops
-    (`Dynamics.derivatives`), the circuit's by its formulas; those of forces from outside, which
+    The operating point is trimmed: forces, or pressures and valve signals, keep the velocities
+    constant. Matrices are exact derivatives through the closed loops
+    (`Dynamics.derivatives`), the circuit's by its formulas; those of external forces, which
     act as at time 0, by differences. Friction that sticks is that of small
     motions which have begun: at rest its viscous part alone, in motion the side that it is on.
-    What the circuit only counts, such as the oil drawn, is no state.
+    The integrals of a circuit, such as the pumped oil, are no states.
 
     Args:
-        machine: The machine, or what `crane.load` takes.
+        machine: The machine, or an argument of `crane.load`.
         operating_point: Active coordinates [m], [rad], by joint or (n,); home for those that are
             not named.
         velocity: Their velocities [m/s], [rad/s], likewise; at rest if not given.
         drive: "valves" or "forces"; valves if not given where the machine has any.
-        outputs: Names of joints, `JOINT_velocity` of active ones, `tip_x`, `JOINT_force`, and
-            channels of the circuit such as `pressure_JOINT_a`; if not given, the active joints,
-            the tip, and with valves the chambers' pressures.
+        outputs: Names of outputs: joints, `JOINT_velocity` of active ones, `tip_x`,
+            `JOINT_force`, and channels of the circuit such as `pressure_JOINT_a`; if not given,
+            the active joints, the tip, and with valves the pressures of the chambers.
         pressures: Of the chambers A and B [Pa] by joint, of which that of the loaded side is
             changed to what holds the machine; if not given, the other side is at the tank's
             pressure, where its valve would begin to let oil in: the model is that of the valve
@@ -59,9 +113,10 @@ def linearize(
         Matrices with the names of states, inputs and outputs, the operating point, and the modes.
 
     Raises:
-        InputError: Unknown names, a posture beyond the limits, or a drive that is not there.
-        ClosureError: The loops do not close there.
-        SimulationError: The machine cannot be trimmed there.
+        InputError: A name is unknown, the operating point is outside of the limits, or the drive
+            does not exist.
+        ClosureError: The loops do not close at the operating point.
+        SimulationError: The machine cannot be trimmed at the operating point.
     """
     if not isinstance(machine, Machine):
         machine = load(machine)
@@ -132,21 +187,21 @@ def linear_models(
     drive: str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[tuple[dict[str, float], LinearModel]]:
-    """Linear models over postures and numbers of a machine, at rest.
+    """Linear models over configurations and parameters of a machine, at rest.
 
     Args:
         machine: See `linearize`.
-        vary: Values by name of an active joint, or of a number of the machine as
-            `crane.description.parameters` lists them; all combinations are taken.
-        operating_point: Active coordinates [m], [rad] that are the same in all.
+        vary: Values by the name of an active joint or of a parameter, see
+            `crane.description.parameters`; all combinations are computed.
+        operating_point: Active coordinates [m], [rad] that are the same in all models.
         drive: See `linearize`.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
-        For each combination the values and the model, the last name varying fastest.
+        Values and model of each combination; the last name varies fastest.
 
     Raises:
-        InputError: See `linearize`; an unknown name.
+        InputError: As `linearize`, or a name is unknown.
     """
     progress = progress_reporter(progress)
     if not isinstance(machine, Machine):
@@ -162,17 +217,15 @@ def linear_models(
     combinations = list(itertools.product(*(x.tolist() for x in values.values())))
     drift_warnings = []
     for i, row in enumerate(combinations):
-        values_here = dict(zip(values, row, strict=True))
-        changes = {
-            name: value for name, value in values_here.items() if name not in machine.active
-        }
-        joints = {name: value for name, value in values_here.items() if name in machine.active}
+        variation = dict(zip(values, row, strict=True))
+        changes = {name: value for name, value in variation.items() if name not in machine.active}
+        joints = {name: value for name, value in variation.items() if name in machine.active}
         variant = variants.machine(changes) if changes else machine
         with warnings.catch_warnings(record=True) as caught_warnings:
             warnings.simplefilter("always")
             found.append(
                 (
-                    values_here,
+                    variation,
                     linearize(variant, dict(operating_point or {}) | joints, drive=drive),
                 )
             )
@@ -190,11 +243,11 @@ class _OutputRows:
 
     Args:
         machine: The machine.
-        drive: What acts on it.
-        q: (nq,) posture.
+        drive: Its drive.
+        q: (nq,) configuration.
         gamma: (nq, n) dq/dq_A.
         motion: q_A and v_A.
-        drive_values: What the drive does, see `Drive.at`.
+        drive_values: Values and derivatives of the drive, see `LinearizedDrive.evaluate`.
     """
 
     def __init__(
@@ -231,7 +284,7 @@ class _OutputRows:
                 self.default_names.append(f"tip_{axis}")
         values, slopes = drive_values
         if drive.state_units:
-            seen = zip(drive.seen.items(), values[n + k :], slopes[n + k :], strict=True)
+            seen = zip(drive.output_units.items(), values[n + k :], slopes[n + k :], strict=True)
             for (name, unit), value, row in seen:
                 self._rows[name] = row, float(value), unit
             self.default_names += [

@@ -1,4 +1,4 @@
-"""Forces, or pressures and signals, at which a machine goes on as it does."""
+"""Trim: forces, or pressures and valve signals, that keep a machine in steady motion."""
 
 import itertools
 import warnings
@@ -11,29 +11,25 @@ from crane.dynamics import Dynamics
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.linear.linear_drive import LinearizedDrive
 
-_RESIDUAL_TOLERANCE = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
-_FREE_JOINT_TOLERANCE = 1e-6  # the same, of free joints that hang still
+_RESIDUAL_TOLERANCE = 1e-9  # residual [coordinate units per characteristic time^2]
+_FREE_JOINT_TOLERANCE = 1e-6  # the same for free joints in equilibrium
 _MAX_ITERATIONS = 50  # of Newton's method
-_MIN_STEP_SHARE = 1e-3  # share of its step below which it is taken all the same
-_PRESSURE_SCALE, _LENGTH_SCALE, _VOLUME_SCALE, _TIME_SCALE = (
-    1e5,
-    1e-3,
-    1e-6,
-    0.1,
-)  # [Pa], [m], [m3], [s]
+_MIN_STEP_SHARE = 1e-3  # least share of a damped step
+_PRESSURE_SCALE, _LENGTH_SCALE = 1e5, 1e-3  # [Pa], [m]
+_VOLUME_SCALE, _TIME_SCALE = 1e-6, 0.1  # [m3], [s]
 
 
 def find_trim(
     dynamics: Dynamics, drive: LinearizedDrive, q_a: Array, v_a: Array, external_forces: Array
 ) -> tuple[Array, Array]:
-    """The drive's states and inputs at which velocities and states stay.
+    """States and inputs of the drive at which velocities and states are constant.
 
     Args:
-        dynamics: Of the machine.
-        drive: What acts on it.
-        q_a: (n,).
-        v_a: (n,).
-        external_forces: (n,) what forces from outside do along the active joints.
+        dynamics: Dynamics of the machine.
+        drive: The drive.
+        q_a: (n,) active coordinates.
+        v_a: (n,) active velocities.
+        external_forces: (n,) external forces along the active joints.
 
     Raises:
         SimulationError: There are none.
@@ -54,13 +50,13 @@ def find_trim(
         raise SimulationError(
             "the machine cannot be trimmed there: no pressures and signals keep these velocities"
         )
-    return drive.own, forces[machine.is_driven]
+    return drive.initial_states, forces[machine.is_driven]
 
 
 def _check_free_joints(
     dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array, external_forces: Array
 ) -> None:
-    """See that free joints keep their velocities while drives bear their share of forces (n,).
+    """Check that free joints keep their velocities while the drives exert their forces (n,).
 
     Raises:
         SimulationError: One does not.
@@ -82,23 +78,22 @@ def _check_free_joints(
 
 
 class _TrimEquations:
-    """What is left of an equilibrium on valves, over their states and signals z.
+    """Equations of the trim of a machine with valves, for its states and signals z.
 
-    Joints at rest have their valves closed: the pressure of the chamber that bears the load holds
-    the machine for now, whatever leaks, and springs in series bear what their cylinders do. All
-    else has to stay what it is.
+    The valves of joints at rest are closed: the pressure of the loaded chamber holds the machine,
+    leakage is neglected, and series springs carry the forces of their cylinders. All other states
+    have to be constant.
 
     Args:
-        dynamics: Of the machine.
+        dynamics: Dynamics of the machine.
         drive: The circuit.
-        q_a: (n,).
-        v_a: (n,).
+        q_a: (n,) active coordinates.
+        v_a: (n,) active velocities.
         external_forces: See `find_trim`.
-        include_shared: Whether states of no joint, of pumps and lines, have to stay what they are,
-            too.
+        include_shared: Whether the states of pumps and lines also have to be constant.
 
     Attributes:
-        closed_valves: (k + m,) closed valves.
+        start: (k + m,) initial guess with closed valves.
     """
 
     def __init__(
@@ -128,16 +123,16 @@ class _TrimEquations:
         self._equation_rows = np.concatenate(
             [np.arange(n), n + np.flatnonzero(spring | moving[:k])]
         )
-        self._variable_scales = np.concatenate([scales, np.ones(len(drive.u))])
-        # pressures of bars within tenths of a second are as much as such accelerations
+        self._variable_scales = np.concatenate([scales, np.ones(len(drive.initial_inputs))])
+        # a bar within a tenth of a second counts as much as such accelerations
         accelerations = closure.units[closure.active] / closure.characteristic_time**2
         self._equation_scales = np.concatenate([accelerations, scales / _TIME_SCALE])[
             self._equation_rows
         ]
-        self.start = np.concatenate([drive.own, drive.u])
+        self.start = np.concatenate([drive.initial_states, drive.initial_inputs])
 
     def state_rates(self, z: Array) -> Array:
-        """(k,) of the states."""
+        """Rates (k,) of the states."""
         n, k = len(self._q_a), len(self.drive.state_units)
         return self.drive.evaluate(self._q_a, self.v_a, z[:k], z[k:])[0][n : n + k]
 
@@ -158,10 +153,12 @@ class _TrimEquations:
         ] / self._equation_scales[:, None]
 
     def solve_newton(self, z: Array, damped: bool = False) -> Array | None:
-        """The nearest z at which nothing is left, by Newton's method; None if there is none.
+        """The solution z by Newton's method; None if it does not converge.
 
-        Damped, its steps are halved until less is left: over a throttle between two nodes it goes
-        back and forth else, root(x) having its zero half the step ahead.
+        Args:
+            z: Initial guess.
+            damped: Whether steps are halved until the residual decreases. The flow of a throttle,
+                root(x), has its zero at half of a Newton step, which else oscillates.
         """
         z, free = z.copy(), self._free_indices
         for _ in range(_MAX_ITERATIONS):
@@ -185,7 +182,7 @@ class _TrimEquations:
         return None
 
     def _reduces_residual(self, z: Array, residual: Array) -> bool:
-        """Whether less is left at another z."""
+        """Whether the residual is smaller at another z."""
         return bool(np.linalg.norm(self.residual(z)[0]) < np.linalg.norm(residual))
 
     def search_from_opening(self, share: float) -> Array:
@@ -197,13 +194,12 @@ class _TrimEquations:
         def residual(x: Array) -> Array:
             return self.residual(z + directions @ x)[0]
 
-        def slopes(x: Array) -> Array:
-            found: Array = self.residual(z + directions @ x)[1] @ directions
-            return found
+        def derivatives(x: Array) -> Array:
+            return self.residual(z + directions @ x)[1] @ directions
 
         scales = 1.0 / (np.abs(directions) / self._variable_scales[:, None]).max(axis=0)
-        closed_valves = np.zeros(len(lower))
-        solution = least_squares(residual, closed_valves, slopes, (lower, upper), x_scale=scales)
+        start = np.zeros(len(lower))
+        solution = least_squares(residual, start, derivatives, (lower, upper), x_scale=scales)
         return z + directions @ solution.x
 
 

@@ -1,19 +1,19 @@
-"""Gradients of sums over a simulated motion, by going back along it.
+"""Gradients of functionals of a simulated motion, by backward integration of adjoint equations.
 
 With J = sum over instants i and outputs of w_i . y(s_i, c), all numbers c and S = ds/dc,
 
     dJ/dc = sum_i w_i^T (C_i S_i + D_i),    S_(i+1) = Phi_i S_i + Psi_i,
 
-is a sum over i that weights lambda of the state gather on their way back,
+is computed by the adjoints lambda of the state, backwards from the last instant,
 
     lambda_i = Phi_i^T lambda_(i+1) + C_i^T w_i,
     dJ/dc = lambda_0^T S_0 + sum_i (Psi_i^T lambda_(i+1) + D_i^T w_i),
 
-the exact transpose of `follow` on the same steps (Bryson and Ho, Applied Optimal Control, 1975,
-chapter 2; Sandu, On the Properties of Runge-Kutta Discrete Adjoints, 2006). A number of the
-machine takes nothing on this way: B^T mu and D^T w, by all numbers at once, are one pass against
-the order of the formulas. The recorded states are the checkpoints; derivatives are made anew from
-them, one stretch at a time.
+the exact transpose of `variational_integration` on the same steps (Bryson and Ho, Applied Optimal
+Control, 1975, chapter 2; Sandu, On the Properties of Runge-Kutta Discrete Adjoints, 2006). The
+cost does not depend on the number of parameters: B^T mu and D^T w are computed for all constants
+by one reverse pass over the formulas. The recorded states are the checkpoints, from which the
+derivatives are computed segment by segment.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,8 @@ import numpy as np
 
 from crane.closure.constraint_structure import Indices
 from crane.common.samples import Array
-from crane.simulation.sensitivity.forward_derivatives import ForwardDerivatives
+from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives, ReverseDerivatives
 from crane.simulation.sensitivity.rate_formulas import report_long_formulas
-from crane.simulation.sensitivity.reverse_derivatives import ReverseDerivatives
 from crane.simulation.sensitivity.simulated_motion import (
     MAX_REFINEMENTS,
     MotionNodes,
@@ -33,30 +32,31 @@ from crane.simulation.sensitivity.simulated_motion import (
     TransitionJump,
 )
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
-from crane.simulation.sensitivity.variational_equations import (
+from crane.simulation.sensitivity.variational_integration import (
     FOURTH_DIFFERENCE_WEIGHTS,
+    MIN_RELATIVE_CHANGE,
+    STEP_ACCURACY,
     TransposedPairMaps,
     interpolation_errors,
     transposed_pair_maps,
 )
-from crane.simulation.sensitivity.variational_integration import MIN_RELATIVE_CHANGE, STEP_ACCURACY
 
 
 class AdjointIntegrator:
-    """The way back along a motion, stretch by stretch.
+    """Backward integrator of the adjoint equations along a motion, segment by segment.
 
-    Pairs of steps over which A^T lambda or B^T lambda bend too much for the method are taken in
-    parts, as `follow` does where A S + B do: the rule for lambda and the gradient is that for S.
+    Pairs of steps over which A^T lambda or B^T lambda are not smooth are divided, by the rule of
+    `variational_integration` for S.
 
     Args:
         motion: The motion.
-        outputs: Names (k,) of what is observed, see `Rate`.
-        nominal_constants: Numbers of the simulation.
-        changes: By how much they change that do; 0 of others, and of references.
-        accuracy: Error of a step, per size of what it is of.
+        outputs: Names (k,) of the outputs, see `sensitivities`.
+        nominal_constants: Constants of the simulation.
+        changes: Sizes of changes of the constants; 0 for those that do not change, and references.
+        accuracy: Relative error of a step.
 
     Raises:
-        InputError: An output that is not there, or formulas that are too long.
+        InputError: An output is unknown, or the formulas are too long.
     """
 
     def __init__(
@@ -88,14 +88,14 @@ class AdjointIntegrator:
         )
 
     def integrate_backward(self, weights: Array) -> SimulationConstants:
-        """Gradients of K sums over the motion.
+        """Gradients of K functionals of the motion.
 
         Args:
-            weights: (K, N + 1, k) of the outputs.
+            weights: (K, N + 1, k) weights of the outputs.
 
         Returns:
-            By all numbers but references, with a leading axis K each; 0 by those that do not
-            change.
+            Derivatives by all constants except for references, each part with a leading axis K; 0
+            for constants that do not change.
         """
         track, sum_count, moving = self._motion, len(weights), len(self._change_sizes)
         self._gradient = np.zeros((sum_count, moving))
@@ -114,12 +114,12 @@ class AdjointIntegrator:
                     weights[:, segment.first_instant : segment.last_instant + 1], 0, 1
                 ).copy()
                 if len(output_weights) > 1:
-                    output_weights[-1] = 0.0  # it is seen in the next one
+                    output_weights[-1] = 0.0  # it belongs to the next segment
                 adjoint = self._integrate_segment(nodes, adjoint, output_weights, MAX_REFINEMENTS)
         return self._gradient_constants(adjoint)
 
     def _gradient_constants(self, start: Array) -> SimulationConstants:
-        """The gradient in all parts."""
+        """The gradient by parts of the constants."""
         out = SimulationConstants(
             *(np.zeros((len(start), part.shape[-1])) for part in self._nominal_constants)
         )
@@ -132,13 +132,13 @@ class AdjointIntegrator:
     def _integrate_segment(
         self, nodes: MotionNodes, adjoint: Array, output_weights: Array | None, depth: int
     ) -> Array:
-        """Lambda (K, m) where a stretch begins, from that where it ends.
+        """Lambda (K, m) at the start of a segment, from that at its end.
 
         Args:
-            nodes: Of n steps.
-            adjoint: lambda.
-            output_weights: Weights (n + 1, K, k) of outputs; none of parts of a step.
-            depth: How often steps may be taken in parts.
+            nodes: Nodes of n steps.
+            adjoint: lambda at the end.
+            output_weights: Weights (n + 1, K, k) of outputs; None for parts of a step.
+            depth: How often steps may be divided.
         """
         lengths, k = nodes.step_sizes, len(self._forward_derivatives.outputs)
         if output_weights is None:
@@ -195,7 +195,7 @@ class AdjointIntegrator:
         is_smooth: Array,
         depth: int,
     ) -> None:
-        """Lambda (n + 1, K, m) along pairs, with those that are not smooth in parts."""
+        """Lambda (n + 1, K, m) backwards over pairs of steps, divided where not smooth."""
         for i in range(len(is_smooth))[::-1]:
             begin, middle, end = 2 * i, 2 * i + 1, 2 * i + 2
             if is_smooth[i]:
@@ -217,7 +217,7 @@ class AdjointIntegrator:
         step: int,
         depth: int,
     ) -> None:
-        """Lambda where a step begins, which is taken in parts."""
+        """Lambda at the start of a step, which is divided."""
         finer = self._motion.nodes_within_step(nodes, step)
         step_adjoints[step] = (
             self._integrate_segment(finer, step_adjoints[step + 1], None, depth - 1)
@@ -233,7 +233,7 @@ class AdjointIntegrator:
         output_weights: Array,
         is_smooth: Array,
     ) -> Array:
-        """What pairs that are smooth add to the gradient, and what is seen, at nodes (., K, l)."""
+        """Contributions (., K, l) of smooth pairs and of outputs to the gradient, at the nodes."""
         weights = np.zeros((len(nodes.times), output_weights.shape[1], self._weighted_count))
         m, pairs = self._forward_derivatives.state_size, 2 * np.arange(len(is_smooth))[is_smooth]
         for of, end in ((transposed_maps.both, pairs + 2), (transposed_maps.first, pairs + 1)):
@@ -257,7 +257,7 @@ class AdjointIntegrator:
     def _gradients_at_nodes(
         self, nodes: MotionNodes, node_indices: Indices, weights: Array
     ) -> Array:
-        """See `ReverseDerivatives.gradients`, at some of the nodes."""
+        """See `ReverseDerivatives.against`, at some of the nodes."""
         numbers = self._motion.constants_at(self._nominal_constants, nodes)
         numbers = numbers._replace(references=numbers.references[node_indices])
         return self._reverse_derivatives.gradients(
@@ -265,7 +265,7 @@ class AdjointIntegrator:
         )
 
     def _update_scales(self, step_adjoints: Array, contributions: Array) -> None:
-        """Remember how large lambda and the gradient get; see `_needs_refinement`."""
+        """Update the largest values of lambda and the gradient; see `_needs_refinement`."""
         of_lambda, of_total = self._largest_values
         largest = self._motion.largest_states
         np.maximum(of_lambda, np.abs(step_adjoints).max(axis=0), out=of_lambda)
@@ -278,12 +278,12 @@ class AdjointIntegrator:
     def _needs_refinement(
         self, nodes: MotionNodes, interpolation_errors: Array, adjoints: Array
     ) -> Array:
-        """Over which pairs of steps A^T lambda or B^T lambda bend too much.
+        """Whether A^T lambda or B^T lambda are not smooth over pairs of steps.
 
         Args:
-            nodes: Of the stretch.
-            interpolation_errors: Those of A (n, m, m).
-            adjoints: lambda (n, K, m) behind each.
+            nodes: Nodes of the segment.
+            interpolation_errors: Interpolation errors of A (n, m, m).
+            adjoints: lambda (n, K, m) after each pair.
         """
         count, several, m = adjoints.shape
         weights = np.zeros((count, several, self._weighted_count))
@@ -303,7 +303,7 @@ class AdjointIntegrator:
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:
-        """Adjoint before joints start or stop, from the adjoint after it."""
+        """Lambda before joints start or stop, from that behind; see `SimulatedMotion.leap`."""
         track, nodes = self._motion, self._motion.nodes_at_transition(jump.transition)
         by_state, leap = track.sensitivity_jump(
             self._forward_derivatives, self._nominal_constants, jump
@@ -312,5 +312,4 @@ class AdjointIntegrator:
         weights = np.zeros((1, len(adjoint), self._weighted_count))
         weights[0, :, -1] = -(adjoint @ leap)
         self._gradient += self._gradients_at_nodes(nodes, np.array([1]), weights)[0]
-        out: Array = adjoint + np.outer(weights[0, :, -1], by_state)
-        return out
+        return adjoint + np.outer(weights[0, :, -1], by_state)

@@ -1,4 +1,4 @@
-"""How a number that is made of a whole motion depends on all numbers of a machine."""
+"""Gradient of a functional of a motion by the parameters of a machine."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -17,12 +17,13 @@ from crane.control import Controller, ValveCommand
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.machine import Machine
 from crane.recordings.recording import Recording
+from crane.simulation.recorded_run import read_simulation
 from crane.simulation.sensitivity.adjoint_integration import AdjointIntegrator
-from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
+from crane.simulation.sensitivity.motion_sensitivities import SensitivityProblem
 from crane.simulation.sensitivity.simulated_motion import SimulatedMotion
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
-from crane.simulation.simulated_readings import read_simulation
-from crane.simulation.simulation_run import Force, Progress
+from crane.simulation.simulation_run import Progress
+from crane.simulation.simulation_setup import Force
 
 Functional = Callable[[Array, Array], tuple[ArrayLike, ArrayLike]]
 """Times (N + 1,), outputs (N + 1, k) -> J, dJ/dy (N + 1, k); of several, with an axis first."""
@@ -30,14 +31,14 @@ Functional = Callable[[Array, Array], tuple[ArrayLike, ArrayLike]]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gradient(OneLineRepr):
-    """A motion, a number J made of it, and the derivatives of J by numbers of the machine.
+    """A motion, a functional J of it, and the gradient of J by parameters of the machine.
 
     Attributes:
         recording: The motion.
-        outputs: Names (k,) of what is observed.
-        output_values: (N + 1, k) these, SI units.
-        parameters: Names (p,) of the numbers.
-        values: (p,) of these.
+        outputs: Names (k,) of the outputs.
+        output_values: (N + 1, k) values of the outputs, SI units.
+        parameters: Names (p,) of the parameters.
+        values: (p,) values of the parameters.
         functional_value: J; (K,) of several.
         derivatives: (p,) dJ/dp, SI units; (K, p) of several.
     """
@@ -51,24 +52,23 @@ class Gradient(OneLineRepr):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Of what, by how much."""
+        """Outputs and number of parameters."""
         return f"Gradient of {', '.join(self.outputs)} by {len(self.parameters)} numbers"
 
     def derivative(self, parameter: str) -> Array:
-        """DJ / d number; (K,) of several.
+        """Derivative of J by a parameter; (K,) of several.
 
         Raises:
-            InputError: There is no such number.
+            InputError: The parameter is unknown.
         """
         if parameter not in self.parameters:
             raise InputError(
                 f"'{parameter}' is not among them, {suggest_names(self.parameters, parameter)}"
             )
-        found: Array = self.derivatives[..., self.parameters.index(parameter)]
-        return found
+        return self.derivatives[..., self.parameters.index(parameter)]
 
     def to_text(self, max_rows: int = 20) -> str:
-        """A table, Markdown: what matters most, by what a hundredth of each number does to J."""
+        """A table in Markdown: the parameters with the largest effects of a change by 1 % on J."""
         slopes, total = np.atleast_2d(self.derivatives), np.atleast_1d(self.functional_value)
         effects = np.abs(slopes * 0.01 * self.values)
         order = np.argsort(-effects.max(axis=0), kind="stable")[:max_rows].tolist()
@@ -98,20 +98,20 @@ def gradient(
     tolerance: float | None = None,
     progress: Progress | None = None,
 ) -> Gradient:
-    """Simulate a machine, with the exact derivatives of a sum over its motion by many numbers.
+    """Simulate a machine, with the exact gradient of a functional of its motion.
 
-    Of J = sum over instants of w_i . y_i, or of any J(y) with dJ/dy_i = w_i, with the slopes that
+    For J = sum over instants of w_i . y_i, or of any J(y) with dJ/dy_i = w_i, with the slopes that
     `sensitivities` gives as S,
 
         dJ/dp = sum_i w_i . (dy_i/dp),
 
-    without these: a way back along the motion gathers what all numbers of the simulation do to J,
-    at a cost that does not grow with how many are asked for; see
-    `crane.simulation.sensitivity.adjoint_integration`. What a number of the machine does to those
-    of the simulation is found beforehand, for each by itself.
+    is computed without S, by integrating the adjoint equations backward along the motion. The cost
+    does not depend on the number of parameters; see
+    `crane.simulation.sensitivity.adjoint_integration`. The derivatives of the constants of the
+    simulation by each parameter are computed beforehand.
 
     Args:
-        machine: The machine, or what `crane.load` takes.
+        machine: The machine, or an argument of `crane.load`.
         controller: See `sensitivities`.
         initial: See `simulate`.
         duration: See `simulate`.
@@ -119,15 +119,14 @@ def gradient(
         functional: J: weights w (N + 1, k) of the outputs at N + 1 instants; or a function of
             their times (N + 1,) and of the outputs (N + 1, k) that gives J and w. Several at once
             have an axis more, (K,) and (K, N + 1, k).
-        parameters: Numbers, see `sensitivities`; all of the machine that change something if not
-            given.
+        parameters: Parameters, see `sensitivities`; by default all that have an effect.
         outputs: See `sensitivities`.
         method: See `simulate`.
         tolerance: See `simulate`.
         progress: See `simulate`.
 
     Raises:
-        InputError: As `sensitivities`, or weights of another shape.
+        InputError: As `sensitivities`, or weights have a wrong shape.
         SimulationError: As `sensitivities`.
     """
     progress = progress_reporter(progress)
@@ -163,7 +162,7 @@ def gradient(
     observed = _output_values(track.chart.machine, recording, parts, problem.outputs)
     total, weights = _functional_and_weights(functional, recording.time, observed)
     gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
-    # references are the controller's, which none of these changes
+    # no parameter changes the references of the controller
     derivatives = sum(
         (
             getattr(gradients, part)
@@ -201,10 +200,10 @@ def _largest_changes(
 def _functional_and_weights(
     functional: Functional | ArrayLike, time: Array, output_values: Array
 ) -> tuple[Array, Array]:
-    """J and dJ/dy (N + 1, k), or several.
+    """J and dJ/dy (N + 1, k); of several functionals with a leading axis.
 
     Raises:
-        InputError: They are of another shape, or not finite.
+        InputError: They have a wrong shape, or are not finite.
     """
     if callable(functional):
         total, weights = (np.asarray(x, dtype=np.float64) for x in functional(time, output_values))
@@ -228,7 +227,7 @@ def _functional_and_weights(
 def _output_values(
     machine: Machine, recording: Recording, parts: LayoutView, outputs: Sequence[str]
 ) -> Array:
-    """Outputs (N + 1, k), those of passive joints' velocities among them."""
+    """Values (N + 1, k) of the outputs, which may be velocities of passive joints."""
     columns, found = recording.columns(), []
     for name in outputs:
         joint = name.removesuffix(VELOCITY_SUFFIX)

@@ -1,19 +1,21 @@
-"""How a simulated motion depends on numbers of the machine and on its start."""
+"""Sensitivities of a simulated motion by parameters of the machine."""
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import LayoutView
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.control import Controller, ValveCommand
+from crane.control import Controller, TracedController, ValveCommand, ValveDrive
 from crane.description.sensors import (
     FORCE_SUFFIX,
     FORCE_UNITS,
@@ -21,15 +23,83 @@ from crane.description.sensors import (
     VELOCITY_SUFFIX,
     VELOCITY_UNITS,
 )
+from crane.dynamics import Dynamics
+from crane.formats import load
 from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table
-from crane.simulation.sensitivity.parameter_directions import START_PREFIX
-from crane.simulation.sensitivity.sensitivity_problem import SensitivityProblem
-from crane.simulation.sensitivity.simulation_constants import SimulationConstants
+from crane.simulation.recorded_run import record_run
+from crane.simulation.sensitivity.rate_formulas import observed_frames
+from crane.simulation.sensitivity.simulated_motion import SimulationProblem
+from crane.simulation.sensitivity.simulation_constants import (
+    START_PREFIX,
+    ParameterDirections,
+    SimulationConstants,
+)
 from crane.simulation.sensitivity.variational_integration import integrate_sensitivities
-from crane.simulation.simulation_run import Force, Progress
+from crane.simulation.simulation_run import Progress
+from crane.simulation.simulation_setup import (
+    Force,
+    count_steps,
+    initial_motion,
+    resolve_controller,
+)
+
+
+class SensitivityProblem(NamedTuple):
+    """A simulation with its outputs and parameters.
+
+    Attributes:
+        simulation: The simulation.
+        outputs: Names of the outputs.
+        directions: Constants and their derivatives by parameters.
+    """
+
+    simulation: SimulationProblem
+    outputs: tuple[str, ...]
+    directions: ParameterDirections
+
+    @classmethod
+    def from_arguments(
+        cls,
+        machine: Machine | str | Path,
+        controller: Controller | ValveCommand | Force | None,
+        initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
+        duration: float | None,
+        step: float,
+        outputs: Sequence[str] | None,
+        method: str | None,
+        tolerance: float | None,
+    ) -> "SensitivityProblem":
+        """The problem from the arguments of `sensitivities`; see there."""
+        if not isinstance(machine, Machine):
+            machine = load(machine)
+        control = resolve_controller(controller, machine)
+        count = count_steps(control, duration, step)
+        start = initial_motion(machine, initial, control)
+        is_sampled = isinstance(control, ValveDrive) and control.period
+        if is_sampled or not isinstance(control, TracedController):
+            raise InputError(
+                "a controller in Python has no formulas, write it as a crane.control.ControlLaw"
+            )
+        dynamics = Dynamics(machine)
+        names = tuple(_default_outputs(machine) if outputs is None else outputs)
+        links = [link for link, _ in observed_frames(machine, names)]
+        motion = SimulationProblem(dynamics, control, start, count, step, method, tolerance)
+        return cls(motion, names, ParameterDirections(dynamics, control, start, links))
+
+    def record_motion(self, time: Array, parts: LayoutView) -> Recording:
+        """The recording of the motion, from its rows; see `integrate`."""
+        return record_run(
+            self.simulation.dynamics.machine, self.simulation.control, time, parts, ""
+        )
+
+
+def _default_outputs(machine: Machine) -> list[str]:
+    joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
+    return [*machine.active, *(f"pressure_{joint}_{side}" for joint in joints for side in "ab")]
+
 
 ZERO_TOLERANCE = 1e-9  # of an output, in the unit that it is read in
 
@@ -40,7 +110,7 @@ class Sensitivities(Result):
 
     Attributes:
         recording: The motion.
-        outputs: Names (k,) of what is observed.
+        outputs: Names (k,) of the outputs.
         parameters: Names (p,) of the numbers.
         values: (p,) of these.
         derivatives: (N, k, p) derivatives of the outputs, SI units.
@@ -53,11 +123,11 @@ class Sensitivities(Result):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Of what, by what."""
+        """Outputs and parameters."""
         return f"Sensitivities of {', '.join(self.outputs)} by {', '.join(self.parameters)}"
 
     def derivative(self, output: str, parameter: str) -> Array:
-        """(N,) d output / d number over time.
+        """Derivative (N,) of an output by a parameter over time.
 
         Raises:
             InputError: There is no such output or number.
@@ -72,7 +142,7 @@ class Sensitivities(Result):
 
     @property
     def typical_changes(self) -> Array:
-        """(p,) small changes of the numbers: a hundredth, or a thousandth [SI] of starts and 0."""
+        """(p,) small changes: 1 % of parameters; 0.001 [SI] of zeros and initial values."""
         is_parameter = [not name.startswith(START_PREFIX) for name in self.parameters]
         steps: Array = np.where(
             is_parameter & (self.values != 0), 0.01 * np.abs(self.values), 1e-3
@@ -92,7 +162,7 @@ class Sensitivities(Result):
         return ""
 
     def to_text(self) -> str:
-        """A table, Markdown: what a small change of each number does to each output."""
+        """A table in Markdown: effects of a small change of each parameter on each output."""
         effects = self.derivatives * self.typical_changes
         units = [
             display_unit(self.unit(output), float(np.abs(effects[:, k]).max()))
@@ -111,7 +181,7 @@ class Sensitivities(Result):
         return "\n".join([*lines, "", "Root mean square of the change over the motion."])
 
     def to_csv(self, path: str | Path) -> None:
-        """Write all derivatives over time, a column "OUTPUT by NUMBER" each.
+        """Write all derivatives over time to a CSV file, in columns "OUTPUT by PARAMETER".
 
         Raises:
             OutputError: It cannot be written.
@@ -137,29 +207,29 @@ def sensitivities(
     tolerance: float | None = None,
     progress: Progress | None = None,
 ) -> Sensitivities:
-    """Simulate a machine, with the exact derivatives of its motion by numbers.
+    """Simulate a machine, with the exact derivatives of its motion by parameters.
 
     With the minimal state s = (q_A, v_A, controller), s' = r(s, t, p), and S = ds/dp,
 
         S' = dr/ds S + dr/dp,    S(0) = ds(0)/dp,
 
-    between the instants at which a joint starts or stops, at which S jumps by (r - r_+) dt/dp; dr
-    is differentiated operation by operation through the closed loops. The equations are solved
-    along the states of the simulation, by Lobatto's method IIIC, extrapolated to order 5, over its
-    recorded steps, which are taken in up to 4,096 parts where something jumps.
+    between stick-slip transitions, at which S jumps by (r - r_+) dt/dp. The rate r is
+    differentiated operation by operation through the closed loops. The equations are solved along
+    the states of the simulation by the method of Lobatto IIIC, extrapolated to order 5, over the
+    recorded steps; these are divided into up to 4,096 parts where the rate is not smooth.
 
     Args:
-        machine: The machine, or what `crane.load` takes.
-        controller: See `simulate`; it stays the same where the machine changes, as do starting
-            coordinates.
+        machine: The machine, or an argument of `crane.load`.
+        controller: See `simulate`; controller and initial coordinates do not depend on the
+            parameters of the machine.
         initial: See `simulate`.
         duration: See `simulate`.
         step: See `simulate`.
-        parameters: Numbers of the machine as `crane.description.parameters` lists them, such as
+        parameters: Parameters of the machine as `crane.description.parameters` lists them, such as
             "payload.mass" or "oil.bulk_modulus", and `start.JOINT`, `start.JOINT_velocity`
             of active joints.
-        outputs: Names of joints, `JOINT_velocity`, `JOINT_force` of active ones, channels of the
-            circuit such as `pressure_JOINT_a`, "kinetic", "potential", `tip_x`,
+        outputs: Names of outputs: joints, `JOINT_velocity`, `JOINT_force` of active ones,
+            channels of the circuit such as `pressure_JOINT_a`, "kinetic", "potential", `tip_x`,
             `inclination_LINK` and `inclination_LINK_velocity`. If not given, the active joints,
             and with valves the chambers' pressures.
         method: See `simulate`.

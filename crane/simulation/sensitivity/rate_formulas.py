@@ -1,4 +1,4 @@
-"""The rate of a simulated machine as formulas of its state and of all its numbers."""
+"""State rate of a simulated machine as formulas of its state and of all its constants."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,31 +22,30 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
-from crane.dynamics.external_forces import reference_counts as counts_of
+from crane.dynamics.external_forces import reference_counts
 from crane.machine import Machine
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import (
+    AT_REST_SUFFIX,
     MachineFormulas,
     controller_formula_key,
     machine_program,
     reference_count,
     trace_machine,
 )  # fmt: skip
-from crane.simulation.integration.state_layouts import state_layout
 from crane.simulation.sensitivity.simulation_constants import FRAME_SIZE, SimulationConstants
-
-_AT_REST_SUFFIX = "_rest"
 
 
 @dataclass(frozen=True)
 class DifferentiatedFormulas:
-    """What is differentiated, on one tape.
+    """Formulas that are differentiated, on one tape.
 
     Attributes:
-        tape: The tape; its arguments are geometry, numbers, settings, frames, references, state.
+        tape: The tape; its arguments are geometry, constants of the dynamics, settings, frames,
+            references, state.
         machine: The machine at the state.
-        rate: (m,) of the minimal state.
-        outputs: What is observed, with a factor of its derivative each.
+        rate: (m,) rate of the minimal state.
+        outputs: Outputs, each with a factor of its derivative.
         transition_margin: See `StickSlipAccelerations.transition_margin`.
     """
 
@@ -58,31 +57,31 @@ class DifferentiatedFormulas:
 
     @property
     def all_values(self) -> list[Scalar]:
-        """Rate, outputs, margin, that derivatives are taken of."""
+        """Rate, outputs and transition margin, which are differentiated."""
         return [*self.rate, *(value for value, _ in self.outputs), self.transition_margin]
 
 
 class RateProgram:
-    """A machine's rate in machine code, and derivatives that a kind of it adds.
+    """Base class of compiled derivatives of the state rate of a machine.
 
-    A kind writes `_add_derivatives`, which adds its formulas and routines to what is at rest or
-    not.
+    A subclass implements `_add_derivatives`, which adds its formulas and routines, with and
+    without joints at rest.
 
     Args:
-        chart: The machine, in its own coordinates.
+        chart: The machine in the coordinates of the user.
         control: Its controller.
-        controller_state_count: Number of all the controller's states.
-        stiff_state_count: Number of those that act back, the first.
-        outputs: What is observed: names, see `sensitivities`.
-        variable_constants: Which numbers change in some direction.
+        controller_state_count: Number of all states of the controller.
+        stiff_state_count: Number of the first ones, on which the rates depend.
+        outputs: Names of the outputs, see `sensitivities`.
+        variable_constants: Nonzero for constants that change.
 
     Attributes:
         state_size: Length of the minimal state.
-        outputs: What is observed.
+        outputs: Names of the outputs.
 
     Raises:
-        TooLongError: It would take too long to compile.
-        InputError: An output that is not there.
+        FormulaTooLongError: The formulas are too long to be compiled.
+        InputError: An output is unknown.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class RateProgram:
         )
         self._controller_columns = reference_count(control)
         self._reference_columns = self._controller_columns + sum(
-            counts_of(machine.external_forces)
+            reference_counts(machine.external_forces)
         )
         self._frames = observed_frames(machine, outputs)
         self._folded_constants = (
@@ -118,7 +117,7 @@ class RateProgram:
                 variable_constants.dynamics_constants != 0, np.nan, chart.dynamics.constant_pattern
             ),
         )
-        # what a circuit has not is 0 among its settings, and no part of the formulas
+        # zeros among the settings are features that a circuit does not have
         self._folded_settings = np.where(
             variable_constants.settings != 0, np.nan, control.settings
         )
@@ -157,14 +156,14 @@ class RateProgram:
         """The rate (m,) of the minimal state.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see
+            constants: Constants of the simulation, with stick-slip modes (see
                 `Dynamics.set_stick_slip_modes`) and one row of references.
-            state: As it is integrated.
-            has_joints_at_rest: Whether some joint is at rest.
+            state: The integrated state.
+            has_joints_at_rest: Whether a joint is at rest.
         """
         out = np.empty(self.state_size)
         self._program.call(
-            "rate" + _AT_REST_SUFFIX * has_joints_at_rest,
+            "rate" + AT_REST_SUFFIX * has_joints_at_rest,
             constants.geometry,
             constants.dynamics_constants,
             constants.settings,
@@ -176,7 +175,7 @@ class RateProgram:
         return out
 
     def _call(self, routine: str, has_joints_at_rest: bool, *arguments: "int | Array") -> None:
-        self._program.call(routine + _AT_REST_SUFFIX * has_joints_at_rest, *arguments)
+        self._program.call(routine + AT_REST_SUFFIX * has_joints_at_rest, *arguments)
 
     def _add_derivatives(
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
@@ -184,7 +183,7 @@ class RateProgram:
         raise NotImplementedError
 
     def _build(self, program: Program) -> None:
-        for added, rest in (("", False), (_AT_REST_SUFFIX, True)):
+        for added, rest in (("", False), (AT_REST_SUFFIX, True)):
             if rest and not self._chart.stick_slip.columns:
                 continue
             rated = self._trace_formulas(rest)
@@ -232,18 +231,18 @@ class RateProgram:
         tau: Sequence[Scalar],
         channel_formulas: Sequence[Scalar],
     ) -> tuple[Scalar, Scalar]:
-        """What is observed and a factor of its derivative; names as in `sensitivities`."""
-        user_machine, control, sweep = (
+        """An output and a factor of its derivative; for names see `sensitivities`."""
+        user_machine, control, dynamics = (
             self._chart.machine,
             self._control,
             machine.dynamics_formulas,
         )
         columns = {joint: i for i, joint in enumerate(user_machine.joints)}
         if name in columns:
-            return sweep.q[columns[name]], 1.0
+            return dynamics.q[columns[name]], 1.0
         joint = name.removesuffix(VELOCITY_SUFFIX)
         if joint in columns:
-            return sweep.joint_velocities[columns[joint] + 1], 1.0
+            return dynamics.joint_velocities[columns[joint] + 1], 1.0
         joint = name.removesuffix(FORCE_SUFFIX)
         if joint in user_machine.active:
             return tau[user_machine.active.index(joint)], 1.0
@@ -252,7 +251,7 @@ class RateProgram:
             if name in channels:
                 return channel_formulas[channels.index(name)], 1.0
         if name in ("kinetic", "potential"):
-            return getattr(sweep, name), 1.0
+            return getattr(dynamics, name), 1.0
         links = [link for link, _ in self._frames]
         if (
             not name.startswith((INCLINATION_PREFIX, "tip_"))
@@ -269,10 +268,10 @@ class RateProgram:
 
 @contextmanager
 def report_long_formulas(machine: Machine) -> Iterator[None]:
-    """Say in one line that formulas are too long.
+    """Report formulas that are too long.
 
     Raises:
-        InputError: They are.
+        InputError: The formulas are too long.
     """
     try:
         yield
@@ -285,7 +284,7 @@ def report_long_formulas(machine: Machine) -> Iterator[None]:
 def _frame_output(
     name: str, machine: MachineFormulas, body: int, frame_constants: Vector
 ) -> tuple[Scalar, Scalar]:
-    """Position of the tip, or inclination of a link's x axis and its rate."""
+    """Position of the tip, or inclination of the x axis of a link and its rate."""
     dynamics_formulas = machine.dynamics_formulas
     kinematics = dynamics_formulas.kinematics
     if not name.startswith(INCLINATION_PREFIX):
@@ -312,7 +311,7 @@ def _frame_output(
 
 
 def observed_frame(machine: Machine, name: str) -> str:
-    """The link whose place or inclination is observed."""
+    """The link of an output that is a position or inclination."""
     inclined = name.startswith(INCLINATION_PREFIX)
     return (
         name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
@@ -322,10 +321,10 @@ def observed_frame(machine: Machine, name: str) -> str:
 
 
 def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str, int]]:
-    """Links whose place or inclination is observed, and their bodies in the geometry.
+    """Links whose position or inclination is an output, and their bodies.
 
     Raises:
-        InputError: An output that is not there.
+        InputError: An output is unknown.
     """
     found: dict[str, int] = {}
     tips = {f"tip_{axis}" for axis in "xyz"} if machine.tip is not None else set()
@@ -339,6 +338,6 @@ def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str,
 
 
 def operation_index(argument: Scalar) -> int:
-    """Of a number that was loaded."""
+    """Index of the operation that loads a value."""
     assert isinstance(argument, SymbolicExpression)
     return argument.index

@@ -1,4 +1,4 @@
-"""A recorded motion, and where along it the variational equations are looked at."""
+"""A simulated motion, and the nodes of its variational equations."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,29 +11,28 @@ from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
-from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state_layouts import row_layout
+from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.stick_slip_modes import StickSlipTransition
-from crane.simulation.sensitivity.forward_derivatives import ForwardDerivatives
+from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
 from crane.simulation.simulation_run import integrate, integrator_factory
 
-_STEPS_PER_SEGMENT = 400  # steps at once
-REFINEMENT_FACTOR, MAX_REFINEMENTS = 16, 3  # parts of a step that is too rough, how often
-_TIME_TOLERANCE = 1e-9  # of a step, between times that are one
-_MAX_CHECKED_SAMPLES = 500  # postures that are asked for a dead centre
-_EVENT_DIFFERENCE_STEP = 1e-6  # of a step, over which references change at an event
+_STEPS_PER_SEGMENT = 400  # steps that are processed together
+REFINEMENT_FACTOR, MAX_REFINEMENTS = 16, 3  # parts of a divided step, depth of divisions
+_TIME_TOLERANCE = 1e-9  # share of a step: difference of equal times
+_MAX_CHECKED_SAMPLES = 500  # configurations that are checked for dead centres
+_EVENT_DIFFERENCE_STEP = 1e-6  # share of a step: interval of the rate of references at an event
 
 
 class SimulationProblem(NamedTuple):
-    """A simulation to be.
+    """Definition of a simulation.
 
     Attributes:
-        dynamics: The machine.
+        dynamics: Dynamics of the machine.
         control: Its controller.
-        initial: q_A and v_A at first.
-        step_count: How many.
-        step: [s] between instants.
+        initial: Initial q_A and v_A.
+        step_count: Number of output intervals.
+        step: Output interval [s].
         method: See `simulate`.
         tolerance: See `simulate`.
     """
@@ -48,13 +47,13 @@ class SimulationProblem(NamedTuple):
 
 
 class MotionNodes(NamedTuple):
-    """Where a stretch of n steps is looked at: their ends and their middles.
+    """Nodes of a segment of n steps: their ends and their middles.
 
     Attributes:
-        times: (2 n + 1,) [s].
-        states: (2 n + 1, .).
-        previous_indices: (2 n + 1,) which of the recorded instants and middles is the last one.
-        interpolation_shares: (2 n + 1,) of the way to the next one.
+        times: (2 n + 1,) times [s].
+        states: (2 n + 1, .) states.
+        previous_indices: (2 n + 1,) index of the last recorded instant or middle before.
+        interpolation_shares: (2 n + 1,) share of the interval to the next one.
     """
 
     times: Array
@@ -64,26 +63,25 @@ class MotionNodes(NamedTuple):
 
     @property
     def step_sizes(self) -> Array:
-        """(n,) of the steps [s]."""
-        lengths: Array = self.times[2::2] - self.times[:-2:2]
-        return lengths
+        """(n,) step sizes [s]."""
+        return self.times[2::2] - self.times[:-2:2]
 
     def interpolate(self, values: Array) -> Array:
-        """Values (..., 2 n + 1, c) at the nodes of those (..., 2 N + 1, c) that are recorded."""
+        """Values (..., 2 n + 1, c) at the nodes, from recorded values (..., 2 N + 1, c)."""
         behind = np.minimum(self.previous_indices + 1, values.shape[-2] - 1)
         share, one = self.interpolation_shares[:, None], values[..., self.previous_indices, :]
         return np.ascontiguousarray((1.0 - share) * one + share * values[..., behind, :])
 
 
 class RecordedSegment(NamedTuple):
-    """Recorded steps between two instants; none from an instant to itself, where things switch.
+    """Recorded steps between two instants; without steps before a transition.
 
-    What is observed at an instant is so in the last of the stretches that have it.
+    The outputs at an instant are those of the last segment that has it.
 
     Attributes:
-        mode: Behind which of the switches.
-        first_instant: Instant.
-        last_instant: Instant.
+        mode: Index of the last transition before.
+        first_instant: Index of the first instant.
+        last_instant: Index of the last instant.
     """
 
     mode: int
@@ -92,11 +90,11 @@ class RecordedSegment(NamedTuple):
 
 
 class ResimulatedSegment(NamedTuple):
-    """A part of a step, which is simulated anew.
+    """A part of a step, which is simulated again.
 
     Attributes:
-        mode: Behind which of the switches.
-        state: At the beginning.
+        mode: Index of the last transition before.
+        state: State at the start.
         start_time: [s].
         end_time: [s].
         end_state: State at the end.
@@ -110,11 +108,11 @@ class ResimulatedSegment(NamedTuple):
 
 
 class TransitionJump(NamedTuple):
-    """An instant at which joints start or stop.
+    """The jump of the sensitivities at a stick-slip transition.
 
     Attributes:
-        mode: Behind which of the switches, before it.
-        transition: What happens.
+        mode: Index of the transition before.
+        transition: The transition.
     """
 
     mode: int
@@ -122,29 +120,29 @@ class TransitionJump(NamedTuple):
 
 
 class SimulatedMotion:
-    """A motion simulated with the middles of its steps, which are nodes like their ends.
+    """A simulated motion with states at the ends and middles of its steps.
 
     Args:
-        motion: What is simulated.
+        motion: The simulation.
         progress: See `simulate`.
 
     Attributes:
-        chart: The machine.
+        chart: The machine in a chart.
         control: Its controller.
-        controller_state_count: Number of the controller's states.
-        stiff_state_count: Number of those that act back, the first.
-        time: (2 N + 1,) of instants and the middles between them [s].
-        rows: (2 N + 1, .) there, see `integrate`.
-        layout: Of a row.
-        notes: What is to be said of the motion.
-        largest_states: (m,) of the minimal state, at least what a machine moves by; 1 of what
-            stays 0.
-        transitions: What started and stopped, the start first.
-        has_joints_at_rest: Whether some joint is at rest.
+        controller_state_count: Number of states of the controller.
+        stiff_state_count: Number of the first ones, on which the rates depend.
+        time: (2 N + 1,) instants and the middles between them [s].
+        rows: (2 N + 1, .) rows at these times, see `integrate`.
+        layout: Layout of a row.
+        notes: Notes for the user about the motion.
+        largest_states: (m,) largest values of the minimal state, at least in coordinate units; 1
+            for states that are always 0.
+        transitions: Stick-slip transitions, with the start as the first.
+        has_joints_at_rest: Whether a joint is at rest.
 
     Raises:
-        InputError: A machine that has no formulas, or floats.
-        SimulationError: It comes to a dead centre; else as `simulate`.
+        InputError: The machine has no formulas or a floating base.
+        SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
 
     def __init__(self, motion: SimulationProblem, progress: Callable[[float], None] | None):
@@ -180,7 +178,7 @@ class SimulatedMotion:
         time, parts, self.notes = run.time, run.rows, run.notes
         self.time, self.controller_state_count, self._step, self.has_joints_at_rest = (
             time,
-            parts.own.shape[1],
+            parts.controller.shape[1],
             step,
             False,
         )
@@ -197,22 +195,24 @@ class SimulatedMotion:
             dynamics, control, self.controller_state_count, motion.method, motion.tolerance
         )
         self._integrator = make(self.chart)
-        self.switches: list[StickSlipTransition] = self.chart.stick_slip.transitions
-        self.chart.stick_slip.transitions = None  # parts that are simulated anew are no news
-        seen, closure = self.chart.user_columns, machine.closure
-        minimal = np.hstack([parts.q[:, seen], parts.v_a, parts.own[:, : self.stiff_state_count]])
+        self.transitions: list[StickSlipTransition] = self.chart.stick_slip.transitions
+        self.chart.stick_slip.transitions = None  # repeated parts are not recorded
+        columns, closure = self.chart.user_columns, machine.closure
+        minimal = np.hstack(
+            [parts.q[:, columns], parts.v_a, parts.controller[:, : self.stiff_state_count]]
+        )
         units = np.concatenate(
-            [closure.units[seen], closure.units[seen] / closure.characteristic_time]
+            [closure.units[columns], closure.units[columns] / closure.characteristic_time]
         )
         self.largest_states: Array = np.abs(minimal).max(axis=0)
         self.largest_states[self.largest_states == 0.0] = 1.0
         self.largest_states[: len(units)] = np.maximum(self.largest_states[: len(units)], units)
 
     def segments(self) -> list[RecordedSegment | ResimulatedSegment | TransitionJump]:
-        """What the motion consists of, in its order."""
+        """Segments of the motion in their order."""
         segments_found: list[RecordedSegment | ResimulatedSegment | TransitionJump] = []
         count, transition_index, first = len(self.time) // 2, 0, 0
-        transitions = self.switches[1:]
+        transitions = self.transitions[1:]
         while first < count:
             last = min(first + _STEPS_PER_SEGMENT, count)
             if transition_index < len(transitions):
@@ -251,10 +251,10 @@ class SimulatedMotion:
         return [*segments_found, RecordedSegment(transition_index, count, count)]
 
     def adopt_mode(self, mode: int) -> None:
-        """Joints do what they do behind one of the switches, the start being the first."""
+        """Set the stick-slip modes after a transition; the start is the first one."""
         sticking = self.chart.stick_slip
-        if self.switches:
-            switch = self.switches[mode]
+        if self.transitions:
+            switch = self.transitions[mode]
             sticking.slip_signs[:], sticking.is_held[:] = switch.slip_signs, switch.is_held
             sticking.is_moving = switch.is_moving
             sticking.apply_to(self.chart.dynamics)
@@ -296,7 +296,7 @@ class SimulatedMotion:
         return self.resimulated_nodes(states[begin], times[begin], times[end], states[end])
 
     def nodes_at_transition(self, transition: StickSlipTransition) -> MotionNodes:
-        """Three nodes around a switch, at its state."""
+        """Three nodes around a transition, with its state."""
         times = transition.time + _EVENT_DIFFERENCE_STEP * self._step * np.array([-1.0, 0.0, 1.0])
         return MotionNodes(
             times, np.tile(transition.state, (3, 1)), *self._interpolation_positions(times)
@@ -310,7 +310,7 @@ class SimulatedMotion:
     def constants_at(
         self, constants: SimulationConstants, nodes: MotionNodes
     ) -> SimulationConstants:
-        """The simulation's numbers at some nodes, with what sticks."""
+        """Constants of the simulation at some nodes, with the stick-slip modes."""
         references = nodes.interpolate(constants.references)
         return constants._replace(
             dynamics_constants=self.chart.dynamics.formula_constants, references=references
@@ -319,14 +319,14 @@ class SimulatedMotion:
     def sensitivity_jump(
         self, tangent: ForwardDerivatives, constants: SimulationConstants, jump: TransitionJump
     ) -> tuple[Array, Array]:
-        """How S jumps where joints start or stop; what they do behind is adopted.
+        """Jump of S at a stick-slip transition; sets the modes after it.
 
-        With g = 0 what tells when, r the rate before and r_+ behind,
+        With g = 0 the condition of the transition, r the rate before and r_+ the rate after it,
 
             S_+ = S + (r - r_+) dt/dp,    (g_s r + g_t) dt/dp = -(g_s S + g_p).
 
         Returns:
-            g_s (m,), and (r - r_+) / (g_s r + g_t) (m,), 0 where nothing paces g.
+            g_s (m,), and (r - r_+) / (g_s r + g_t) (m,); 0 where g does not change.
         """
         nodes, m = self.nodes_at_transition(jump.transition), tangent.state_size
         event_constants = self.constants_at(constants, nodes)
@@ -351,7 +351,7 @@ class SimulatedMotion:
     def _rate_at_node(
         self, derivatives: ForwardDerivatives, constants: SimulationConstants, nodes: MotionNodes
     ) -> Array:
-        """The rate (m,) at the middle one of three nodes."""
+        """Rate (m,) at the second of three nodes."""
         node_constants = self.constants_at(constants, nodes)
         row = np.ascontiguousarray(node_constants.references[1])
         return derivatives.evaluate_rate(
@@ -362,10 +362,10 @@ class SimulatedMotion:
 
 
 def _check_dead_centres(chart: Chart, time: Array, q: Array) -> None:
-    """Raise where active coordinates do not describe a motion (N, nq)."""
+    """Check that configurations (N, nq) are not near dead centres."""
     stride = max(1, len(q) // _MAX_CHECKED_SAMPLES)
-    for at, posture in zip(time[::stride], q[::stride], strict=True):
-        if chart.largest_gamma_entry(posture) > chart.chart_limits[0]:
+    for at, configuration in zip(time[::stride], q[::stride], strict=True):
+        if chart.largest_gamma_entry(configuration) > chart.chart_limits[0]:
             raise SimulationError(
                 f"at t = {at:.4g} s the active coordinates come near a dead centre, where nothing "
                 "depends on them smoothly: drive other joints, or end before"

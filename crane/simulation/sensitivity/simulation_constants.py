@@ -1,14 +1,18 @@
-"""All numbers of a simulation."""
+"""Constants of a simulation, and their derivatives by named parameters."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from crane.closure.kinematics_formulas import tree_geometry
+from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
+from crane.description.sensors import VELOCITY_SUFFIX
 from crane.dynamics import Dynamics
+from crane.dynamics.constant_derivatives import UNIT_OF_ZERO_PARAMETER, ConstantDerivatives
 from crane.machine import Machine
 from crane.simulation.integration.machine_formulas import reference_samples
 
@@ -16,17 +20,17 @@ FRAME_SIZE = 6  # numbers of a frame
 
 
 class SimulationConstants(NamedTuple):
-    """What a simulation depends on.
+    """All constants on which a simulation depends.
 
     Attributes:
-        geometry: Where joints and loops are, see `crane.closure.kinematics_formulas.TreeGeometry`.
-        dynamics_constants: Masses and force laws, see
-            `crane.dynamics.formula_structure.dynamics_constants`, without what joints do whose
-            friction sticks.
-        settings: Of the controller; a circuit's are among them.
-        frames: Per frame that is observed, where it is on its body (3,) and its x axis (3,).
-        references: (N, c) of the controller at N instants.
-        initial_state: (m,) the minimal state at first.
+        geometry: Placements of joints and loops, see
+            `crane.closure.kinematics_formulas.TreeGeometry`.
+        dynamics_constants: Inertias and force laws, see
+            `crane.dynamics.formula_structure.dynamics_constants`, without stick-slip modes.
+        settings: Settings of the controller, with the constants of a circuit.
+        frames: Position (3,) on its body and x axis (3,) of each frame of an output.
+        references: (N, c) references at N instants.
+        initial_state: (m,) initial minimal state.
     """
 
     geometry: Array
@@ -39,7 +43,7 @@ class SimulationConstants(NamedTuple):
     def difference_quotient(
         self, other: "SimulationConstants", interval: float
     ) -> "SimulationConstants":
-        """(self - other) / over."""
+        """(self - other) / interval."""
         return SimulationConstants(
             *((one - two) / interval for one, two in zip(self, other, strict=True))
         )
@@ -53,32 +57,32 @@ def simulation_constants_of(
     times: Array,
     variant: Machine | None = None,
 ) -> SimulationConstants:
-    """The numbers of a simulation.
+    """Constants of a simulation.
 
     Args:
-        dynamics: Of the machine.
+        dynamics: Dynamics of the machine.
         control: Its controller.
-        initial: q_A and v_A at first.
-        frames: Links that are observed.
-        times: (N,) [s].
-        variant: A machine of the same structure whose numbers are asked for, if not the machine's
-            own, with the controller on it.
+        initial: Initial q_A and v_A.
+        frames: Links of outputs.
+        times: (N,) instants of the references [s].
+        variant: A machine of the same structure with its controller, whose constants are computed
+            instead.
     """
     machine = dynamics.machine if variant is None else variant
     constants = dynamics.constants_of(machine)
     geometry, dynamics_constants = np.split(
         constants, [len(dynamics.machine.closure.compiled_closure.geometry.constants)]
     )
-    # what residuals are measured by is no part of the motion
+    # the scale of residuals does not affect the motion
     geometry[-1] = dynamics.machine.closure.compiled_closure.geometry.constants[-1]
     q = machine.closure.solve(initial[0], initial_guess=machine.home)
     controller_state = np.zeros(0)
     if hasattr(control, "start_closed"):
-        # nothing is worth compiling for one posture
+        # compiling does not pay for a single configuration
         controller_state = control.start_closed(Dynamics(machine, backend="pinocchio"), q)
     if isinstance(control, ValveDrive):
         controller_state = controller_state[: control.circuit.stiff_state_count]
-    # of a variant that a circuit grips elsewhere there are more numbers
+    # a variant may have circuit friction at other joints, and more constants
     dynamics_constants[np.flatnonzero(np.isnan(dynamics.constant_pattern))] = 0.0
     frame_constants = [np.zeros(0)]
     body_rotations = tree_geometry(machine.closure.equations).body_rotations
@@ -97,3 +101,155 @@ def simulation_constants_of(
         reference_samples(machine, control, times),
         np.concatenate([*initial, controller_state]),
     )
+
+
+START_PREFIX = "start."
+_DIFFERENCE_STEP = 1e-4  # of initial motions [coordinate units], per characteristic time
+_CENTRAL_DIFFERENCE_WEIGHTS = (
+    (1, 8.0 / 12.0),
+    (-1, -8.0 / 12.0),
+    (2, -1.0 / 12.0),
+    (-2, 1.0 / 12.0),
+)
+
+
+class ParameterDirections:
+    """Constants of a simulation, and their derivatives by named parameters.
+
+    Args:
+        dynamics: Dynamics of the machine.
+        control: Its controller.
+        start: Initial q_A and v_A.
+        frames: Links of outputs.
+    """
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        control: TracedController,
+        start: tuple[Array, Array],
+        frames: Sequence[str],
+    ):
+        self._dynamics, self._control = dynamics, control
+        self._initial_motion, self._frames = start, frames
+
+    @cached_property
+    def _constant_derivatives(self) -> ConstantDerivatives:
+        return ConstantDerivatives(self._dynamics.machine)
+
+    def nominal_constants(self, times: Array) -> SimulationConstants:
+        """Constants, for the times (2 N + 1,) of the references [s]."""
+        return self._constants_of(self._dynamics.machine, self._initial_motion, times)
+
+    def derivatives(self, names: Sequence[str], times: Array) -> dict[str, SimulationConstants]:
+        """Derivatives by parameters; see `nominal_constants`.
+
+        Raises:
+            InputError: A name is unknown, or a parameter cannot be varied.
+        """
+        return dict(self._iterate_derivatives(names, times, skip_invalid=False))
+
+    def all_derivatives(self, times: Array) -> dict[str, SimulationConstants]:
+        """Derivatives by all parameters of the machine that have an effect and can be varied."""
+        every = self._iterate_derivatives(
+            self._constant_derivatives.parameter_names, times, skip_invalid=True
+        )
+        return {name: found for name, found in every if any(part.any() for part in found)}
+
+    def _iterate_derivatives(
+        self, names: Sequence[str], times: Array, skip_invalid: bool
+    ) -> Iterator[tuple[str, SimulationConstants]]:
+        base = self.nominal_constants(times)
+        ends = np.cumsum([part.size for part in base])[:-1]
+
+        def flat(machine: Machine) -> Array:
+            return np.concatenate(
+                [x.ravel() for x in self._constants_of(machine, self._initial_motion, times)]
+            )
+
+        nominal = None
+        for name in names:
+            if name.startswith(START_PREFIX):
+                yield name, self._start_derivative(name, times)
+                continue
+            nominal = (
+                self._constant_derivatives.nominal_constants(flat) if nominal is None else nominal
+            )
+            try:
+                derivative = self._constant_derivatives.derivative(name, flat, nominal)
+            except InputError:
+                if not skip_invalid:
+                    raise
+                continue
+            parts = zip(np.split(derivative, ends), base, strict=True)
+            found = SimulationConstants(*(part.reshape(like.shape) for part, like in parts))
+            if not found.references.any():  # saves memory
+                found = SimulationConstants(*map(np.copy, found))._replace(
+                    references=np.broadcast_to(0.0, found.references.shape)
+                )
+            yield name, found
+
+    def parameter_value(self, name: str) -> float:
+        """Value of a parameter, or of an initial coordinate or velocity."""
+        if name.startswith(START_PREFIX):
+            part, i = _parse_start_name(name, self._dynamics.machine)
+            return float(self._initial_motion[part][i])
+        return self._constant_derivatives.parameter_value(name)
+
+    def typical_change(self, name: str) -> float:
+        """Size of a large change of a parameter."""
+        value = self.parameter_value(name)
+        return (
+            abs(value) if value and not name.startswith(START_PREFIX) else UNIT_OF_ZERO_PARAMETER
+        )
+
+    def _constants_of(
+        self, machine: Machine, start: tuple[Array, Array], times: Array
+    ) -> SimulationConstants:
+        """Constants of a machine of the same structure, from an initial motion."""
+        control = self._control
+        machine_controller = (
+            control.for_machine(machine) if isinstance(control, ValveDrive) else control
+        )
+        return simulation_constants_of(
+            self._dynamics, machine_controller, start, self._frames, times, machine
+        )
+
+    def _start_derivative(self, name: str, times: Array) -> SimulationConstants:
+        """Derivatives of the constants by an initial coordinate or velocity."""
+        machine = self._dynamics.machine
+        part, i = _parse_start_name(name, machine)
+        closure = machine.closure
+        difference_step = (
+            _DIFFERENCE_STEP
+            * closure.units[closure.active][i]
+            / (closure.characteristic_time if part else 1.0)
+        )
+        start = np.zeros(0)
+        for side, weight in _CENTRAL_DIFFERENCE_WEIGHTS:
+            moved = self._initial_motion[0].copy(), self._initial_motion[1].copy()
+            moved[part][i] += side * difference_step
+            more = (
+                weight / difference_step * self._constants_of(machine, moved, times).initial_state
+            )
+            start = start + more if start.size else more
+        base = self.nominal_constants(times)  # no other constant depends on the initial motion
+        return SimulationConstants(*(np.broadcast_to(0.0, x.shape) for x in base))._replace(
+            initial_state=start
+        )
+
+
+def _parse_start_name(name: str, machine: Machine) -> tuple[int, int]:
+    """Part of the initial motion of a name (0 for q_A, 1 for v_A), and index of the joint.
+
+    Raises:
+        InputError: The joint is no active joint.
+    """
+    joint = name.removeprefix(START_PREFIX)
+    part = int(joint.endswith(VELOCITY_SUFFIX) and joint not in machine.active)
+    joint = joint.removesuffix(VELOCITY_SUFFIX) if part else joint
+    if joint not in machine.active:
+        raise InputError(
+            f"'{name}' is no start of an active joint, {suggest_names(machine.active, joint)}"
+        )
+    return part, machine.active.index(joint)

@@ -1,4 +1,22 @@
-"""Sensitivities along a simulated motion."""
+"""Integration of the variational equations S' = A(t) S + B(t) along a recorded motion.
+
+A step of the method of Lobatto IIIC of order 4, which is L-stable, has its stages at the begin,
+the middle and the end of the step,
+
+    S_i = S + h sum_j a_ij (A_j S_j + B_j),    S(t + h) = S_3,
+
+so that stiff circuits and end stops need no shorter steps (Hairer and Wanner, Solving Ordinary
+Differential Equations II, IV.5). A step is a linear map, S(t + h) = Phi S(t) + Psi.
+
+Two steps and one step over both of them differ by 15 times the error of the two steps. Without
+this error they are of order 5 (Hairer, Norsett and Wanner, Solving Ordinary Differential
+Equations I, II.4).
+
+The transposed map takes weights lambda of S(t + h) to those of S(t) and of the B_j,
+
+    nu = (1 - h a (x) A)^-T (0, 0, lambda),    Phi^T lambda = sum_i nu_i,
+    Psi^T lambda = sum_j B_j^T mu_j,    mu_j = h sum_i a_ij nu_i.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -7,7 +25,7 @@ import numpy as np
 
 from crane.codegen import LayoutView
 from crane.common.samples import Array
-from crane.simulation.sensitivity.forward_derivatives import ForwardDerivatives
+from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives
 from crane.simulation.sensitivity.rate_formulas import report_long_formulas
 from crane.simulation.sensitivity.simulated_motion import (
     MAX_REFINEMENTS,
@@ -18,20 +36,160 @@ from crane.simulation.sensitivity.simulated_motion import (
     TransitionJump,
 )
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
-from crane.simulation.sensitivity.variational_equations import interpolation_errors, step_pair_maps
 
-STEP_ACCURACY = 1e-8  # error of a step, per size of what it is of
-MIN_RELATIVE_CHANGE = 1e-6  # of the states, what matters of what a number as a whole changes
+STAGE_WEIGHTS = np.array([[1.0, -2.0, 1.0], [1.0, 2.5, -0.5], [1.0, 4.0, 1.0]]) / 6.0
+
+
+class StepPairMaps(NamedTuple):
+    """Maps of S by n pairs of steps: Phi and Psi (n, m, m + p).
+
+    Attributes:
+        first: Maps of the first step.
+        both: Maps of both steps, extrapolated.
+    """
+
+    first: Array
+    both: Array
+
+
+FOURTH_DIFFERENCE_WEIGHTS = (
+    np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 15.0
+)  # see `interpolation_errors`
+
+
+def interpolation_errors(values: Array) -> Array:
+    """Error bounds of parabolic interpolation by pair of steps.
+
+    Fourth differences over 15 of values (4 n + 1, .) at the nodes.
+    """
+    count = len(values) - 4
+    return sum(
+        (share * values[i : count + i : 4] for i, share in enumerate(FOURTH_DIFFERENCE_WEIGHTS)),
+        np.zeros(()),
+    )
+
+
+class TransposedMap(NamedTuple):
+    """Transposed map: Phi^T (n, m, m), and matrices that give mu (n, nodes, m, m)."""
+
+    transposed_propagation: Array
+    stage_weights: Array
+
+
+class TransposedPairMaps(NamedTuple):
+    """The transpose of `StepPairMaps`, at three nodes of the first step and at five of both."""
+
+    first: TransposedMap
+    both: TransposedMap
+
+
+def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> StepPairMaps:
+    """Maps of pairs of steps.
+
+    Args:
+        values: A and B (4 n + 1, m, m + p) at the nodes.
+        lengths: (2 n,) of the steps, those of a pair equal [s].
+        sizes: See `step_maps`.
+    """
+    m, count = values.shape[1], len(lengths)
+    all_step_maps = np.concatenate(step_maps(*_stage_values(values, lengths), sizes), axis=2)
+    first, second, coarse = (
+        all_step_maps[:count:2],
+        all_step_maps[1:count:2],
+        all_step_maps[count:],
+    )
+    refined = second[..., :m] @ first
+    refined[..., m:] += second[..., m:]
+    return StepPairMaps(first, refined + (refined - coarse) / 15.0)
+
+
+def transposed_pair_maps(by_state: Array, lengths: Array, sizes: Array) -> TransposedPairMaps:
+    """Transposed maps of pairs of steps; see `step_pair_maps`, with A (4 n + 1, m, m)."""
+    count = len(lengths)
+    back, stages = transposed_step_maps(*_stage_values(by_state, lengths), sizes)
+    first, second = (TransposedMap(back[i:count:2], stages[i:count:2]) for i in range(2))
+    refined_stages = np.concatenate(
+        [
+            first.stage_weights @ second.transposed_propagation[:, None],
+            0.0 * second.stage_weights[:, 1:],
+        ],
+        axis=1,
+    )
+    refined_stages[:, 2:] += second.stage_weights
+    refined_stages *= 16.0 / 15.0
+    refined_stages[:, ::2] -= stages[count:] / 15.0
+    refined_propagation = (
+        16.0 * first.transposed_propagation @ second.transposed_propagation - back[count:]
+    ) / 15.0
+    return TransposedPairMaps(first, TransposedMap(refined_propagation, refined_stages))
+
+
+def _stage_values(values: Array, lengths: Array) -> tuple[Array, Array]:
+    """Values at the stages of 2 n steps and of n over two of them each, and how long these are."""
+    stages = np.concatenate([_values_by_step(values), _values_by_step(values[::2])])
+    return stages, np.concatenate([lengths, lengths[::2] + lengths[1::2]])
+
+
+def _values_by_step(values: Array) -> Array:
+    """Values (N, 3, .) at the stages of N steps, of those (2 N + 1, .) at their nodes."""
+    return np.stack([values[i : len(values) - 2 + i : 2] for i in range(3)], axis=1)
+
+
+def step_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
+    """Phi (N, m, m) and Psi (N, m, p) of steps.
+
+    Args:
+        values: A and B (N, 3, m, m + p) at their stages.
+        lengths: (N,) [s].
+        sizes: (m,) scales of the states for the solution of the equations.
+    """
+    count, stages, m, width = values.shape
+    by_state, by_number, p = values[..., :m], values[..., m:], width - m
+    right = np.empty((count, stages, m, m + p))
+    right[..., :m] = np.eye(m)
+    right[..., m:] = (
+        np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, lengths, by_number) / sizes[:, None]
+    )
+    right = right.reshape(count, stages * m, m + p)
+    solution = (
+        np.linalg.solve(_stage_matrix(by_state, lengths, sizes), right)[:, -m:] * sizes[:, None]
+    )
+    solution[..., :m] /= sizes
+    return solution[..., :m].astype(np.float64), solution[..., m:].astype(np.float64)
+
+
+def transposed_step_maps(by_state: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
+    """Phi^T (N, m, m) of steps, and matrices (N, 3, m, m) that give mu_j of their stages."""
+    count, stages, m, _ = by_state.shape
+    right = np.broadcast_to(np.eye(stages * m)[:, -m:], (count, stages * m, m))
+    solution = np.linalg.solve(np.swapaxes(_stage_matrix(by_state, lengths, sizes), 1, 2), right)
+    nu = solution.astype(np.float64).reshape(count, stages, m, m) / sizes[:, None] * sizes
+    return nu.sum(axis=1), np.einsum("ij,n,nimp->njmp", STAGE_WEIGHTS, lengths, nu)
+
+
+def _stage_matrix(by_state: Array, lengths: Array, sizes: Array) -> Array:
+    """1 - h a (x) A (N, 3 m, 3 m), scaled by the sizes of the states."""
+    by_state = by_state / sizes[:, None] * sizes
+    count, stages, m, _ = by_state.shape
+    whole = np.zeros((count, stages, m, stages, m))
+    for i in range(stages):
+        for j in range(stages):
+            whole[:, i, :, j] = -STAGE_WEIGHTS[i, j] * lengths[:, None, None] * by_state[:, j]
+    return whole.reshape(count, stages * m, stages * m) + np.eye(stages * m)
+
+
+STEP_ACCURACY = 1e-8  # relative error of a step
+MIN_RELATIVE_CHANGE = 1e-6  # least relative change of states by a whole parameter that counts
 
 
 class SensitivitySolution(NamedTuple):
-    """A motion and how it changes.
+    """A motion and its sensitivities.
 
     Attributes:
-        time: (N + 1,) [s].
-        parts: Of the rows (N + 1, .), see `crane.simulation.simulation_run.integrate`.
-        derivatives: (N + 1, k, p) of k outputs in p directions.
-        notes: What is to be said of the motion.
+        time: (N + 1,) instants [s].
+        parts: Parts of the rows (N + 1, .), see `crane.simulation.simulation_run.integrate`.
+        derivatives: (N + 1, k, p) derivatives of k outputs in p directions.
+        notes: Notes for the user about the motion.
     """
 
     time: Array
@@ -48,20 +206,20 @@ def integrate_sensitivities(
     accuracy: float = STEP_ACCURACY,
     progress: Callable[[float], None] | None = None,
 ) -> SensitivitySolution:
-    """Simulate a machine, and how its outputs change in some directions.
+    """Simulate a machine, with derivatives of its outputs along directions.
 
     Args:
-        motion: What is simulated.
-        outputs: What is observed, see `Rate`.
-        make_constants: Numbers of the simulation, and p directions of them with a leading axis
-            each, given the times (2 N + 1,) at which references are asked.
-        typical_changes: (p,) how long directions are that change much.
-        accuracy: Error of a step, per size of what it is of.
+        motion: The simulation.
+        outputs: Names of the outputs, see `sensitivities`.
+        make_constants: Function of the times (2 N + 1,) of the references; returns constants of
+            the simulation, and p directions of them, each part with a leading axis.
+        typical_changes: (p,) sizes of large changes along the directions.
+        accuracy: Relative error of a step.
         progress: See `simulate`.
 
     Raises:
-        InputError: A machine that has no formulas, or floats; an output that is not there.
-        SimulationError: It comes to a dead centre; else as `simulate`.
+        InputError: The machine has no formulas or a floating base, or an output is unknown.
+        SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
     track = SimulatedMotion(motion, progress)
     base, directions = make_constants(track.time)
@@ -82,23 +240,23 @@ def integrate_sensitivities(
 
 
 def _variable_constants(directions: SimulationConstants) -> SimulationConstants:
-    """Which numbers change in some of p directions, 1 or 0."""
+    """Constants that change along any of p directions, as 1 or 0."""
     flat = (np.any(part != 0, axis=tuple(range(part.ndim - 1))) for part in directions)
     return SimulationConstants(*(part.astype(np.float64) for part in flat))
 
 
 class _VariationalIntegrator:
-    """The variational equations along a recorded motion, stretch by stretch.
+    """Integrator of the variational equations along a recorded motion, segment by segment.
 
-    Pairs of steps over which A or B bend too much for the method are taken in parts, along states
-    that are simulated anew: where a valve opens or a compensator closes they jump.
+    Pairs of steps over which A or B are not smooth, as where a valve opens or a compensator
+    closes, are divided and simulated again.
 
     Args:
         motion: The motion.
         forward_derivatives: Derivatives of the rate.
-        nominal_constants: Numbers of the simulation.
+        nominal_constants: Constants of the simulation.
         directions: p directions of them.
-        scale: (m, p) what is taken for no smaller.
+        scale: (m, p) least scales of S.
         accuracy: See `integrate_sensitivities`.
     """
 
@@ -134,10 +292,10 @@ class _VariationalIntegrator:
                     track.resimulated_nodes(*segment[1:]), sensitivity, MAX_REFINEMENTS - 1
                 )[0][-1]
             else:
-                every, seen = self._integrate_segment(
+                every, node_outputs = self._integrate_segment(
                     track.recorded_nodes(segment), sensitivity, MAX_REFINEMENTS
                 )
-                at = seen[::2, :k]
+                at = node_outputs[::2, :k]
                 output_derivatives[segment.first_instant : segment.last_instant + 1] = (
                     at[..., :m] @ every + at[..., m:]
                 )
@@ -145,7 +303,7 @@ class _VariationalIntegrator:
         return output_derivatives
 
     def _directional_derivatives(self, nodes: MotionNodes) -> tuple[Array, Array]:
-        """A and B, and the derivatives of outputs and transition margin."""
+        """A and B, derivatives of outputs and margin; see `ForwardDerivatives.along`."""
         reference_changes = nodes.interpolate(self._directions.references)
         return self._forward_derivatives.directional_derivatives(
             self._motion.constants_at(self._nominal_constants, nodes),
@@ -157,7 +315,7 @@ class _VariationalIntegrator:
     def _integrate_segment(
         self, nodes: MotionNodes, sensitivity: Array, depth: int
     ) -> tuple[Array, Array]:
-        """S (n + 1, m, p) at the ends of a stretch's steps, and what is seen at its nodes."""
+        """S (n + 1, m, p) at the ends of the steps, and derivatives of outputs at the nodes."""
         m, (state_jacobian, output_jacobian) = (
             self._forward_derivatives.state_size,
             self._directional_derivatives(nodes),
@@ -194,14 +352,14 @@ class _VariationalIntegrator:
     def _refine_step(
         self, nodes: MotionNodes, step_sensitivities: list[Array], depth: int
     ) -> None:
-        """One more step, in parts."""
+        """Append S after one more step, which is divided."""
         finer = self._motion.nodes_within_step(nodes, len(step_sensitivities) - 1)
         step_sensitivities.append(
             self._integrate_segment(finer, step_sensitivities[-1], depth - 1)[0][-1]
         )
 
     def _apply_jump(self, jump: TransitionJump, sensitivity: Array) -> Array:
-        """Sensitivities S after an instant at which joints start or stop."""
+        """S behind an instant at which joints start or stop; see `SimulatedMotion.leap`."""
         track, m, nodes = (
             self._motion,
             self._forward_derivatives.state_size,

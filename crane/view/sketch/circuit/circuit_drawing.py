@@ -8,8 +8,8 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from crane.common.errors import InputError
-from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.supply_and_engine import TANK_NODE
+from crane.hydraulics.circuit_elements import TANK_NODE
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine import Machine
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure

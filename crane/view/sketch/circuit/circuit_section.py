@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from crane.hydraulics.circuit_elements import TANK_NODE, Supply
 from crane.hydraulics.components import CounterbalanceValve, Cylinder, Valve
-from crane.hydraulics.supply_and_engine import TANK_NODE, Supply
 from crane.view.plots.figure_text import escape_label
 from crane.view.sketch.circuit import machine_symbols, valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import (

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.supply_and_engine import TANK_NODE
+from crane.hydraulics.circuit_elements import TANK_NODE
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.view.sketch.circuit import valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
 from crane.view.sketch.circuit.circuit_section import CircuitFunction

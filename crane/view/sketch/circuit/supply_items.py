@@ -3,9 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from crane.hydraulics.circuit_elements import Accumulator, CircuitElement
-from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.supply_and_engine import TANK_NODE, Engine, Supply
+from crane.hydraulics.circuit_elements import (
+    TANK_NODE,
+    Accumulator,
+    CircuitElement,
+    Engine,
+    Supply,
+)
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.view.plots.figure_text import escape_label
 from crane.view.sketch.circuit import machine_symbols, valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose

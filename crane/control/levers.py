@@ -1,4 +1,4 @@
-"""Levers as an operator works them: each is held until its joint is where it shall be."""
+"""Valve signals by levers: over time, of a task, or held until joints reach positions."""
 
 import threading
 from bisect import bisect_right
@@ -7,45 +7,45 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from crane.codegen import Scalar
-from crane.common.errors import ClosureError, InputError, SimulationError
+from crane.common.errors import ClosureError, InputError, SimulationError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
-from crane.control.valve_commands import ValveCommand, lever_signals, require_circuit
+from crane.control.valve_commands import ValveCommand, ValveSignals, lever_signals, require_circuit
 from crane.description.specification import DEFAULT_RAMP_TIME
 from crane.description.task_phases import Phase
 from crane.machine import Machine
 
-_SAMPLING_PERIOD = 0.01  # [s] between looks at the machine
+_SAMPLING_PERIOD = 0.01  # sampling period of the joints [s]
 
 
 class LeverPhases(ValveCommand, OneLineRepr, threading.local):
-    """Levers that are held until joints have come to their positions, phase by phase.
+    """Valve command by levers that are held until joints reach their positions, phase by phase.
 
-    Every 10 ms it looks where the joints are. A joint that has come to its position, in the
-    direction of its lever, has its lever moved back to neutral; when all of a phase have, the next
-    one begins. A hand takes `ramp` from neutral to the end of a lever. Between looks the signals
-    go straight, so those of a recording are the same signals again.
+    The joints are sampled every 10 ms. The lever of a joint that has reached its position, in the
+    direction of the lever, moves back to neutral; when all joints of a phase have, the next phase
+    begins. A lever takes `ramp` from neutral to its end. Signals are linear between samples, so
+    that a recording of them gives the same signals again.
 
-    Every thread has its own look at them: what one run has come to is not another's.
+    The state is separate in each thread, so that several runs can use the same command.
 
-    Its clock counts phases: 1.5 when the slowest joint of the second has gone half of its way
-    there; it tells this one look late, straight in between.
+    The clock counts phases: it is 1.5 when the slowest joint of the second phase has moved half of
+    its way. It is delayed by one sample and linear between samples.
 
     Args:
         machine: The machine.
-        phases: One after the other.
-        ramp: From neutral to a full lever [s].
-        initial_coordinates: Active coordinates (n,) to begin at [m], [rad]; home if not given.
+        phases: The phases in their order.
+        ramp: Time from neutral to the end of a lever [s].
+        start: Initial active coordinates (n,) [m], [rad]; home if not given.
 
     Attributes:
-        title: What recordings call it.
-        duration: What all phases may take, and the levers to go back [s].
-        is_finished: Whether all phases are done and the levers back in neutral.
+        title: Name of the controller in recordings.
+        duration: Largest duration of all phases and of the return of the levers [s].
+        is_finished: Whether all phases have ended and the levers are in neutral.
 
     Raises:
-        InputError: There are none, a joint has no valve, a lever no position, or one that it does
-            not reach.
+        InputError: There are no phases, a joint has no valve, a lever has no position, or it
+            cannot reach the position.
     """
 
     title = "joystick"
@@ -84,7 +84,7 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         )
         self._units = {x: machine.unit(x) for x in circuit.joints}
         self._lever_indices = [self._joints.index(spool.joint) for spool in self._spools]
-        # what may be left of a phase as it ends, and the way of the levers back
+        # a phase ends at a sample; then the levers return
         final_allowance = (len(phases) + 2) * _SAMPLING_PERIOD + self._ramp
         self.duration = float(
             np.ceil((sum(x.within for x in phases) + final_allowance) / 0.1) * 0.1
@@ -93,11 +93,11 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
 
     def _reset(self) -> None:
         self._last_time, self._phase_index, self._phase_start_time = -np.inf, -1, 0.0
-        self._phase_start: dict[str, float] = {}  # where joints were as the phase began
+        self._phase_start: dict[str, float] = {}  # positions at the begin of the phase
         self._pending_joints: set[str] = set()
         self._levers = np.zeros(len(self._joints))
         neutral = np.append([spool.neutral for spool in self._spools], 0.0)
-        # signals and clock at every look, at last those of the next one
+        # signals and clock at each sample, and at last at the next one
         self._sample_times, self._sample_rows = [0.0], [neutral]
         self.is_finished = False
 
@@ -105,13 +105,13 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         """See `ValveCommand`.
 
         Raises:
-            SimulationError: A phase takes longer than it may, or the run goes back in time.
+            SimulationError: A phase takes too long, or the run goes back in time.
         """
         if not time:
             self._reset()
         elif time == self._last_time:
-            return  # asked again, in other coordinates
-        elif time < self._last_time:  # where branches of motion cross, a run looks back
+            return  # called again in another chart
+        elif time < self._last_time:  # a run goes back before it crosses branches
             raise SimulationError(
                 f"at t = {time:.6g} s: the linkage comes to where it could go on in "
                 "several ways, and levers by positions do not go back: give levers over time"
@@ -131,13 +131,13 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self._sample_rows.append(np.append(signals, self._phase_clock(positions)))
 
     def _begin_phase(self, index: int, time: float, positions: Mapping[str, float]) -> None:
-        """Begin a phase."""
+        """Start a phase."""
         self._phase_index, self._phase_start_time, self._phase_start = index, time, dict(positions)
         is_done = index == len(self._phases)
         self._pending_joints = set() if is_done else set(self._phases[index].until)
 
     def _check_arrivals(self, time: float, positions: Mapping[str, float]) -> None:
-        """See which joints have arrived, and begin the next phase when all have."""
+        """Find the joints that have reached their positions; start the next phase if all have."""
         while self._phase_index < len(self._phases):
             phase = self._phases[self._phase_index]
             self._pending_joints = {
@@ -156,13 +156,12 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
             raise SimulationError(
                 f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
                 f"{phase.within:g} s, '{joint}' is at {positions[joint]:.4g} {unit} on its way "
-                f"from "
-                f"{self._phase_start[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
+                f"from {self._phase_start[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
                 + self._remedy_text(phase, positions)
             )
 
     def _remedy_text(self, phase: Phase, positions: Mapping[str, float]) -> str:
-        """What to do about a phase that does not end; a dead centre on the way is named."""
+        """Remedy for a phase that does not end; names a dead centre before the positions."""
         end = {joint: phase.until[joint] for joint in self._pending_joints}
         q_a = np.array(
             [{**positions, **end}.get(joint, at) for joint, at in self._home_positions.items()]
@@ -174,41 +173,105 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         return "give it more time or lever, or a position that it reaches"
 
     def _lever_targets(self) -> Array:
-        """Where the hand wants the levers (m,)."""
+        """Target positions of the levers (m,)."""
         if self._phase_index == len(self._phases):
             return np.zeros(len(self._joints))
         levers = self._phases[self._phase_index].levers
         return np.array([levers[x] if x in self._pending_joints else 0.0 for x in self._joints])
 
     def _completed_share(self, joint: str, positions: Mapping[str, float]) -> float:
-        """How much of its way in the phase a joint has gone that has not arrived."""
-        initial_coordinates, end = (
-            self._phase_start[joint],
-            self._phases[self._phase_index].until[joint],
-        )
-        return max((positions[joint] - initial_coordinates) / (end - initial_coordinates), 0.0)
+        """Share of its way in the phase that a joint has moved."""
+        start, end = self._phase_start[joint], self._phases[self._phase_index].until[joint]
+        return max((positions[joint] - start) / (end - start), 0.0)
 
     def _phase_clock(self, positions: Mapping[str, float]) -> float:
-        """The clock, which does not go back."""
+        """The clock, which never decreases."""
         share = min(
             (self._completed_share(x, positions) for x in self._pending_joints), default=0.0
         )
         return max(self._phase_index + share, float(self._sample_rows[-1][-1]))
 
     def references(self, times: Array) -> Array:
-        """See `ValveCommand`: signals, and the clock."""
+        """See `ValveCommand`: the signals, then the clock."""
         first = max(bisect_right(self._sample_times, float(times.min())) - 1, 0)
         last = bisect_right(self._sample_times, float(times.max())) + 1
-        sample_times, rows = (
-            self._sample_times[first:last],
-            np.array(self._sample_rows[first:last]),
+        columns = np.array(self._sample_rows[first:last]).T
+        return np.column_stack(
+            [np.interp(times, self._sample_times[first:last], x) for x in columns]
         )
-        return np.column_stack([np.interp(times, sample_times, column) for column in rows.T])
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
         """See `ValveCommand`."""
         return inputs.reference[: len(self._spools)]
 
     def clock(self, times: Array) -> Array:
-        """The phase (N,) at times (N,) [s] until the next look."""
+        """The phase (N,) at times (N,) [s] up to the next sample."""
         return self.references(times)[:, -1]
+
+
+_MAX_DURATION = 4000.0  # largest duration of levers [s]: steps of a run in milliseconds
+
+
+def joystick(
+    machine: Machine, points: Mapping[str, Sequence[tuple[float, float]]] | str
+) -> ValveSignals | LeverPhases:
+    """Valve signals by levers.
+
+    A lever moves both spools of a valve with two spools; JOINT_b names a lever of the second spool
+    alone. A task starts at its `start`, and may have phases instead of polygons. The position of a
+    lever is a share of the flow of the valve, see `lever_signals`.
+
+    Args:
+        machine: The machine.
+        points: Polygons of (time [s], lever from -1 to 1) by joint, or the name of a task.
+
+    Raises:
+        InputError: Unknown joints or task, levers outside of -1 to 1, or times that do not
+            increase.
+    """
+    circuit = require_circuit(machine)
+    last, start = 0.0, None
+    if isinstance(points, str):
+        task = machine.tasks.get(points)
+        if task is None or task.space != "joystick":
+            names = [name for name, task in machine.tasks.items() if task.space == "joystick"]
+            raise InputError(f"'{points}' is no task of levers, {suggest_names(names, points)}")
+        if task.start:
+            start = machine.check_limits(
+                [
+                    task.start.get(joint, machine.home[machine.column(joint)])
+                    for joint in machine.active
+                ],
+                f"the start of task '{points}'",
+            )
+        if task.phases:
+            return LeverPhases(machine, task.phases, task.ramp, start)
+        points, last = task.levers, task.duration
+    polygons: dict[str, tuple[Array, Array]] = {}
+    for joint, polygon in points.items():
+        if joint not in circuit.spools:
+            raise InputError(f"no valve for '{joint}', {suggest_names(circuit.spools, joint)}")
+        try:
+            table = np.array(polygon, dtype=np.float64)
+        except (TypeError, ValueError):
+            table = np.zeros(0)
+        if table.shape[1:] != (2,) or not len(table):
+            raise InputError(f"lever of '{joint}': give pairs of time and position")
+        if not (np.diff(table[:, 0]) > 0).all() or not (np.abs(table[:, 1]) <= 1).all():
+            raise InputError(
+                f"lever of '{joint}': give increasing times and positions from -1 to 1"
+            )
+        polygons[joint] = table[:, 0], table[:, 1]
+    # a signal jumps over the dead band where a lever passes zero, so corners alone do not suffice
+    last = max([last, *(times[-1] for times, _ in polygons.values())])
+    if not 0 < last <= _MAX_DURATION:
+        raise InputError(f"the levers end at {last:g} s, give times up to {_MAX_DURATION:g} s")
+    times_fine = np.linspace(0.0, last, max(2, round(last / 1e-3) + 1))
+    signals = {}
+    for name, spool in circuit.spools.items():
+        lever = name if name in polygons else spool.joint
+        if lever in polygons:
+            signals[name] = lever_signals(spool, np.interp(times_fine, *polygons[lever]))
+    command = ValveSignals(machine, times_fine, signals)
+    command.title, command.initial_coordinates = "joystick", start
+    return command

@@ -1,0 +1,448 @@
+"""Integrators in one chart that locate stick-slip transitions, with fixed or controlled steps."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Protocol
+
+import numpy as np
+
+from crane.codegen import FormulaTooLongError
+from crane.common.errors import ClosureError, InputError
+from crane.common.samples import Array
+from crane.control import Controller, TracedController, ValveDrive
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.error_controlled_stepper import (
+    MAX_REFERENCE_SPACING,
+    ErrorControlledStepper,
+)
+from crane.simulation.integration.python_stepper import (
+    IntegrationHaltError,
+    PythonStepper,
+    StepProgress,
+)
+from crane.simulation.integration.runge_kutta import RungeKuttaStepper
+from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
+
+_TIME_TOLERANCE = 1e-9  # share of the output interval: difference of equal instants
+_MAX_TRANSITIONS = 2000  # stick-slip transitions within an output interval
+
+
+class CompiledMethod(Protocol):
+    """A compiled method."""
+
+    bounds: Array
+
+    @property
+    def event(self) -> float:
+        """Not 0 at a stick-slip transition."""
+
+    def adopt_modes(self) -> None:
+        """See `MachineCodeStepper.adopt_modes`."""
+
+    def observe(self, time: float, state: Array) -> tuple[Array, float]:
+        """See `MachineCodeStepper.observe`."""
+
+
+class StickSlipIntegrator:
+    """Base class of integrators in one chart.
+
+    A method with steps of a given size implements `_make_step`.
+
+    Args:
+        chart: The machine in a chart.
+        control: Its controller.
+        controller_state_count: Number of states of the controller.
+        compiled_method: The compiled method, or None.
+
+    Attributes:
+        python_stepper: Observes states, makes single steps, and explains halts.
+        done: Number of instants with a row, after a run or a halt.
+        next_instant: Index of the first instant that is not before the state.
+        offset: Time of the state after the next instant without a row [s].
+    """
+
+    _max_transitions = _MAX_TRANSITIONS
+
+    def __init__(
+        self,
+        chart: Chart,
+        control: Controller,
+        controller_state_count: int,
+        compiled_method: CompiledMethod | None,
+    ):
+        self.python_stepper = PythonStepper(chart, control, controller_state_count)
+        self.done = self.next_instant = 0
+        self.offset = 0.0
+        self._stick_slip, self._compiled_method = chart.stick_slip, compiled_method
+        self._dynamics, self._transition_count, self._count_start_time = chart.dynamics, 0, -np.inf
+
+    def set_chart_limits(self, limits: Array) -> None:
+        """Set the limits of the chart, see `Chart.chart_limits`."""
+        self.python_stepper.chart_limits = limits
+        if self._compiled_method is not None:
+            self._compiled_method.bounds[3:5] = limits
+
+    def final_row(self, time: float, state: Array) -> Array:
+        """The row of a state.
+
+        Args:
+            time: [s].
+            state: State at this time.
+
+        Raises:
+            IntegrationHaltError: The outputs cannot be computed.
+        """
+        return np.concatenate([state, self._outputs_and_margin(time, state)[0]])
+
+    def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
+        """A step size [s] with which the motion continues after a halt; 0 if none is found.
+
+        The arguments are those of the run. Methods with step-size control return 0.
+        """
+        return 0.0
+
+    def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
+        """State and margin after one step of a given size.
+
+        Methods that locate events within their steps do not need it.
+        """
+        raise NotImplementedError
+
+    def _outputs_and_margin(self, time: float, state: Array) -> tuple[Array, float]:
+        """Outputs and margin at a state."""
+        if self._compiled_method is not None:
+            return self._compiled_method.observe(time, state)
+        return self.python_stepper.observe(time, state)[1], self.python_stepper.transition_margin
+
+    def _prepare_modes(self, time: float, state: Array) -> None:
+        """Set the stick-slip modes before the first step, and after a change of the chart."""
+        if not self._stick_slip.columns:
+            return
+        if not self._stick_slip.has_modes:
+            self._find_modes(time, state)
+            return
+        self._stick_slip.apply_to(self._dynamics)
+        if self._compiled_method is not None:
+            self._compiled_method.adopt_modes()
+
+    def _find_modes(self, time: float, state: Array) -> None:
+        """Determine the stick-slip modes at a state."""
+        if self._compiled_method is None:
+            self.python_stepper.find_modes(time, state)
+        else:
+            self._compiled_method.adopt_modes()
+            self.python_stepper.find_modes(
+                time, state, self._compiled_method.observe(time, state)[0]
+            )
+            self._compiled_method.adopt_modes()
+        self._stick_slip.record_transition(time, state)
+
+    def _advance_to_transition(
+        self, time: float, state: Array, length: float, step: float
+    ) -> float:
+        """Integrate to a stick-slip transition within a step.
+
+        Args:
+            time: [s].
+            state: State at this time, replaced by that at the transition with the new modes.
+            length: Step size [s].
+            step: Output interval [s].
+
+        Returns:
+            Time from the start of the step to the transition [s].
+
+        Raises:
+            IntegrationHaltError: There are too many transitions.
+        """
+        self._count_transition(time, state, step)
+        margin_before, (_, margin_behind) = (
+            self._outputs_and_margin(time, state)[1],
+            self._make_step(time, state, length),
+        )
+        if margin_before < -EVENT_TOLERANCE:
+            time_offset = 0.0
+        else:
+            time_offset, state[:] = locate_event(
+                lambda part: self._make_step(time, state, part),
+                margin_before,
+                length,
+                margin_behind,
+            )
+        self._find_modes(time + time_offset, state)
+        return time_offset
+
+    def _count_transition(self, time: float, state: Array, step: float) -> None:
+        """Count a stick-slip transition.
+
+        Raises:
+            IntegrationHaltError: There are too many within an output interval.
+        """
+        if time > self._count_start_time + step:
+            self._count_start_time, self._transition_count = time, 0
+        self._transition_count += 1
+        if self._transition_count > self._max_transitions:
+            raise IntegrationHaltError(
+                time,
+                self.python_stepper.user_coordinates(state),
+                f" joints stick and slip more than {self._max_transitions} times within "
+                f"{step:g} s",
+                ": forces that jump with the sign of a velocity fight their friction, smooth them",
+            )
+
+    def _rounded_offset(self, offset: float, step: float) -> float:
+        """An offset, 0 if it is within rounding errors."""
+        return offset if offset < -_TIME_TOLERANCE * step else 0.0
+
+    def _advance_to_instant(self, now: float, state: Array, step: float) -> None:
+        """Integrate to the next instant, or to a stick-slip transition before it.
+
+        Args:
+            now: The next instant [s].
+            state: State at `offset`.
+            step: Output interval [s].
+        """
+        after, margin = self._make_step(now + self.offset, state, -self.offset)
+        if margin >= -EVENT_TOLERANCE:
+            state[:], self.offset = after, 0.0
+            return
+        time_offset = self._advance_to_transition(now + self.offset, state, -self.offset, step)
+        self.offset = self._rounded_offset(self.offset + time_offset, step)
+
+
+_STEPS_PER_REPORT = 5000  # between reports of progress
+# steps before and after a halt that are repeated with finer steps
+_STEPS_BEFORE_HALT, _STEPS_AFTER_HALT = 40, 20
+_REFINEMENT_FACTORS = (2, 8)  # of finer steps
+_MAX_TRANSITIONS_IN_FINER_STEP = 100  # a step size with more transitions is no remedy
+
+
+class FixedStepIntegrator(StickSlipIntegrator):
+    """Fixed steps of the classical Runge-Kutta method, compiled where possible.
+
+    Args:
+        chart: The machine in a chart.
+        control: Its controller.
+        controller_state_count: Number of states of the controller.
+    """
+
+    def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
+        self._compiled_stepper: RungeKuttaStepper | None = None
+        compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
+        if (
+            compiled
+            and chart.machine.has_traceable_forces
+            and isinstance(control, TracedController)
+        ):
+            with suppress(FormulaTooLongError):
+                self._compiled_stepper = RungeKuttaStepper(chart, control, controller_state_count)
+        super().__init__(chart, control, controller_state_count, self._compiled_stepper)
+        self._next_time = 0.0
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+    ) -> int:
+        """Integrate from each of the times to the next, while the chart is regular.
+
+        Args:
+            times: (N,) instants [s].
+            state: State at the first instant or `offset` after it, replaced by the final one.
+            step: Interval of the instants [s].
+            rows: (N, row size) in any memory order, filled with state and outputs.
+            progress: Called with the number of finished steps.
+
+        Returns:
+            Number of steps.
+
+        Raises:
+            IntegrationHaltError: A step fails.
+        """
+        first = times[0] if len(times) else self._next_time
+        self.done = self.next_instant = 0
+        self._prepare_modes(first + self.offset, state)
+        while self.done < len(times) or self.offset < 0:
+            now = first + step * self.next_instant
+            if self.offset < 0:
+                self._advance_to_instant(now, state, step)
+                continue
+            if not self._make_steps(times, state, step, rows):
+                break
+            if progress is not None:
+                progress(self.done)
+        self._next_time = first + step * self.next_instant
+        return self.next_instant
+
+    def _make_steps(self, times: Array, state: Array, step: float, rows: Array) -> bool:
+        """Make some steps, or integrate to a stick-slip transition.
+
+        Returns:
+            False where another chart is needed.
+        """
+        size, i = len(state), self.done
+        chunk_end, event = min(i + _STEPS_PER_REPORT, len(times)), 0.0
+        if self._compiled_stepper is not None:
+            i += self._compiled_stepper.run(times[i:chunk_end], state, step, rows[i:])
+            self.done = self.next_instant = i
+            event = self._compiled_stepper.event
+        if i < chunk_end and not event:  # the compiled stepper stopped, or there is none
+            if self.python_stepper.exceeds_chart_limits(state):
+                return False
+            rate, outputs = self.python_stepper.observe(times[i], state)
+            if self.python_stepper.transition_margin < -EVENT_TOLERANCE:
+                event = step
+            else:
+                rows[i, :size], rows[i, size:] = state, outputs
+                self.done = i + 1
+                state[:] = self.python_stepper.advance(times[i], state, rate, step)
+                i = self.next_instant = i + 1
+        if not event and i == len(times) and self._stick_slip.columns:  # no step follows
+            event = step * (
+                self._outputs_and_margin(times[-1] + step, state)[1] < -EVENT_TOLERANCE
+            )
+        if event and i:
+            state[:] = rows[i - 1, :size]
+            event_time_offset = self._advance_to_transition(times[i - 1], state, event, step)
+            self.offset = self._rounded_offset(event_time_offset - step, step)
+        elif event:
+            self._find_modes(times[0], state)
+        return True
+
+    def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
+        """See `StickSlipIntegrator._make_step`."""
+        if self._compiled_stepper is not None:
+            after, row = state.copy(), np.empty((1, self._compiled_stepper.row_size))
+            if self._compiled_stepper.run(np.array([time]), after, length, row):
+                return after, self._compiled_stepper.observe(time + length, after)[1]
+        rate, _ = self.python_stepper.observe(time, state)
+        after = self.python_stepper.advance(time, state, rate, length)
+        self.python_stepper.observe(time + length, after)
+        return after, self.python_stepper.transition_margin
+
+    def find_finer_step(self, times: Array, rows: Array, step: float) -> float:
+        """See `StickSlipIntegrator.find_finer_step`."""
+        done_before = self.done
+        first_repeated, last_repeated = (
+            max(0, done_before - _STEPS_BEFORE_HALT),
+            min(done_before + _STEPS_AFTER_HALT, len(times)),
+        )
+        self._max_transitions = _MAX_TRANSITIONS_IN_FINER_STEP
+        for share in _REFINEMENT_FACTORS:
+            finer_step = step / share
+            repeated_times = times[first_repeated] + finer_step * np.arange(
+                share * (last_repeated - first_repeated)
+            )
+            state = rows[first_repeated, : self.python_stepper.state_layout.size].copy()
+            self.offset, self._stick_slip.has_modes = 0.0, False
+            with suppress(IntegrationHaltError):
+                steps_made = self.run(
+                    repeated_times,
+                    state,
+                    finer_step,
+                    np.empty((len(repeated_times), rows.shape[1])),
+                )
+                if steps_made == len(repeated_times):
+                    self.python_stepper.observe(repeated_times[-1] + finer_step, state)
+                    self.done = done_before
+                    return finer_step
+        self.done = done_before
+        return 0.0
+
+
+_INSTANTS_PER_REPORT = 1000  # between reports of progress
+
+
+class ErrorControlledIntegrator(StickSlipIntegrator):
+    """Compiled method with step-size control, with a sampled valve command where there is one.
+
+    Args:
+        chart: The machine in a chart.
+        control: Its controller.
+        controller_state_count: Number of states of the controller.
+        stepper_factory: Creates the compiled method.
+
+    Raises:
+        FormulaTooLongError: The formulas are too long to be compiled.
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        control: TracedController,
+        controller_state_count: int,
+        stepper_factory: Callable[..., ErrorControlledStepper],
+    ):
+        self._stepper = stepper_factory(chart, control, controller_state_count)
+        super().__init__(chart, control, controller_state_count, self._stepper)
+        self._chart, self._control, self._next_time = chart, control, 0.0
+        self._sampled_drive = (
+            control if isinstance(control, ValveDrive) and control.period else None
+        )
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
+    ) -> int:
+        """See `FixedStepIntegrator.run`.
+
+        Raises:
+            InputError: The period of the valve command is no whole number of steps.
+            IntegrationHaltError: A step fails.
+        """
+        period = self._period_in_steps(step)
+        first = times[0] if len(times) else self._next_time
+        self.done = self.next_instant = 0
+        self._stepper.reset_step_size()
+        self._prepare_modes(first + self.offset, state)
+        while self.done < len(times) or self.offset < 0:
+            self._next_time = now = first + step * self.done
+            chunk = rows[self.done : min(self.done + _INSTANTS_PER_REPORT, len(times))]
+            if period and self.offset < 0:
+                chunk = chunk[:0]
+            elif period:
+                since = round(now / step) % period
+                chunk = chunk[: period - since]
+                if not since:
+                    self._update_command(now, state)
+            count, self.offset = self._stepper.run(now, state, self.offset, step, chunk)
+            self.done = self.next_instant = self.done + count
+            self._next_time = first + step * self.done
+            if self._stepper.event:
+                self._count_transition(self._next_time + self.offset, state, step)
+                # references are those after a jump, as for steps that start there
+                self._find_modes(
+                    self._next_time
+                    + self.offset
+                    + _TIME_TOLERANCE * min(step, MAX_REFERENCE_SPACING),
+                    state,
+                )
+                self.offset = self._rounded_offset(self.offset, step)
+            elif count < len(chunk) or self.offset < 0:
+                if self.python_stepper.exceeds_chart_limits(state):
+                    break
+                raise self.python_stepper.halt_error(self._next_time + self.offset, state)
+            if progress is not None:
+                progress(self.done)
+        return self.done
+
+    def _period_in_steps(self, step: float) -> int:
+        """Number of steps in a period of the sampled valve command; 0 without one."""
+        if self._sampled_drive is None:
+            return 0
+        period_time = self._sampled_drive.period
+        period = round(period_time / step)
+        if abs(period * step - period_time) > _TIME_TOLERANCE * period_time:
+            raise InputError(
+                f"the period {period_time:g} s of the valves' program is no whole number of "
+                f"steps of {step:g} s, change one"
+            )
+        return period
+
+    def _update_command(self, time: float, state: Array) -> None:
+        """Sample the valve command."""
+        at = self.python_stepper.state_layout.view(state)
+        assert self._sampled_drive is not None
+        try:
+            v_a = self._chart.user_velocities(at.q, at.v_a)
+            self._sampled_drive.update(time, at.q, v_a, at.controller)
+        except ClosureError as error:
+            raise IntegrationHaltError(
+                time, self.python_stepper.user_coordinates(state), f": {error}"
+            ) from None
