@@ -103,7 +103,7 @@ def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
                 least[joint] = min(least[joint], load / pressed)
     for joint, margin in least.items():
         assert margins[joint][cell] == pytest.approx(margin, rel=1e-4)
-    with pytest.raises(crane.CraneError, match="leans by 5.73 degrees: rate without slope"):
+    with pytest.raises(crane.CraneError, match="slopes by 5.73 degrees: rate without slope"):
         chart.pin_forces()
     assert "in a pin" not in chart.to_markdown() and "first to buckle" in chart.to_markdown()
 

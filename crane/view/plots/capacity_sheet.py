@@ -9,8 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from crane.ratings import Capacity
-from crane.ratings.capacity_report import capacity_facts, factor_shares, slew_labels, table_note
-from crane.ratings.load_tables import LoadTable
+from crane.ratings.capacity_report import (
+    LoadTable,
+    capacity_facts,
+    factor_shares,
+    slew_labels,
+    table_note,
+)
 from crane.view.plots.capacity_figure import (
     capacity_heading,
     draw_capacity_panel,
