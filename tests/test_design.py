@@ -6,8 +6,12 @@ from typed import typed
 
 import crane
 from crane.formats.machine_loading import MachineVariants
-from crane.studies.design.dual_numbers import DUAL_FUNCTIONS, DualNumber
-from crane.studies.design.measure_expressions import MeasureExpression, parse_requirement
+from crane.studies.design.measure_expressions import (
+    DUAL_FUNCTIONS,
+    DualNumber,
+    MeasureExpression,
+    parse_requirement,
+)
 from crane.studies.design.variant_measures import MeasureOptions, VariantEvaluation
 
 pytestmark = pytest.mark.slow

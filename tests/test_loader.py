@@ -211,7 +211,7 @@ def test_a_toggle_is_beside_it_alone(with_toggle):
         assert found[closure.active][1] == pytest.approx(exact, abs=1e-7)
     for tilt in (exact + 0.012 * strokes.span[1], 0.2, 0.4, 0.6):
         q = closure.solve(np.array([lift, tilt]))
-        assert find_toggle(strokes, 1, q) is None and toggle(strokes, 0, q) is None
+        assert find_toggle(strokes, 1, q) is None and find_toggle(strokes, 0, q) is None
 
 
 def test_vertical_break_out_of_loaders(loader):

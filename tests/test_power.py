@@ -12,7 +12,7 @@ from work import at_most
 
 import crane
 from crane.recordings import Recording
-from crane.studies.power_comparison import PowerComparison
+from crane.studies.power_balance_result import PowerComparison
 from crane.view.plots.power_comparison_figure import power_comparison_figure
 from crane.view.plots.power_figure import power_figure
 from crane.view.plots.sankey_diagram import sankey_figure

@@ -74,7 +74,7 @@ def power(
     )
     from crane.control.valve_commands import require_circuit
     from crane.studies.hydraulic_power_balance import power_balance
-    from crane.studies.power_comparison import PowerComparison
+    from crane.studies.power_balance_result import PowerComparison
 
     check_folder(out, force)
     if moved is not None and not beside:

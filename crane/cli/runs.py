@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from crane.simulation.recording_replay import Comparison
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.design import Design
-    from crane.studies.hydraulic_power_balance import PowerBalance
-    from crane.studies.power_comparison import PowerComparison
+    from crane.studies.power_balance_result import PowerBalance
+    from crane.studies.power_balance_result import PowerComparison
     from crane.studies.study_table import Study
 
 RECORDING, RECORDING_NPZ = "recording.csv", "recording.npz"

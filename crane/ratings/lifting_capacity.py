@@ -288,11 +288,9 @@ def _gross_torque(
     def torque(stroke: float) -> float:
         q_a = machine.home[machine.closure.active].copy()
         q_a[i] = stroke
-        q = machine.closure.solve(q_a)
-        rate = float(machine.closure.gamma(q)[column, i])
-        load_forces = search.statics.evaluate(q[None]).tip_load_forces(
-            machine.model.gravity.linear
-        )
+        rate = float(machine.closure.gamma(machine.closure.solve(q_a))[column, i])
+        statics = search.statics.evaluate(machine.closure.solve(q_a)[None])
+        load_forces = statics.tip_load_forces(machine.model.gravity.linear)
         return abs((drive.max_force if load_forces[0, i] > 0 else drive.min_force) / rate)
 
     strokes = np.linspace(search.low[i], search.high[i], _STROKE_STEPS + 1)

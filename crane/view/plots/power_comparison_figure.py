@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from crane.common.units import display_unit, format_number
 from crane.hydraulics.power_balance import SHAFT_POWER
-from crane.studies.hydraulic_power_balance import POWER_CLASSES
-from crane.studies.power_comparison import PowerComparison
+from crane.studies.power_balance_result import POWER_CLASSES
+from crane.studies.power_balance_result import PowerComparison
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
 

@@ -12,7 +12,7 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.hydraulics.power_balance import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
-from crane.studies.hydraulic_power_balance import (
+from crane.studies.power_balance_result import (
     POWER_CLASSES,
     PowerBalance,
     part_class,

@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from crane.common.units import format_number
 from crane.hydraulics.power_balance import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
-from crane.studies.hydraulic_power_balance import (
+from crane.studies.power_balance_result import (
     LOAD,
     PowerBalance,
     part_class,
