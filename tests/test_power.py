@@ -13,8 +13,7 @@ from work import at_most
 import crane
 from crane.recordings import Recording
 from crane.studies.power_balance_result import PowerComparison
-from crane.view.plots.power_comparison_figure import power_comparison_figure
-from crane.view.plots.power_figure import power_figure
+from crane.view.plots.power_figure import power_comparison_figure, power_figure
 from crane.view.plots.sankey_diagram import sankey_figure
 
 G, SUPPLY, TANK, SPEED = 9.81, 9.25e6, 1e5, 0.05

@@ -118,7 +118,7 @@ def _orifices(
     judge: "Recording | None",
 ) -> "tuple[str, Figure]":
     from crane.identification.hydraulics.orifice_coefficients import identify_orifices
-    from crane.view.plots.hydraulics_figures import equation_sides_figure
+    from crane.view.plots.identification_figures import equation_sides_figure
 
     found = identify_orifices(machine, runs, joint, method, period=period)
     shown = {f"recording {i + 1}": both for i, both in enumerate(found.training_sides)}
@@ -132,7 +132,7 @@ def _orifices(
 
 def _valve(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
     from crane.identification.hydraulics.valve_curve import identify_valve
-    from crane.view.plots.hydraulics_figures import valve_curve_figure
+    from crane.view.plots.identification_figures import valve_curve_figure
 
     curve = identify_valve(machine, run, joint)
     unit = machine.unit(joint)
@@ -141,7 +141,7 @@ def _valve(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figu
 
 def _friction(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
     from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
-    from crane.view.plots.hydraulics_figures import friction_figure
+    from crane.view.plots.identification_figures import friction_figure
 
     found = identify_cylinder_friction(machine, run, joint)
     unit = machine.unit(joint)

@@ -58,8 +58,7 @@ def live(
     from crane.cli.commands import is_run
     from crane.cli.runs import machine_of, read_run
     from crane.view.live.live_server import serve_live_view
-    from crane.view.live.live_session import Session
-    from crane.view.live.playback import Playback
+    from crane.view.live.live_session import Playback, Session
 
     recording = None
     if is_run(what):

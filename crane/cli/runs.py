@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from crane.simulation.recording_replay import Comparison
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.design import Design
-    from crane.studies.power_balance_result import PowerBalance
-    from crane.studies.power_balance_result import PowerComparison
+    from crane.studies.power_balance_result import PowerBalance, PowerComparison
     from crane.studies.study_table import Study
 
 RECORDING, RECORDING_NPZ = "recording.csv", "recording.npz"
@@ -128,7 +127,7 @@ def write_comparison(
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.comparison_figure import plot_comparison
+    from crane.view.plots.calibration_figure import plot_comparison
 
     text = f"# {heading(recording)}\n\n{comparison.to_markdown()}"
     with replace_folder(folder, force, _stale(npz)) as part:
@@ -321,7 +320,7 @@ def write_sensitivities(folder: Path, found: "Sensitivities", force: bool = True
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.sensitivities_figure import plot_sensitivities
+    from crane.view.plots.modes_figure import plot_sensitivities
 
     with replace_folder(folder, force) as part:
         (part / "sensitivities.md").write_text(found.to_text() + "\n", encoding="utf-8")
@@ -360,7 +359,7 @@ def write_power_comparison(folder: Path, comparison: "PowerComparison", force: b
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.view.plots.power_comparison_figure import plot_power_comparison
+    from crane.view.plots.power_figure import plot_power_comparison
 
     text = f"# power of {', '.join(comparison.balances)}\n\n{comparison.to_markdown()}"
     with replace_folder(folder, force) as part:

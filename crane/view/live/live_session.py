@@ -1,4 +1,4 @@
-"""What a live view knows: one posture, closed at every move, and its numbers."""
+"""State of a live view: one closed configuration, and playback of a recording."""
 
 from dataclasses import dataclass, replace
 
@@ -6,12 +6,73 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from crane.common.errors import ClosureError, InputError, SingularConfigurationError, suggest_names
+from crane.common.errors import (
+    ClosureError,
+    InputError,
+    RecordingError,
+    SingularConfigurationError,
+    suggest_names,
+)
 from crane.common.samples import Array, as_number
 from crane.dynamics import Dynamics
 from crane.machine import Machine, Payload
 from crane.motion.kinematics import Kinematics
+from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS
+
+
+class Playback:
+    """The active coordinates and forces of a recording at any time within it.
+
+    Args:
+        machine: The machine it belongs to.
+        recording: The recording.
+
+    Attributes:
+        start: Time of the first sample [s].
+        end: Time of the last sample [s].
+        configurations: (N, nq) closed postures of all samples [m], [rad].
+
+    Raises:
+        RecordingError: It lacks an active joint of the machine.
+        ClosureError: The loops cannot be closed at a sample.
+    """
+
+    def __init__(self, machine: Machine, recording: Recording):
+        columns = []
+        for joint in machine.active:
+            if joint not in recording.joints:
+                raise RecordingError(
+                    f"the recording has no joint '{joint}', which drives {machine.name}, "
+                    f"{suggest_names(recording.joints, joint)}"
+                )
+            columns.append(recording.joints.index(joint))
+        self._time = recording.time
+        self._active_count = len(columns)
+        self._coordinates_and_forces = np.hstack(
+            [recording.q[:, columns], recording.tau[:, columns]]
+        )
+        self.start, self.end = float(self._time[0]), float(self._time[-1])
+        self.configurations = machine.closure.solve(
+            self._coordinates_and_forces[:, : self._active_count]
+        )
+
+    def interpolate(self, time: float) -> tuple[Array, Array]:
+        """Active coordinates (n,) [m], [rad] and forces (n,) [N], [N m] at a time [s].
+
+        They run straight from sample to sample.
+        """
+        next_index = int(
+            np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
+        )
+        adjacent_rows = self._coordinates_and_forces[next_index - 1 : next_index + 1]
+        if len(adjacent_rows) == 1:
+            return adjacent_rows[0, : self._active_count], adjacent_rows[0, self._active_count :]
+        start_time, end_time = self._time[next_index - 1 : next_index + 1]
+        share = np.clip((time - start_time) / (end_time - start_time), 0.0, 1.0)
+        values = adjacent_rows[0] + share * (adjacent_rows[1] - adjacent_rows[0])
+        return values[: self._active_count], values[self._active_count :]
+
 
 _MAX_STEP_SHARE = 1 / 128  # of a move, at most
 _MIN_STEP_SHARE = 1e-11  # of a move, at which it gives up

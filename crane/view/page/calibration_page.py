@@ -18,14 +18,15 @@ from crane.identification.calibration.residual_dependence import (
 )
 from crane.recordings.recording_summary import result_title
 from crane.view.page.html_document import definition_list, html_table, write_document
+from crane.view.plots.calibration_figure import channel_residual_figure, residual_dependence_figure
 from crane.view.plots.identification_figures import correlation_figure
 from crane.view.plots.image_tags import image_tag
 from crane.view.plots.recording_figure import FIGURE_STYLE
-from crane.view.plots.residual_figures import channel_residual_figure, residual_dependence_figure
 
 _MIN_MATRIX_PARAMETERS = 3  # numbers, whose correlations need no picture
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def write_calibration_report(calibration: Calibration, path: str | Path) -> Path:
     """Write what a calibration found as one HTML file that needs no network.
 
@@ -44,16 +45,15 @@ def write_calibration_report(calibration: Calibration, path: str | Path) -> Path
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
     dependences = residual_dependences(calibration)
-    with mpl.rc_context(FIGURE_STYLE):
-        parts = [
-            _summary_facts(calibration),
-            "<h2>Numbers</h2>", _parameter_table(calibration),
-            "<h2>How well it follows</h2>", _channel_section(calibration),
-            "<h2>What is left</h2>", _dependence_section(dependences),
-            "<h2>What would help</h2>", _score_test_section(calibration),
-            "<h2>Not told apart</h2>", _correlation_section(calibration),
-            "<h2>The same machine</h2>", _option_text(calibration),
-        ]  # fmt: skip
+    parts = [
+        _summary_facts(calibration),
+        "<h2>Numbers</h2>", _parameter_table(calibration),
+        "<h2>How well it follows</h2>", _channel_section(calibration),
+        "<h2>What is left</h2>", _dependence_section(dependences),
+        "<h2>What would help</h2>", _score_test_section(calibration),
+        "<h2>Not told apart</h2>", _correlation_section(calibration),
+        "<h2>The same machine</h2>", _option_text(calibration),
+    ]  # fmt: skip
     return write_document(path, result_title(calibration.machine.name, "calibration"), parts)
 
 

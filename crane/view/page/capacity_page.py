@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from crane.common.atomic_output import replace_file
-from crane.common.errors import OutputError
 from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.ratings import Capacity
 from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
-from crane.view.page.report_page import PAGE_SUFFIXES
+from crane.view.page.html_document import check_page_suffix, write_page
 from crane.view.plots.capacity_figure import (
     capacity_heading,
     drawing_extent,
@@ -24,7 +22,7 @@ from crane.view.plots.capacity_figure import (
     home_outlines,
     load_contours,
 )
-from crane.view.sketch.machine_outline import MachineOutline, machine_outline
+from crane.view.sketch.mechanism_projection import MachineOutline, machine_outline
 
 _MAX_CELLS = 1500  # per slew angle, at most
 _OUTLINE_RESOLUTION = 4000.0  # of the extent, to which outlines are rounded
@@ -44,8 +42,7 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    check_page_suffix(path)
     assets = files("crane.view.page") / "assets"
     style, script, template = (
         (assets / f"capacity.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html")
@@ -57,9 +54,7 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
         script=script,
         data=data.replace("</", "<\\/"),
     )
-    with replace_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return Path(path)
+    return write_page(path, text)
 
 
 def capacity_page_data(chart: Capacity) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """What a page draws on the machine: forces of its drives and loads, springs between its bodies."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -8,12 +8,9 @@ from crane.common.samples import Array
 from crane.description.specification import ForceElement, GasSpring
 from crane.dynamics.frame_distances import FrameDistances
 from crane.machine import Machine
+from crane.recordings.recording import Recording
 from crane.view.page.machine_visuals import largest_body_extent
-from crane.view.page.packed_arrays import pack_base64
-from crane.view.page.page_motion import frame_data
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+from crane.view.page.page_motion import frame_data, pack_base64
 
 _FULL_ARROW_PERCENTILE = (
     99.5  # percentile of the forces that has a full arrow: a single spike does not count
@@ -25,7 +22,7 @@ _SAMPLED_CONFIGURATIONS = 300  # postures that tell how short a strut gets
 
 
 def actuator_markers(
-    machine: Machine, recording: "Recording", rows: np.ndarray
+    machine: Machine, recording: Recording, rows: np.ndarray
 ) -> list[dict[str, Any]]:
     """Where the driven joints act and how strongly, in shares of what has a full arrow."""
     model = machine.model
@@ -90,9 +87,7 @@ def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, fl
     }
 
 
-def load_markers(
-    machine: Machine, recording: "Recording", rows: np.ndarray
-) -> list[dict[str, Any]]:
+def load_markers(machine: Machine, recording: Recording, rows: np.ndarray) -> list[dict[str, Any]]:
     """Where forces from outside act and how strongly, in shares of the largest."""
     known_forces = [
         *machine.external_forces,

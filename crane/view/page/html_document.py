@@ -6,7 +6,8 @@ from pathlib import Path
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import OutputError
-from crane.view.page.report_page import PAGE_SUFFIXES
+
+PAGE_SUFFIXES = (".html", ".htm")
 
 _CSS = """
 :root { color: #26292e; background: #fff; font: 15px/1.5 system-ui, "Segoe UI", sans-serif; }
@@ -49,8 +50,7 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    check_page_suffix(path)
     heading = escape(heading)
     text = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -58,6 +58,25 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
         f"<title>{heading}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
         f"<h1>{heading}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
     )
+    return write_page(path, text)
+
+
+def check_page_suffix(path: str | Path) -> None:
+    """Check that a file name is that of a page.
+
+    Raises:
+        OutputError: The suffix is not .html or .htm.
+    """
+    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
+        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+
+
+def write_page(path: str | Path, text: str) -> Path:
+    """Write the HTML text of a page to a file, and return the path.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     with replace_file(path) as part:
         part.write_text(text, encoding="utf-8")
     return Path(path)

@@ -26,6 +26,7 @@ _CORRELATION_THRESHOLD = 0.9
 _VALIDATION_COLOUR = "#2a9d6f"
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def identification_report(
     result: Identification, path: str | Path, recording: str = "", validation: str = ""
 ) -> Path:
@@ -46,16 +47,15 @@ def identification_report(
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    with mpl.rc_context(FIGURE_STYLE):
-        parts = [
-            _summary_facts(result, recording, validation),
-            "<h2>Fit</h2>", _fit_section(result),
-            "<h2>Forces</h2>", _force_section(result),
-            "<h2>Base parameters</h2>", _base_parameter_section(result),
-            *([] if result.parameters is None else ["<h2>Bodies</h2>", _body_section(result)]),
-            "<h2>Correlations</h2>", _correlation_section(result),
-            "<h2>Not told</h2>", _unobservable_section(result),
-        ]  # fmt: skip
+    parts = [
+        _summary_facts(result, recording, validation),
+        "<h2>Fit</h2>", _fit_section(result),
+        "<h2>Forces</h2>", _force_section(result),
+        "<h2>Base parameters</h2>", _base_parameter_section(result),
+        *([] if result.parameters is None else ["<h2>Bodies</h2>", _body_section(result)]),
+        "<h2>Correlations</h2>", _correlation_section(result),
+        "<h2>Not told</h2>", _unobservable_section(result),
+    ]  # fmt: skip
     return write_document(
         path, result_title(result.described_machine.name, "identification"), parts
     )

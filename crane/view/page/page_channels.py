@@ -8,7 +8,7 @@ values at the cursor.
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +21,9 @@ from crane.recordings.recording import (
     REFERENCE_PREFIX,
     VELOCITY_SUFFIX,
     VELOCITY_UNITS,
+    Recording,
 )
-from crane.view.page.packed_arrays import pack_base64
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+from crane.view.page.page_motion import pack_base64
 
 MIN_SPANS = 4000  # of time, in a short recording
 SPANS_PER_SECOND = 15.0  # in a long one
@@ -90,7 +88,7 @@ class ThinningGrid:
 
     @classmethod
     def from_recording(
-        cls, recording: "Recording", frame_rows: np.ndarray, page_share: float = 1.0
+        cls, recording: Recording, frame_rows: np.ndarray, page_share: float = 1.0
     ) -> "ThinningGrid":
         """Spans for a recording that takes a share of the page."""
         time, columns = recording.time, 1 + 3 * len(recording.joints) + len(recording.channels)
@@ -136,9 +134,9 @@ def _column_series(column: PageColumn, grid: ThinningGrid, scale: float) -> dict
 
 def plot_groups(
     machine: Machine,
-    recording: "Recording",
+    recording: Recording,
     grid: ThinningGrid,
-    second_recording: "tuple[Recording, ThinningGrid] | None" = None,
+    second_recording: tuple[Recording, ThinningGrid] | None = None,
 ) -> list[dict[str, Any]]:
     """Everything that a page plots, by group.
 
@@ -197,7 +195,7 @@ def plot_groups(
     return group_data
 
 
-def page_columns(machine: Machine, recording: "Recording") -> Iterator[PageColumn]:
+def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]:
     """All columns but time, each in its group; references with what they are references of.
 
     Beside them what follows from them: errors, references less coordinates, and the sum of

@@ -1,14 +1,7 @@
-"""What a page computes postures from: the tree of joints, and their coordinates per frame.
+"""Motion of a page: joint tree, packed coordinates and frames for its script."""
 
-A page holds no poses. Its script computes them as Pinocchio does, from the root outwards,
-
-    oM_i = oM_parent(i)  placement_i  exp(S_i q_i),
-
-S_i being the joint's unit axis, which it turns about or slides along. A body that floats has six
-coordinates, place and rotation vector.
-"""
-
-from typing import TYPE_CHECKING, Any
+import base64
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,10 +9,38 @@ import pinocchio as pin
 from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.view.page.packed_arrays import pack_base64, quantise
+from crane.recordings.recording import Recording
 
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+_LEVELS = 2**32 - 1
+
+
+def pack_base64(values: np.ndarray, dtype_name: str) -> str:
+    """Base64 of little-endian numbers.
+
+    Args:
+        values: Any shape, written row by row.
+        dtype_name: numpy's name of the type, "f4", "f8" or "u4".
+    """
+    return base64.b64encode(
+        np.ascontiguousarray(values, dtype=f"<{dtype_name}").tobytes()
+    ).decode()
+
+
+def quantise(values: Array) -> dict[str, Any]:
+    """Coordinates in four bytes each, to 1.2e-10 of their range (float32 would have 6e-8).
+
+    Args:
+        values: (N,) finite.
+
+    Returns:
+        low, step and levels: value = low + step level; no levels where all are low.
+    """
+    low = float(values.min())
+    step = (float(values.max()) - low) / _LEVELS
+    if not step:
+        return {"low": low, "step": 0.0, "levels": ""}
+    return {"low": low, "step": step, "levels": pack_base64(np.rint((values - low) / step), "u4")}
+
 
 FRAMES_PER_SECOND = 30.0
 MAX_FRAMES = 36_000  # twenty minutes at full rate; longer recordings get fewer per second
@@ -129,7 +150,7 @@ def motion_data(time: Array, q: Array) -> dict[str, Any]:
     return {"time": pack_base64(time, "f8"), "q": [quantise(column) for column in q.T]}
 
 
-def check_joints(machine: Machine, recording: "Recording") -> None:
+def check_joints(machine: Machine, recording: Recording) -> None:
     """See that a recording is of this machine.
 
     Raises:
@@ -155,7 +176,7 @@ def check_joints(machine: Machine, recording: "Recording") -> None:
             )
 
 
-def recorded_configurations(machine: Machine, recording: "Recording", rows: np.ndarray) -> Array:
+def recorded_configurations(machine: Machine, recording: Recording, rows: np.ndarray) -> Array:
     """(len(rows), nq) closed postures of some samples of a recording.
 
     Raises:
@@ -181,7 +202,7 @@ def recorded_configurations(machine: Machine, recording: "Recording", rows: np.n
     return q
 
 
-def _is_recorded(machine: Machine, recording: "Recording", joint: str) -> bool:
+def _is_recorded(machine: Machine, recording: Recording, joint: str) -> bool:
     """Whether the channel of a passive joint is there, in the joint's unit or in none."""
     unit = recording.channel_units.get(joint)
     return unit is not None and unit in ("", machine.unit(joint))

@@ -7,15 +7,15 @@ from importlib.resources import files
 from math import cos, sin
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from crane.common.atomic_output import replace_file
-from crane.common.errors import OutputError, RecordingError
+from crane.common.errors import RecordingError
 from crane.machine import Machine
+from crane.recordings.recording import Recording
 from crane.recordings.recording_differences import clock_shift, joint_differences
 from crane.recordings.recording_summary import label, point_channel, result_title
 from crane.view.page.force_markers import actuator_markers, load_markers, spring_markers
-from crane.view.page.packed_arrays import pack_base64
+from crane.view.page.html_document import check_page_suffix, write_page
 from crane.view.page.page_channels import ThinningGrid, plot_groups
 from crane.view.page.page_motion import (
     check_joints,
@@ -23,16 +23,12 @@ from crane.view.page.page_motion import (
     frame_rows,
     joint_tree,
     motion_data,
+    pack_base64,
     payload_frame_data,
     recorded_configurations,
 )
 from crane.view.page.run_summary import summarize_run
 from crane.view.page.scene import Scene, build_scene
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
-
-PAGE_SUFFIXES = (".html", ".htm")
 
 # Directions from the machine to the camera; x forward (see `Scene.heading`), z up.
 CAMERA_DIRECTIONS = {
@@ -45,9 +41,9 @@ SCRIPT_NAMES = ("data", "kinematics", "timeline", "scene", "marks", "plots", "ch
 
 def report(
     machine: Machine,
-    recording: "Recording | None",
+    recording: Recording | None,
     path: str | Path,
-    second_recording: "Recording | None" = None,
+    second_recording: Recording | None = None,
 ) -> Path:
     """Write a machine, moving as recorded or in its home posture, as one HTML file.
 
@@ -70,18 +66,14 @@ def report(
         InputError: A posture is not finite.
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
-    text = report_html(machine, recording, second_recording)
-    with replace_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return Path(path)
+    check_page_suffix(path)
+    return write_page(path, report_html(machine, recording, second_recording))
 
 
 def report_html(
     machine: Machine,
-    recording: "Recording | None",
-    second_recording: "Recording | None" = None,
+    recording: Recording | None,
+    second_recording: Recording | None = None,
     frame_share: float = 1.0,
 ) -> str:
     """The page of `report`, as HTML.
@@ -104,7 +96,7 @@ def open_in_browser(path: str | Path) -> bool:
     return webbrowser.open(Path(path).resolve().as_uri())
 
 
-def _machine_data(machine: Machine, scene: Scene, recording: "Recording | None") -> dict[str, Any]:
+def _machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
     """What is known of the machine itself."""
     return {
         "machine": machine.name,
@@ -135,8 +127,8 @@ def _machine_data(machine: Machine, scene: Scene, recording: "Recording | None")
 def _run_data(
     machine: Machine,
     scene: Scene,
-    recording: "Recording",
-    second_recording: "Recording | None",
+    recording: Recording,
+    second_recording: Recording | None,
     frame_share: float,
 ) -> dict[str, Any]:
     """What was recorded, once or twice."""

@@ -1,6 +1,6 @@
 """The few facts and numbers that a page tells of a run in words."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -8,17 +8,14 @@ from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks
 from crane.common.units import format_number, format_quantity
 from crane.machine import Machine
-from crane.recordings.recording import FORCE_UNITS
+from crane.recordings.recording import FORCE_UNITS, Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS, summarize
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
 
 _MAX_LIMIT_SENTENCES = 6  # on limits, at most
 _LIMIT_TOLERANCE = 1e-4  # share of a range that counts as at its end
 
 
-def summarize_run(machine: Machine, recording: "Recording | None") -> dict[str, Any]:
+def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, Any]:
     """What the page's panel says.
 
     Returns:
@@ -88,7 +85,7 @@ def summarize_run(machine: Machine, recording: "Recording | None") -> dict[str, 
     }
 
 
-def mechanical_work(recording: "Recording") -> tuple[float, float]:
+def mechanical_work(recording: Recording) -> tuple[float, float]:
     """Work [J] that the active joints gave to the machine, and that it gave back to them.
 
     The integrals of the positive and of the negative part of sum tau v, by the trapezoidal rule.
@@ -102,7 +99,7 @@ def mechanical_work(recording: "Recording") -> tuple[float, float]:
     return float(delivered), float(returned)
 
 
-def reached_limit_sentences(machine: Machine, recording: "Recording") -> list[str]:
+def reached_limit_sentences(machine: Machine, recording: Recording) -> list[str]:
     """Sentences on active joints that were at or beyond the ends of their ranges."""
     sentences = []
     for i, joint in enumerate(machine.active):

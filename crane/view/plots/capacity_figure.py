@@ -21,8 +21,8 @@ from crane.ratings import Capacity
 from crane.ratings.capacity_report import slew_labels
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, write_figure
-from crane.view.sketch.machine_outline import MachineOutline, machine_outline
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading, write_figure
+from crane.view.sketch.mechanism_projection import MachineOutline, machine_outline
 
 FACTOR_COLOURS = (
     "#a9c8ea", "#f6c08c", "#a6d9b0", "#d5b8e4", "#f0aaa6", "#a5d8df", "#e5d98f", "#c3c7cd",
@@ -58,6 +58,7 @@ def plot_capacity(chart: Capacity, path: str | Path) -> None:
     write_figure(path, lambda: capacity_figure(chart))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def capacity_figure(chart: Capacity) -> Figure:
     """The figure of rated loads: one panel per slew angle."""
     lower, upper = drawing_extent(chart)
@@ -67,29 +68,22 @@ def capacity_figure(chart: Capacity) -> Figure:
     content_width, content_height = upper - lower
     height = float(np.clip(8.6 / columns * content_height / content_width, 3.0, 6.5))
     width = float(np.clip(columns * height * content_width / content_height + 1.0, 5.0, 10.0))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
-        panels = figure.subplots(lines, columns, squeeze=False).ravel()
-        for k, axes in enumerate(panels):
-            if k < panel_count:
-                draw_capacity_panel(axes, chart, k)
-                if k % columns:
-                    axes.set_ylabel("")
-            else:
-                axes.set_axis_off()
-        figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
-        figure.suptitle(
-            escape_label(capacity_heading(chart)),
-            x=0.01,
-            ha="left",
-            fontsize=11,
-            fontweight="bold",
-        )
-        figure.legend(
-            handles=legend_patches(chart),
-            loc="outside lower center",
-            ncols=2 if panel_count > 1 else 1,
-        )
+    figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for k, axes in enumerate(panels):
+        if k < panel_count:
+            draw_capacity_panel(axes, chart, k)
+            if k % columns:
+                axes.set_ylabel("")
+        else:
+            axes.set_axis_off()
+    figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
+    add_heading(figure, escape_label(capacity_heading(chart)))
+    figure.legend(
+        handles=legend_patches(chart),
+        loc="outside lower center",
+        ncols=2 if panel_count > 1 else 1,
+    )
     return figure
 
 

@@ -2,6 +2,7 @@
 
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -49,25 +50,25 @@ def plot_capacity_sheet(chart: Capacity, path: str | Path) -> None:
     write_figure(path, lambda: capacity_sheet_figure(chart))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def capacity_sheet_figure(chart: Capacity) -> Figure:
     """The page as a figure."""
     table = chart.table
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(_PAGE_WIDTH, _PAGE_HEIGHT))
-        top = _PAGE_HEIGHT - _PAGE_MARGIN
-        figure.text(
-            _PAGE_MARGIN / _PAGE_WIDTH,
-            top / _PAGE_HEIGHT,
-            escape_label(capacity_heading(chart)),
-            va="top",
-            fontsize=13,
-            fontweight="bold",
-        )
-        _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
-        table_bottom = _PAGE_MARGIN + 1.6 * _LINE_HEIGHT
-        table_top = _draw_table(figure, chart, table, table_bottom)
-        charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
-        _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
+    figure = Figure(figsize=(_PAGE_WIDTH, _PAGE_HEIGHT))
+    top = _PAGE_HEIGHT - _PAGE_MARGIN
+    figure.text(
+        _PAGE_MARGIN / _PAGE_WIDTH,
+        top / _PAGE_HEIGHT,
+        escape_label(capacity_heading(chart)),
+        va="top",
+        fontsize=13,
+        fontweight="bold",
+    )
+    _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
+    table_bottom = _PAGE_MARGIN + 1.6 * _LINE_HEIGHT
+    table_top = _draw_table(figure, chart, table, table_bottom)
+    charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
+    _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
     return figure
 
 
@@ -78,13 +79,11 @@ def _write_text(
     text: str,
     colour: str = INK_COLOUR,
     size: float = _TEXT_SIZE,
-    **options: object,
+    **options: Any,
 ) -> None:
     """A line of text at a place [inch]."""
-    escaped_text = escape_text(text)
-    figure.text(
-        x / _PAGE_WIDTH, y / _PAGE_HEIGHT, escaped_text, fontsize=size, color=colour, **options
-    )  # type: ignore[arg-type]
+    x, y = x / _PAGE_WIDTH, y / _PAGE_HEIGHT
+    figure.text(x, y, escape_text(text), fontsize=size, color=colour, **options)
 
 
 def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> float:

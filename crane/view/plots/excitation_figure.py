@@ -35,15 +35,15 @@ def plot_excitation(excitation: Excitation, path: str | Path) -> None:
     write_figure(path, lambda: excitation_figure(excitation))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def excitation_figure(excitation: Excitation) -> Figure:
     """The figure of a reference: limits dashed, ways from and to rest shaded."""
     count = len(excitation.machine.active)
     columns = tuple(x[:: -(-len(x) // _MAX_POINTS)] for x in excitation.motion())
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(2.4 * count + 0.6, 6.0), layout="constrained")
-        grid = figure.subplots(3, count, sharex=True, squeeze=False)
-        for i in range(count):
-            _draw_joint(list(grid[:, i]), excitation, columns, i)
+    figure = Figure(figsize=(2.4 * count + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, count, sharex=True, squeeze=False)
+    for i in range(count):
+        _draw_joint(list(grid[:, i]), excitation, columns, i)
     return figure
 
 
@@ -94,14 +94,14 @@ def plot_signals(excitation: SignalExcitation, path: str | Path) -> None:
     write_figure(path, lambda: signals_figure(excitation))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def signals_figure(excitation: SignalExcitation) -> Figure:
     """The figure of valve signals: signal, stroke with its ends dashed, pressures."""
     count = len(excitation.signals)
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(3.0 * count + 0.6, 6.0), layout="constrained")
-        grid = figure.subplots(3, count, sharex=True, squeeze=False)
-        for i, joint in enumerate(excitation.signals):
-            _draw_valve(list(grid[:, i]), excitation, joint)
+    figure = Figure(figsize=(3.0 * count + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, count, sharex=True, squeeze=False)
+    for i, joint in enumerate(excitation.signals):
+        _draw_valve(list(grid[:, i]), excitation, joint)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Linear models as pictures: poles and frequency responses, and modes over strokes and loads."""
+"""Figures of linear models and sensitivities."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,13 +10,17 @@ from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
 from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.description.machine_lookup import CHANGES_SEPARATOR
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
 from crane.simulation.linear import LinearModel, Mode
+from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_heading,
     write_figure,
 )
 
@@ -60,6 +64,7 @@ def plot_parameter_modes(
     write_figure(path, lambda: parameter_modes_figure(models))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def modes_figure(model: LinearModel) -> Figure:
     """Poles, each with what it moves most, and a panel of responses per input that has any."""
     frequencies = _frequency_grid(model)
@@ -69,20 +74,19 @@ def modes_figure(model: LinearModel) -> Figure:
         for j in range(len(model.inputs))
         if responses[:, _position_outputs(model), j].max(initial=0) > 0
     ][:_MAX_INPUT_PANELS]
-    with mpl.rc_context(FIGURE_STYLE):
-        columns = 1 + min(len(responding_inputs), 3)
-        rows = max(1, -(-len(responding_inputs) // 3))
-        figure = Figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5), layout="constrained")
-        grid = figure.add_gridspec(rows, columns)
-        _draw_poles(figure.add_subplot(grid[:, 0]), model)
-        for i, j in enumerate(responding_inputs):
-            axes = figure.add_subplot(grid[i // 3, 1 + i % 3])
-            _draw_response(axes, model, frequencies, responses[:, :, j], j)
-        heading = result_title(model.machine.name, "small motions")
-        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    columns = 1 + min(len(responding_inputs), 3)
+    rows = max(1, -(-len(responding_inputs) // 3))
+    figure = Figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5), layout="constrained")
+    grid = figure.add_gridspec(rows, columns)
+    _draw_poles(figure.add_subplot(grid[:, 0]), model)
+    for i, j in enumerate(responding_inputs):
+        axes = figure.add_subplot(grid[i // 3, 1 + i % 3])
+        _draw_response(axes, model, frequencies, responses[:, :, j], j)
+    add_heading(figure, escape_label(result_title(model.machine.name, "small motions")))
     return figure
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]]) -> Figure:
     """Above frequencies, below damping, over the first name; a colour per value of the others."""
     names = list(models[0][0])
@@ -90,31 +94,27 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
     for values, model in models:
         first_value, other_values = next(iter(values.values())), tuple(values.values())[1:]
         families.setdefault(other_values, []).append((first_value, model))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(6.4, 5.6), layout="constrained")
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        for color, (family_values, family) in zip(
-            _cycle_colours(len(families)), families.items(), strict=True
-        ):
-            pairs = zip(names[1:], family_values, strict=True)
-            label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
-            family.sort(key=lambda pair: pair[0])
-            for k, (x, frequency, damping) in enumerate(_track_modes(family)):
-                label = escape_label(label_text) if label_text and not k else "_"
-                upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
-                lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
-        upper.set_yscale("log")
-        upper.set_ylabel("frequency [Hz]")
-        lower.set_ylabel("damping [%]")
-        machine = models[0][1].machine
-        unit = machine.unit(names[0]) if names[0] in machine.active else ""
-        lower.set_xlabel(escape_label(f"{names[0]} [{unit}]" if unit else names[0]))
-        if len(families) > 1:
-            figure.legend(loc="outside lower center", ncols=min(len(families), 5))
-        label_text = result_title(machine.name, "what rings")
-        figure.suptitle(
-            escape_label(label_text), x=0.01, ha="left", fontsize=11, fontweight="bold"
-        )
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for color, (family_values, family) in zip(
+        _cycle_colours(len(families)), families.items(), strict=True
+    ):
+        pairs = zip(names[1:], family_values, strict=True)
+        label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
+        family.sort(key=lambda pair: pair[0])
+        for k, (x, frequency, damping) in enumerate(_track_modes(family)):
+            label = escape_label(label_text) if label_text and not k else "_"
+            upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
+            lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
+    upper.set_yscale("log")
+    upper.set_ylabel("frequency [Hz]")
+    lower.set_ylabel("damping [%]")
+    machine = models[0][1].machine
+    unit = machine.unit(names[0]) if names[0] in machine.active else ""
+    lower.set_xlabel(escape_label(f"{names[0]} [{unit}]" if unit else names[0]))
+    if len(families) > 1:
+        figure.legend(loc="outside lower center", ncols=min(len(families), 5))
+    add_heading(figure, escape_label(result_title(machine.name, "what rings")))
     return figure
 
 
@@ -227,3 +227,55 @@ def _draw_response(
     axes.set_title(escape_label(f"per {model.inputs[input_index]}"))
     axes.set_xlabel("frequency [Hz]")
     axes.legend(fontsize=6.5)
+
+
+_MAX_PANELS = 18  # panels
+
+
+def plot_sensitivities(sensitivities: Sensitivities, path: str | Path) -> None:
+    """Write the picture to a file.
+
+    Args:
+        sensitivities: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: sensitivities_figure(sensitivities))
+
+
+@mpl.rc_context(FIGURE_STYLE)
+def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
+    """A panel per output that depends on something, a line per number."""
+    effects = sensitivities.derivatives * sensitivities.typical_changes
+    panels = []
+    for k, output in enumerate(sensitivities.outputs):
+        largest = float(np.abs(effects[:, k]).max())
+        unit, scale = display_unit(sensitivities.unit(output), largest)
+        if scale * largest > ZERO_TOLERANCE:
+            panels.append((output, unit, scale * effects[:, k]))
+    panels = panels[:_MAX_PANELS]
+    columns = 2 if len(panels) > 1 else 1
+    rows = max(1, -(-len(panels) // columns))
+    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.9), layout="constrained")
+    for k, (output, unit, values) in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        for i, name in enumerate(sensitivities.parameters):
+            label = escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}")
+            axes.plot(sensitivities.recording.time, values[:, i], linewidth=1.0, label=label)
+        axes.set_title(escape_label(f"{output} [{unit}]"), fontsize=8.5)
+        if k >= len(panels) - columns:
+            axes.set_xlabel("time [s]")
+    if panels:
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    add_heading(
+        figure,
+        escape_label(
+            result_title(
+                sensitivities.recording.machine.partition(CHANGES_SEPARATOR)[0], "sensitivities"
+            )
+        ),
+    )
+    return figure

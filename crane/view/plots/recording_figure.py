@@ -24,8 +24,7 @@ from crane.common.scratch_arrays import release_pages
 from crane.common.units import display_unit
 from crane.recordings.recording import FORCE_UNITS, Recording
 from crane.recordings.recording_summary import heading, point_channel, tip_error
-from crane.view.plots.curve_thinning import envelope, thin_path
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_text import envelope, escape_label, thin_path
 
 FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
     "png": None,
@@ -129,6 +128,12 @@ def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
         figure.savefig(part, format=file_format, dpi=200, metadata=FIGURE_FORMATS[file_format])
 
 
+def add_heading(figure: Figure, text: str) -> None:
+    """Add a bold heading at the upper left."""
+    figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
+@mpl.rc_context(FIGURE_STYLE)
 def recording_figure(recording: Recording) -> Figure:
     """The figure of a recording.
 
@@ -150,26 +155,23 @@ def recording_figure(recording: Recording) -> Figure:
     ]
     panels = [[column[row] for column in panels_by_joint] for row in used_rows]
     rows = len(used_rows)
-    with mpl.rc_context(FIGURE_STYLE):
-        bands = -(-len(joints) // MAX_COLUMNS)
-        columns = -(-len(joints) // bands)
-        is_spatial = tip is not None and path_plane is None
-        widths = [1.0] * columns + [1.6 if is_spatial else 1.0] * (tip is not None)
-        width = 2.4 * sum(widths) + 0.3
-        margin = 0.3 if is_spatial else 0.0  # the layout overlooks the label of the z axis
-        layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
-        figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
-        grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
-        letters = iter(ascii_lowercase)
-        for band, row in itertools.product(range(bands), range(rows)):
-            joints_in_band = range(band * columns, min((band + 1) * columns, len(joints)))
-            grid_cells = {
-                i: grid[rows * band + row, i - joints_in_band.start] for i in joints_in_band
-            }
-            _draw_row(figure, grid_cells, recording, panels, row, letters)
-        if tip is not None:
-            _draw_tip_path(figure, grid, recording, tip, path_plane, letters)
-        _add_caption(figure, recording)
+    bands = -(-len(joints) // MAX_COLUMNS)
+    columns = -(-len(joints) // bands)
+    is_spatial = tip is not None and path_plane is None
+    widths = [1.0] * columns + [1.6 if is_spatial else 1.0] * (tip is not None)
+    width = 2.4 * sum(widths) + 0.3
+    margin = 0.3 if is_spatial else 0.0  # the layout overlooks the label of the z axis
+    layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
+    figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
+    grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
+    letters = iter(ascii_lowercase)
+    for band, row in itertools.product(range(bands), range(rows)):
+        joints_in_band = range(band * columns, min((band + 1) * columns, len(joints)))
+        grid_cells = {i: grid[rows * band + row, i - joints_in_band.start] for i in joints_in_band}
+        _draw_row(figure, grid_cells, recording, panels, row, letters)
+    if tip is not None:
+        _draw_tip_path(figure, grid, recording, tip, path_plane, letters)
+    _add_caption(figure, recording)
     return figure
 
 
@@ -406,9 +408,7 @@ def _add_caption(figure: Figure, recording: Recording) -> None:
     """What is shown, and which line is what."""
     heading_text = heading(recording)
     if heading_text:
-        figure.suptitle(
-            escape_label(heading_text), x=0.01, ha="left", fontsize=11, fontweight="bold"
-        )
+        add_heading(figure, escape_label(heading_text))
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
     if legend_lines := [
         lines[label] for label in LINE_STYLES if label in lines and label != "recording"

@@ -98,6 +98,7 @@ def plot_sankey(balance: PowerBalance, path: str | Path) -> None:
     write_figure(path, lambda: sankey_figure(balance))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def sankey_figure(balance: PowerBalance) -> Figure:
     """Energies from the shafts by pump and joint into what they go into, in kJ and %.
 
@@ -105,8 +106,7 @@ def sankey_figure(balance: PowerBalance) -> Figure:
     What has less than 0.4 % is drawn as others, less than 0.1 % not at all. Percentages are of
     what the shafts give.
     """
-    with mpl.rc_context(FIGURE_STYLE):
-        return _SankeyDiagram(balance).figure
+    return _SankeyDiagram(balance).figure
 
 
 class _SankeyDiagram:

@@ -18,6 +18,7 @@ from crane.view.plots.recording_figure import (
     DASHED_STYLE,
     FIGURE_STYLE,
     RECORDED_COLOUR,
+    add_heading,
     write_figure,
 )
 
@@ -41,6 +42,7 @@ def plot_study(study: Study, path: str | Path) -> None:
     write_figure(path, lambda: study_figure(study))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def study_figure(study: Study) -> Figure:
     """The figure of a study, a panel per measure; measures that do not change are left out.
 
@@ -49,13 +51,12 @@ def study_figure(study: Study) -> Figure:
     """
     shown_measures = [name for name in study.measures if _is_varying(study.columns[name])]
     shown_measures = (shown_measures or list(study.measures))[:_MAX_PANELS]
-    with mpl.rc_context(FIGURE_STYLE):
-        if not study.grid_shape or len(study.parameters) > 2:
-            figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
-        else:
-            figure = _draw_panels(study, shown_measures)
-        heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
-        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    if not study.grid_shape or len(study.parameters) > 2:
+        figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
+    else:
+        figure = _draw_panels(study, shown_measures)
+    heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
+    add_heading(figure, escape_label(heading))
     return figure
 
 

@@ -22,6 +22,7 @@ from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_heading,
     joint_symbol,
     write_figure,
 )
@@ -56,6 +57,7 @@ def plot_workspace(reachable_space: Workspace, path: str | Path) -> None:
     write_figure(path, lambda: workspace_figure(reachable_space))
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def workspace_figure(reachable_space: Workspace) -> Figure:
     """The figure of a workspace.
 
@@ -63,41 +65,40 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     move it most, and the machine at home; right over these two strokes the condition of the drive
     and the least singular value of the tip's slopes, grey where the loops do not close.
     """
-    with mpl.rc_context(FIGURE_STYLE):
-        lower, upper = (
-            reachable_space.section_positions.min(axis=0),
-            reachable_space.section_positions.max(axis=0),
-        )
-        skeleton = skeleton_lines(reachable_space)
-        lower = np.minimum(lower, skeleton.reshape(-1, 2).min(axis=0))
-        upper = np.maximum(upper, skeleton.reshape(-1, 2).max(axis=0))
-        aspect = np.clip((upper - lower)[1] / max((upper - lower)[0], 1e-9), 0.45, 1.5)
-        has_condition_panel = (
-            float(np.nanmax(reachable_space.stroke_map.condition)) > _MIN_SHOWN_CONDITION
-        )
-        height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
-        figure = Figure(figsize=(9.6, height), layout="constrained")
-        grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
-        _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, (lower, upper))
-        right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
-        if has_condition_panel:
-            _draw_stroke_map(
-                right[0],
-                reachable_space,
-                reachable_space.stroke_map.condition,
-                "condition of the drive",
-            )
-            right[0].sharex(right[1])
-            right[0].tick_params(labelbottom=False)
-            right[0].set_xlabel("")
+    lower, upper = (
+        reachable_space.section_positions.min(axis=0),
+        reachable_space.section_positions.max(axis=0),
+    )
+    skeleton = skeleton_lines(reachable_space)
+    lower = np.minimum(lower, skeleton.reshape(-1, 2).min(axis=0))
+    upper = np.maximum(upper, skeleton.reshape(-1, 2).max(axis=0))
+    aspect = np.clip((upper - lower)[1] / max((upper - lower)[0], 1e-9), 0.45, 1.5)
+    has_condition_panel = (
+        float(np.nanmax(reachable_space.stroke_map.condition)) > _MIN_SHOWN_CONDITION
+    )
+    height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
+    figure = Figure(figsize=(9.6, height), layout="constrained")
+    grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
+    _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, (lower, upper))
+    right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
+    if has_condition_panel:
         _draw_stroke_map(
-            right[-1],
+            right[0],
             reachable_space,
-            reachable_space.stroke_map.least_singular_value,
-            "tip, least singular [m]",
+            reachable_space.stroke_map.condition,
+            "condition of the drive",
         )
-        right[0].set_title(_stroke_title(reachable_space))
-        _add_caption(figure, reachable_space)
+        right[0].sharex(right[1])
+        right[0].tick_params(labelbottom=False)
+        right[0].set_xlabel("")
+    _draw_stroke_map(
+        right[-1],
+        reachable_space,
+        reachable_space.stroke_map.least_singular_value,
+        "tip, least singular [m]",
+    )
+    right[0].set_title(_stroke_title(reachable_space))
+    _add_caption(figure, reachable_space)
     return figure
 
 
@@ -294,7 +295,7 @@ def _add_caption(figure: Figure, reachable_space: Workspace) -> None:
             f", turned by {joint_symbol(reachable_space.slewing_joint_name)} from "
             f"{slewing_range[0]:.4g}° to {slewing_range[1]:.4g}°"
         )
-    figure.suptitle(heading, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    add_heading(figure, heading)
     handles: list[Line2D | Swatch] = [
         Line2D([], [], marker="o", ls="", color=INK_COLOUR, mfc="white", mew=1.3, label="home")
     ]

@@ -1,9 +1,139 @@
-"""What a mechanism consists of, in the coordinates of the plane that it is drawn in."""
+"""Plane and elements of a sketch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
+from crane.machine import Machine
+
+_PARALLEL_TOLERANCE = 1e-6  # deviation of unit vectors that count as parallel
+
+# Directions to the right and up in views along a world axis.
+VIEW_DIRECTIONS = {
+    "xy": (np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
+    "xz": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
+    "yz": (np.array([0, 1.0, 0]), np.array([0, 0, 1.0])),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class DrawingPlane:
+    """A plane to draw in.
+
+    Attributes:
+        right: (3,) unit vector of the first coordinate.
+        up: (3,) unit vector of the second coordinate.
+        labels: What the coordinates are called.
+    """
+
+    right: Array
+    up: Array
+    labels: tuple[str, str]
+
+    @property
+    def normal(self) -> Array:
+        """(3,) unit vector towards whoever looks at it."""
+        return np.cross(self.right, self.up)
+
+    def project(self, vectors: Array) -> Array:
+        """Coordinates (..., 2) of points or directions (..., 3)."""
+        return vectors @ np.column_stack([self.right, self.up])
+
+
+def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPlane:
+    """The plane to draw a machine in.
+
+    At least half of the revolute axes, those of the loops included, are parallel in the home
+    posture and perpendicular to the plane; among equals, it is the plane that holds the vertical.
+    The plane turns with the body that carries the first of these joints.
+
+    Args:
+        machine: The machine.
+        q: (nq,) closed posture.
+        view: A key of `VIEW_DIRECTIONS`, to look along an axis of the world instead.
+
+    Raises:
+        InputError: Unknown view, or too few axes are parallel.
+    """
+    if view is not None:
+        if view not in VIEW_DIRECTIONS:
+            raise InputError(f"view '{view}' is unknown, {suggest_names(VIEW_DIRECTIONS, view)}")
+        return _label_plane(*VIEW_DIRECTIONS[view])
+    home_data = pin.Data(machine.model)
+    pin.forwardKinematics(machine.model, home_data, machine.home)
+    axes, carriers = _revolute_axes(machine, home_data)
+    is_parallel = np.abs(axes @ axes.T) > 1 - _PARALLEL_TOLERANCE
+    counts = is_parallel.sum(axis=1)
+    if 2 * counts.max(initial=0) < max(len(axes), 1):
+        raise InputError(
+            f"{machine.name} has no plane: no more than {counts.max(initial=0)} of its "
+            f"{len(axes)} revolute axes are parallel; choose the plane "
+            f"({', '.join(VIEW_DIRECTIONS)})"
+        )
+    is_level = np.abs(axes[:, 2]) < _PARALLEL_TOLERANCE
+    chosen_axis = max(range(len(axes)), key=lambda i: (counts[i], is_level[i], -i))
+    right, up = _plane_directions(axes[chosen_axis])
+    moved_data = pin.Data(machine.model)
+    pin.forwardKinematics(machine.model, moved_data, q)
+    body = carriers[chosen_axis]
+    body_rotation = moved_data.oMi[body].rotation @ home_data.oMi[body].rotation.T
+    return _label_plane(body_rotation @ right, body_rotation @ up)
+
+
+def joint_axes(machine: Machine, data: pin.Data) -> Array:
+    """(njoints, 3) directions of all joints in the world, the first row unused.
+
+    Args:
+        machine: The machine.
+        data: After forward kinematics.
+    """
+    model = machine.model
+    axes = np.zeros((model.njoints, 3))
+    for i in range(1, model.njoints):
+        column = np.asarray(model.joints[i].createData().S).reshape(6)
+        axes[i] = data.oMi[i].rotation @ (column[:3] + column[3:])  # one of both is zero
+    return axes
+
+
+def _revolute_axes(machine: Machine, data: pin.Data) -> tuple[Array, list[int]]:
+    """Directions (k, 3) of all revolute axes, and the joint that carries each."""
+    model, equations = machine.model, machine.closure.equations
+    all_axes, axes, carriers = joint_axes(machine, data), [], []
+    for i, name in enumerate(machine.joints, start=1):
+        if machine.unit(name) == "rad":
+            axes.append(all_axes[i])
+            carriers.append(int(model.parents[i]))
+    for loop, (joint, placement) in zip(equations.loops, equations.frames[::2], strict=True):
+        if loop.type == "revolute":
+            axes.append((data.oMi[joint] * placement).rotation[:, 2])
+            carriers.append(joint)
+    return np.array(axes).reshape(-1, 3), carriers
+
+
+def _plane_directions(normal: Array) -> tuple[Array, Array]:
+    """Directions to the right and up in the plane with a normal, near those of the world."""
+    vertical_part = np.eye(3)[2] - normal[2] * normal
+    up = (
+        vertical_part if np.linalg.norm(vertical_part) > 0.5 else np.eye(3)[1] - normal[1] * normal
+    )
+    up = up / np.linalg.norm(up)
+    right = np.cross(up, normal)
+    return right * np.sign(right[np.argmax(np.abs(right))]), up
+
+
+def _label_plane(right_direction: Array, up_direction: Array) -> DrawingPlane:
+    names = []
+    for direction, default_label in (
+        (right_direction, "in the machine's plane"),
+        (up_direction, "upwards"),
+    ):
+        axis = int(np.argmax(direction))
+        names.append("xyz"[axis] if direction[axis] > 1 - _PARALLEL_TOLERANCE else default_label)
+    return DrawingPlane(right_direction, up_direction, (names[0], names[1]))
 
 
 @dataclass(frozen=True, eq=False)

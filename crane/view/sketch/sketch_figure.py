@@ -17,7 +17,6 @@ from crane.common.samples import Array
 from crane.machine import Machine
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
-from crane.view.sketch.drawing_plane import find_plane
 from crane.view.sketch.label_placement import SketchLabel, find_clear_point, place_labels
 from crane.view.sketch.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
 from crane.view.sketch.sketch_canvas import (
@@ -28,10 +27,17 @@ from crane.view.sketch.sketch_canvas import (
     QUARTER_MARKERS,
     SketchCanvas,
     convex_hull,
+    create_sketch_layout,
+    format_joint_symbol,
     marker_options,
 )
-from crane.view.sketch.sketch_elements import SketchBody, SketchMechanism, SketchPin, SketchSlide
-from crane.view.sketch.sketch_layout import create_sketch_layout, format_joint_symbol
+from crane.view.sketch.sketch_elements import (
+    SketchBody,
+    SketchMechanism,
+    SketchPin,
+    SketchSlide,
+    find_plane,
+)
 
 CHAIN_COLOURS = (
     "#1f5fa8", "#d0661c", "#2f8050", "#8a4a9c", "#b03a48", "#2b8c9c", "#8c7a1e", "#5a5f66",
@@ -84,6 +90,7 @@ def sketch(
     )
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def sketch_figure(
     machine: Machine,
     q_a: ArrayLike | None = None,
@@ -110,31 +117,30 @@ def sketch_figure(
     drawing_plane = find_plane(machine, q, plane)
     mechanism = project_mechanism(machine, q, drawing_plane)
     ghosts = [project_mechanism(machine, other, drawing_plane) for other in other_configurations]
-    with mpl.rc_context(FIGURE_STYLE):
-        legend = _legend(machine, show_centres_of_mass) + [
-            (_ghost_line(i),) for i in range(len(ghosts))
-        ]
-        figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
-        _draw_regions(canvas, mechanism)
-        for i, ghost in enumerate(ghosts):
-            _draw_ghost(canvas, ghost, mechanism, i)
-        for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
-            _draw_body(canvas, body)
-        for slide in mechanism.slides:
-            _draw_slide(canvas, slide)
-        for position, down_direction in mechanism.ground:
-            canvas.draw_ground(
-                position, down_direction, _ground_gap(mechanism, position, down_direction)
-            )
-        for item in mechanism.collars:
-            canvas.draw_collar(item.name, item.position, item.axis)
-        if show_centres_of_mass:
-            _draw_centres(canvas, mechanism)
-        if mechanism.tip is not None:
-            canvas.draw_tip(mechanism.tip)
-        _draw_pins(canvas, mechanism)
-        _number_regions(canvas, mechanism)
-        place_labels(canvas, _create_labels(mechanism))
+    legend = _legend(machine, show_centres_of_mass) + [
+        (_ghost_line(i),) for i in range(len(ghosts))
+    ]
+    figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
+    _draw_regions(canvas, mechanism)
+    for i, ghost in enumerate(ghosts):
+        _draw_ghost(canvas, ghost, mechanism, i)
+    for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
+        _draw_body(canvas, body)
+    for slide in mechanism.slides:
+        _draw_slide(canvas, slide)
+    for position, down_direction in mechanism.ground:
+        canvas.draw_ground(
+            position, down_direction, _ground_gap(mechanism, position, down_direction)
+        )
+    for item in mechanism.collars:
+        canvas.draw_collar(item.name, item.position, item.axis)
+    if show_centres_of_mass:
+        _draw_centres(canvas, mechanism)
+    if mechanism.tip is not None:
+        canvas.draw_tip(mechanism.tip)
+    _draw_pins(canvas, mechanism)
+    _number_regions(canvas, mechanism)
+    place_labels(canvas, _create_labels(mechanism))
     return figure
 
 

@@ -15,10 +15,14 @@ from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
 from crane.view.sketch.circuit import circuit_section
 from crane.view.sketch.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
-from crane.view.sketch.circuit.circuit_section import CircuitFunction, CircuitSection
-from crane.view.sketch.circuit.open_centre_lines import OpenCentreLines
-from crane.view.sketch.circuit.spool_symbol import SPOOL_HEIGHT
+from crane.view.sketch.circuit.circuit_functions import (
+    CircuitFunction,
+    OpenCentreLines,
+    valve_rows,
+)
+from crane.view.sketch.circuit.circuit_section import CircuitSection
 from crane.view.sketch.circuit.supply_items import SupplyItem, create_supply_items
+from crane.view.sketch.circuit.valve_symbols import SPOOL_HEIGHT
 
 _FUNCTIONS_PER_ROW = 4  # functions beside each other
 _RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest to what hangs on it
@@ -41,6 +45,7 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
     write_figure(path, lambda: circuit_figure(machine)[0])
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
     """The figure of a circuit, and what it was drawn with; see `sketch_circuit`.
 
@@ -53,8 +58,7 @@ def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
         raise InputError(
             f"'{machine.name}' has no hydraulic circuit, sketch its mechanism or add 'hydraulics'"
         )
-    with mpl.rc_context(FIGURE_STYLE):
-        return _CircuitDrawing(machine, hydraulics).draw()
+    return _CircuitDrawing(machine, hydraulics).draw()
 
 
 class _CircuitDrawing:
@@ -140,7 +144,7 @@ class _CircuitDrawing:
     def _actuator_height(self, row: int) -> float:
         """Height of the actuators' middle above the valves."""
         functions = self._function_rows[row]
-        rows = max(sum(h for _, h in circuit_section.valve_rows(x)) for x in functions)
+        rows = max(sum(h for _, h in valve_rows(x)) for x in functions)
         return rows + 20 + (6 if self._open_centres.line_count(row) else 0)
 
     def _row_height(self, row: int, rail_count: int) -> float:

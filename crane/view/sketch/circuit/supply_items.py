@@ -9,8 +9,8 @@ from crane.hydraulics.supply_and_engine import TANK_NODE, Engine, Supply
 from crane.view.plots.figure_text import escape_label
 from crane.view.sketch.circuit import machine_symbols, valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose
-from crane.view.sketch.circuit.circuit_section import CircuitFunction
-from crane.view.sketch.circuit.format_quantities import (
+from crane.view.sketch.circuit.circuit_functions import CircuitFunction
+from crane.view.sketch.circuit.valve_symbols import (
     format_flow,
     format_number,
     format_pressure,

@@ -1,17 +1,128 @@
-"""The lines of open centres, from a pump through its valves to the throttle behind them."""
+"""Functions of a hydraulic circuit: actuators with their valves, and open-centre lines."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.supply_and_engine import TANK_NODE
+from crane.hydraulics.components import Cylinder, Hydraulics, Valve
+from crane.hydraulics.supply_and_engine import TANK_NODE, Supply
 from crane.view.sketch.circuit import valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
-from crane.view.sketch.circuit.circuit_section import CircuitFunction
+from crane.view.sketch.circuit.valve_symbols import format_flow, format_pressure
 
+_PORT_LANES = {"Ta": -26.0, "LS": -20.0, "P": 0.0, "T": 12.0}
+_SUPPLY_LANE_BESIDE_CENTRE = -7.0  # lane of P beside an open centre
+_COMPENSATOR_HEIGHT, _METERING_HEIGHT = 28.0, 48.0  # below the valve
+_ORIFICE_DROP = 1.0e6  # pressure drop of the flows that labels of plain valves give [Pa]
 _FEED_LANE, _RETURN_LANE, _SIGNAL_OFFSET = 40.0, 59.0, 6.0  # lanes from a section's middle
 _LANE_SPACING = 3.0  # between the lines of two pumps
 
 CentreEnds = Mapping[str, tuple[float, SheetPoint, SheetPoint]]
+
+
+@dataclass(frozen=True)
+class CircuitFunction:
+    """A cylinder or motor with its valve.
+
+    Attributes:
+        joint: What it drives.
+        cylinder: The actuator.
+        valve: Its valve.
+        supply: The pump that feeds it.
+        is_revolute: Whether its joint is a revolute one.
+        stroke: Between the joint's limits [m], [rad]; infinite without.
+        tapped_chambers: Chambers, of "a" and "b", that something else is joined to.
+        has_load_sensing: Whether its load is told to a pump or to other valves.
+        shares_load_sensing: Whether others tell theirs to the same.
+        centre_nets: Nets before and behind its open centre, None where it is closed.
+    """
+
+    joint: str
+    cylinder: Cylinder
+    valve: Valve
+    supply: Supply
+    is_revolute: bool
+    stroke: float
+    tapped_chambers: frozenset[str] = frozenset()
+    has_load_sensing: bool = False
+    shares_load_sensing: bool = False
+    centre_nets: tuple[str, str] | None = None
+
+    @property
+    def ports(self) -> list[str]:
+        """Ports of its valve below, from the left."""
+        has_separate_returns = self.valve.return_a != self.valve.return_b
+        availability = {
+            "Ta": has_separate_returns,
+            "LS": self.has_load_sensing,
+            "P": True,
+            "C": self.centre_nets is not None,
+            "T": True,
+        }
+        return [name for name, is_present in availability.items() if is_present]
+
+    @property
+    def rails(self) -> dict[str, str]:
+        """Nets that lead down to rails, by port of the valve or chamber."""
+        valve = self.valve
+        nets = {"P": valve.supply, "T": valve.return_b}
+        if "Ta" in self.ports:
+            nets["Ta"] = valve.return_a
+        if self.has_load_sensing:
+            nets["LS"] = f"LS {valve.supply}"
+        return nets | {side: f"{self.joint}.{side}" for side in sorted(self.tapped_chambers)}
+
+    @property
+    def height_below(self) -> float:
+        """Height of what stands below the valve."""
+        if self.valve.sharing:
+            return _METERING_HEIGHT
+        return _COMPENSATOR_HEIGHT if self.valve.margin > 0 else 8.0
+
+    @property
+    def valve_texts(self) -> list[str]:
+        """Words about the valve."""
+        valve = self.valve
+        margin = valve.margin or (self.supply.margin if valve.sharing else 0.0)
+        root_pressure_drop = (margin or _ORIFICE_DROP) ** 0.5
+        flow_in, flow_out = (
+            format_flow(valve.c1 * root_pressure_drop),
+            format_flow(valve.c4 * root_pressure_drop),
+        )
+        texts = (
+            [f"{flow_in} l/min"] if flow_in == flow_out else [f"{flow_in} | {flow_out}", "l/min"]
+        )
+        if valve.spool_b:
+            texts.insert(0, "2 spools: A, B")
+        if valve.margin > 0:
+            return [*texts, f"Δp {format_pressure(valve.margin)}"]
+        return [*texts, "sharing"] if margin else [*texts, f"at {format_pressure(_ORIFICE_DROP)}"]
+
+
+def port_lane(function: CircuitFunction, port: str) -> float:
+    """Where a port of the valve goes down to its rail, from the section's middle."""
+    if port == "P" and function.centre_nets is not None:
+        return _SUPPLY_LANE_BESIDE_CENTRE
+    return _PORT_LANES[port]
+
+
+def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
+    """What stands between the valve and the actuator, upwards, with heights."""
+    cylinder, valve = function.cylinder, function.valve
+    rows: list[tuple[str, float]] = []
+    for side in "ab":
+        if getattr(cylinder, f"counterbalance_{side}") is not None:
+            rows.append((f"counterbalance_{side}", 32.0))
+    if cylinder.rupture_a or cylinder.rupture_b:
+        rows.append(("rupture", 22.0))
+    if cylinder.relief or cylinder.refill:
+        rows.append(("port", 44.0 if cylinder.relief else 34.0))
+    if cylinder.cross_relief:
+        rows.append(("cross", 48.0))
+    if valve.regeneration:
+        rows.append(("regeneration", 24.0))
+    if function.tapped_chambers:
+        rows.append(("tap", 8.0))
+    return rows
 
 
 class OpenCentreLines:
