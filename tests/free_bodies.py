@@ -27,7 +27,7 @@ def about(axis, angle):
 
 def places(machine, q):
     """Matrices of all links at a closed posture (nq,), in the world."""
-    tree, out = machine.tree, {machine.tree.root: np.eye(4)}
+    tree, out = machine.tree, {machine.tree.root_link: np.eye(4)}
     waiting = list(tree.joints.values())
     while waiting:
         joint = waiting.pop(0)

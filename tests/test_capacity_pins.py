@@ -38,19 +38,19 @@ def force(machine, q, load, name):
 
 
 def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
-    ends = {chart.causes[k].what for k in chart.ends if chart.causes[k].why == "pin force"}
+    ends = {chart.limiting_factors[k].element for k in chart.active_factors if chart.limiting_factors[k].reason == "pin force"}
     assert ends == set(PINS)
     for cell in map(tuple, cells(chart, 25)):
         q = excavator.closure.solve(chart.q_a[cell])
-        for k, cause in enumerate(chart.causes):
-            if cause.why != "pin force":
+        for k, cause in enumerate(chart.limiting_factors):
+            if cause.reason != "pin force":
                 continue
             found = chart.each[cell][k] / 0.8
             if not found:
-                assert force(excavator, q, 0.0, cause.what) >= PINS[cause.what]
+                assert force(excavator, q, 0.0, cause.element) >= PINS[cause.element]
                 continue
 
-            def left(load, name=cause.what, q=q):
+            def left(load, name=cause.element, q=q):
                 return force(excavator, q, load, name) - PINS[name]
 
             samples = [left(load) for load in np.linspace(0, found * (1 - 1e-9), 5)]
@@ -144,8 +144,8 @@ def test_pins_that_are_not_there_are_named(excavator):
     [
         ({"pins.boom": 0.0}, {}, "'pins.boom' is 0 N, give a force above 0"),
         ({"pins.bom": 1.0}, {}, "'pins.bom' is unknown, did you mean 'pins.boom'"),
-        ({}, {"slope": 0.1}, "rated on level ground, and this leans by 5.73 degrees"),
-        ({}, {"rule": "sfs4677"}, "rated on level ground, and this leans by 5 degrees"),
+        ({}, {"slope": 0.1}, "rated on level ground, and but the ground slopes by 5.73 degrees"),
+        ({}, {"rule": "sfs4677"}, "rated on level ground, and but the ground slopes by 5 degrees"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(excavator, change, given, said):

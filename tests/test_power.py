@@ -388,7 +388,7 @@ def compared(patu, **more):
 
 def test_runs_beside_each_other(patu):
     """Each one's classes sum to its shafts; time, peak, work per mass as by hand."""
-    found = compared(patu, moved=500.0)
+    found = compared(patu, moved_mass=500.0)
     for run, account in found.balances.items():
         assert sum(found.energy_by_class(run).values()) == pytest.approx(
             account.totals["shaft"], rel=1e-9
@@ -447,7 +447,7 @@ def test_the_command_compares(patu, tmp_path):
         (("--beside", tmp_path / "no"), "no"),
         (
             ("--beside", tmp_path / "two", "--moved", "0"),
-            "the mass that is moved is 0.0 kg, give a number above 0",
+            "the moved mass is 0.0 kg, give a number above 0",
         ),
     ):
         done = typed("power", "patu655", tmp_path / "one", *options, "--out", tmp_path / "bad")

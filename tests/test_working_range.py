@@ -28,7 +28,7 @@ def grid(excavator):
     q_a = np.column_stack([np.zeros(len(strokes)), strokes])
     lip, pin = (crane.Kinematics(excavator, x).position(q_a) for x in ("bucket_lip", "bucket"))
     along, up = (lip - pin)[:, [0, 2]] / 1.47, np.array([[0.0, 1.0], [-1.0, 0.0]])
-    blade = np.array(excavator.external[0].blade)
+    blade = np.array(excavator.external_forces[0].blade)
     floor = blade[0] * along + blade[1] * along @ up  # by the bucket's x and y
     return q_a, lip[:, [0, 2]], pin[:, [0, 2]], floor
 
@@ -38,12 +38,12 @@ def test_dimensions_are_where_their_postures_put_the_lip(excavator, found):
         if one.name == "smallest front slewing radius":
             continue
         lip = places(excavator, excavator.closure.solve(one.q_a))["bucket_lip"][:3, 3]
-        assert one.place == pytest.approx([lip[0], lip[2]], abs=1e-9)
+        assert one.section_position == pytest.approx([lip[0], lip[2]], abs=1e-9)
         inside = (one.q_a >= excavator.lower - 1e-9) & (one.q_a <= excavator.upper + 1e-9)
         assert inside.all()
-        value = one.place[0] if one.name.startswith("reach") else abs(one.place[1])
+        value = one.section_position[0] if one.name.startswith("reach") else abs(one.section_position[1])
         assert one.value == pytest.approx(value, abs=1e-9)
-    assert found["reach at ground level"].place[1] == pytest.approx(0.0, abs=1e-9)
+    assert found["reach at ground level"].section_position[1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_nothing_of_a_grid_is_better(found, grid):
@@ -74,7 +74,7 @@ def test_the_level_bottom_ends_at_the_reach(excavator, found):
     deepest = [-lip[np.abs(lip[:, 0] - u) < 0.02, 1].min() for u in np.arange(1.0, 6.0, 0.02)]
     windows = [min(deepest[k : k + 122]) for k in range(len(deepest) - 122)]
     assert one.value - 0.02 < max(windows) < one.value + 0.02
-    ends = [-lip[np.abs(lip[:, 0] - u) < 0.02, 1].min() for u in one.place[0] + [0.0, 2.44]]
+    ends = [-lip[np.abs(lip[:, 0] - u) < 0.02, 1].min() for u in one.section_position[0] + [0.0, 2.44]]
     assert ends == pytest.approx([one.value] * 2, abs=0.02)
     assert found.level == 2.44
 

@@ -1,4 +1,4 @@
-"""Cells of a notebook that take long say what goes on: one line with a bar, gone in the end."""
+"""Progress of long notebook cells: one line with a bar that disappears at the end."""
 
 from types import FrameType
 from typing import Any
@@ -20,20 +20,20 @@ def show_cell_progress(shell: Any) -> None:
 
 
 class _CellProgressBar:
-    """The line of a cell."""
+    """Progress line of a cell."""
 
     def __init__(self) -> None:
         self._monitor: MainThreadMonitor | None = None
         self._display_handle: Any = None
 
     def start(self) -> None:
-        """A cell begins."""
+        """Start the progress of a cell."""
         self.stop()
         self._monitor = MainThreadMonitor(self._show_progress)
         self._monitor.start()
 
     def stop(self) -> None:
-        """It is over: no line stays."""
+        """Stop the progress and remove the line."""
         if self._monitor is not None:
             self._monitor.stop()
         if self._display_handle is not None:
@@ -57,8 +57,6 @@ class _CellProgressBar:
 
 
 class _HtmlLine:
-    """A line of HTML."""
-
     def __init__(self, html: str):
         self._html = html
 

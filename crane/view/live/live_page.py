@@ -26,7 +26,7 @@ _WARNING_BOX_TAG = (
 
 
 def format_coordinate(machine: Machine, joint: str, value: float) -> str:
-    """A joint's coordinate [m], [rad] in the unit to read it in."""
+    """Return a joint coordinate [m], [rad] as text in its display unit."""
     unit, scale = DISPLAY_UNITS[machine.unit(joint)]
     return f"{round(scale * value, 2) + 0.0:.2f} {unit}"
 
@@ -84,7 +84,7 @@ def readout_html(
 
 
 def warning_html(text: str) -> str:
-    """A message in a box as HTML, nothing for an empty one."""
+    """Return a message in a box as HTML; empty for an empty text."""
     return f"{_WARNING_BOX_TAG}{escape(text)}</div>" if text else ""
 
 
@@ -164,7 +164,7 @@ class LivePage:
             self.process_requests([(_TIME_KEY, playback.start)])
 
     def _aim_camera(self, client: Any) -> None:
-        """Turn the camera of a window that has come to where it sees the machine."""
+        """Set the camera of a new client so that it shows the machine."""
         if client.camera.aspect < 1:
             look_at, position = self._scene.camera_view(client.camera.aspect)
             with client.atomic():
@@ -173,11 +173,11 @@ class LivePage:
 
     @property
     def is_playing(self) -> bool:
-        """Whether `advance_playback` moves the machine."""
+        """Whether the recording plays."""
         return self._playing
 
     def process_requests(self, pending_requests: list[tuple[str, float]]) -> None:
-        """Do what notes say: of the sliders only the last of each."""
+        """Process requests; of several requests of one widget only the last."""
         for key, value in dict(pending_requests).items():
             try:
                 readout = self._process_request(key, value)
@@ -187,7 +187,7 @@ class LivePage:
                 self._warning_html.content = warning_html(message)
 
     def advance_playback(self) -> None:
-        """Go on in the recording by the time since the last call."""
+        """Advance the recording by the time since the last call."""
         assert self._playback is not None
         now = time.perf_counter()
         playback_time = self._sliders[_TIME_KEY].value + now - self._last_update
@@ -228,14 +228,14 @@ class LivePage:
         )
 
     def _seek(self, playback_time: float) -> Readout:
-        """The posture at a time [s] of the recording."""
+        """Move to the configuration at a time of the recording [s]."""
         assert self._playback is not None
         q_a, self._recorded_forces = self._playback.interpolate(playback_time)
         self._sliders[_TIME_KEY].value = playback_time
         return self._session.set_active_coordinates(q_a)
 
     def _update_widgets(self, readout: Readout) -> None:
-        """Send a posture: links, sliders that are not there, numbers."""
+        """Send poses, sliders and readout to the clients."""
         machine = self._session.machine
         with self._server.atomic():
             self._scene.update_poses()
@@ -282,14 +282,14 @@ class LivePage:
         return button
 
     def _tip_path(self, playback: Playback) -> Array:
-        """(k, 3) where the tip goes [m], every so many samples."""
+        """Return the path of the tip (k, 3) [m], thinned."""
         return self._session.tip_positions(
             playback.configurations[:: max(len(playback.configurations) // 2000, 1)]
         )
 
 
 def _set_slider(slider: Any, value: float) -> None:
-    """Put a slider at the value in its range that is nearest, if it is not there."""
+    """Set a slider to the nearest value in its range."""
     clipped_value = float(np.clip(value, slider.min, slider.max))
     if abs(slider.value - clipped_value) > 1e-6 * (slider.max - slider.min):
         slider.value = clipped_value

@@ -1,4 +1,4 @@
-"""The machine as a live view shows it: shapes that move with their links."""
+"""Scene of a live view: shapes that move with their links."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -52,7 +52,7 @@ class LiveScene:
         self.update_poses()
 
     def update_poses(self) -> None:
-        """Put all links where the session has them."""
+        """Update the poses of all links from the session."""
         poses = self._session.link_poses(self._links)
         for frame, pose in zip(self._frames, poses, strict=True):
             x, y, z, w = pin.Quaternion(pose[:3, :3]).coeffs()
@@ -60,7 +60,7 @@ class LiveScene:
             frame.wxyz = np.array([w, x, y, z])
 
     def show_payload(self) -> None:
-        """Draw the payload as a ball of water at the tip."""
+        """Draw the payload as a sphere of water at the tip."""
         volume = self._session.payload_mass / _PAYLOAD_DENSITY
         self._server.scene.add_icosphere(
             "/tip/payload",
@@ -79,7 +79,7 @@ class LiveScene:
             )
 
     def _set_view(self, lower: Array, upper: Array, ground_height: float) -> None:
-        """A grid at a height [m], and a camera that has everything in view."""
+        """Add a grid at the ground height [m], and set the camera."""
         scene, camera = self._server.scene, self._server.initial_camera
         self._scene_size = size = float(np.linalg.norm(upper - lower))
         self._scene_centre = centre = (lower + upper) / 2
@@ -124,7 +124,6 @@ class LiveScene:
 
 
 def _add_shape(scene: Any, name: str, visual: Visual) -> None:
-    """Put a shape into the group of its link."""
     x, y, z, w = pin.Quaternion(np.array(visual.placement[:3, :3])).coeffs()
     red, green, blue, opacity = (min(max(value, 0.0), 1.0) for value in visual.colour)
     appearance: dict[str, Any] = {
@@ -170,7 +169,7 @@ def _motion_bounds(visuals: Sequence[Visual], session: Session) -> tuple[Array, 
 
 
 def _shape_corners(visuals: Sequence[Visual], session: Session) -> Array:
-    """(k, 3) corners of boxes around all shapes where the session has them."""
+    """Return the corners (k, 3) of boxes around all shapes in the session's configuration."""
     links = list(dict.fromkeys(visual.link for visual in visuals))
     poses = dict(zip(links, session.link_poses(links), strict=True))
     return np.concatenate(

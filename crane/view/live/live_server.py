@@ -39,11 +39,11 @@ class AccessGuard:
 
     @property
     def is_local_only(self) -> bool:
-        """Whether only this computer is let in."""
+        """Whether only this computer has access."""
         return self.host.lower() == "localhost" or _is_loopback(self.host)
 
     def address(self, port: int) -> str:
-        """What to open in a browser."""
+        """Return the address to open in a browser."""
         host_text = f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host_text}:{port}/{self.token}/"
 
@@ -65,7 +65,7 @@ class AccessGuard:
         return "/" + inner_path
 
     def _is_known_host(self, host: str) -> bool:
-        """Whether a header `Host` names what is listened on, which a foreign name does not."""
+        """Return whether a `Host` header names the host that is listened on."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
             if name in ("localhost", self.host.lower()):
@@ -77,7 +77,7 @@ class AccessGuard:
 
     @contextmanager
     def guard_servers(self) -> Iterator[None]:
-        """Servers that viser begins meanwhile ask this door first, by HTTP and by websocket."""
+        """Guard HTTP and websocket requests of servers that viser starts in this context."""
         from websockets.asyncio import server
 
         serve: Any = server.serve
@@ -126,7 +126,7 @@ def restrict_widget_updates(server: Any) -> None:
 
 
 def _is_valid_update(widget: Any, updates: Any) -> bool:
-    """Whether an update is one of a value that a widget can have."""
+    """Return whether an update sets a value that the widget can have."""
     if not isinstance(updates, dict) or set(updates) != {"value"}:
         return False
     value = updates["value"]
@@ -190,7 +190,7 @@ def serve_live_view(
 
 
 def _process_until_end(page: LivePage, requests: RequestQueue) -> None:
-    """Do what is asked for, and play, until the end."""
+    """Process requests and play the recording until the end."""
     while (pending_requests := _take_requests(requests, page.is_playing)) is not None:
         page.process_requests(pending_requests)
         if page.is_playing:
@@ -198,7 +198,7 @@ def _process_until_end(page: LivePage, requests: RequestQueue) -> None:
 
 
 def start_server(guard: AccessGuard, port: int | None) -> Any:
-    """A viser server behind a door, that says nothing and offers no address elsewhere."""
+    """Start a guarded viser server that prints nothing and shares no public address."""
     viser = import_optional_library("viser", "a live view")
     port = _free_port(guard.host, port)
     with redirect_stdout(io.StringIO()), guard.guard_servers():
@@ -210,13 +210,13 @@ def start_server(guard: AccessGuard, port: int | None) -> Any:
 
 
 def stop_server(server: Any) -> None:
-    """End a server and its threads."""
+    """Stop a server and its threads."""
     with redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def _take_requests(requests: RequestQueue, is_playing: bool) -> list[tuple[str, float]] | None:
-    """All notes there are, at least one unless a recording plays; None at the end."""
+    """Return all pending requests; wait for one unless a recording plays; None at the end."""
     pending_requests: list[tuple[str, float]] = []
     try:
         item = requests.get(timeout=_FRAME_INTERVAL if is_playing else None)
@@ -230,7 +230,7 @@ def _take_requests(requests: RequestQueue, is_playing: bool) -> list[tuple[str, 
 
 @contextmanager
 def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
-    """Let SIGINT and SIGTERM put the end into the queue, whose put may interrupt itself."""
+    """Put None into the queue on SIGINT and SIGTERM; `SimpleQueue.put` is reentrant."""
     signal_numbers = (signal.SIGINT, signal.SIGTERM)
     previous_handlers = {
         signal_number: signal.signal(signal_number, lambda *_: requests.put(None))
@@ -244,7 +244,7 @@ def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
 
 
 def _free_port(host: str, port: int | None) -> int:
-    """A port that can be listened on; viser would try others, or for ever, without a word."""
+    """Return a free port; viser would try other ports, or retry endlessly, silently."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

@@ -215,7 +215,7 @@ class Session:
         return self.posture
 
     def go_home(self) -> Readout:
-        """Go to the home posture."""
+        """Move to the home configuration."""
         self.posture = self._compute_readout(self.machine.home)
         return self.posture
 
@@ -236,7 +236,7 @@ class Session:
         return self.posture
 
     def link_poses(self, links: list[str]) -> Array:
-        """(len(links), 4, 4) poses of links in the world."""
+        """Return the poses (len(links), 4, 4) of links in the world."""
         model = self.machine.model
         data = model.createData()
         pinocchio_configuration = self.machine.coordinates.configuration(
@@ -247,7 +247,7 @@ class Session:
         return np.array([data.oMf[i].homogeneous for i in frames]).reshape(-1, 4, 4)
 
     def tip_positions(self, q: Array) -> Array:
-        """(N, 3) positions of the tip [m] at closed postures (N, nq); (0, 3) without one."""
+        """Return tip positions (N, 3) [m] at closed configurations (N, nq); (0, 3) if no tip."""
         if self._kinematics is None:
             return np.empty((0, 3))
         return self._kinematics.positions_at_configurations(q)
@@ -329,7 +329,7 @@ class Session:
 
 
 def round_up_to_nice(value: float) -> float:
-    """The next of 1, 2 or 5 times a power of ten that is not below a positive value."""
+    """Round a positive value up to 1, 2 or 5 times a power of ten."""
     power_of_ten = 10.0 ** np.floor(np.log10(value))
     return float(
         next(x for x in (1, 2, 5, 10) if x * power_of_ten >= value * (1 - 1e-9)) * power_of_ten

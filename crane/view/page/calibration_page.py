@@ -1,4 +1,4 @@
-"""A calibration as one self-contained page: numbers, how well it follows, what it lacks."""
+"""Page of a calibration: parameters, fit, residuals, score tests, correlations."""
 
 from html import escape
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Rated loads as one page to point at: load, causes, posture, strokes and pressures of a place."""
+"""Interactive page of rated loads: load, limits, strokes and pressures at each position."""
 
 import json
 from html import escape
@@ -58,7 +58,7 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
 
 
 def capacity_page_data(chart: Capacity) -> dict[str, Any]:
-    """What the page shows, as JSON has it; lengths of outlines in `unit` metres."""
+    """Return the data of the page for JSON; outlines in multiples of `unit` metres."""
     lower, upper = drawing_extent(chart)
     unit = float((upper - lower).max()) / _OUTLINE_RESOLUTION
     machine, pressures = chart.machine, chart.pressures()
@@ -138,13 +138,13 @@ def _cell_rows(
 
 
 def _cell_stride(chart: Capacity) -> int:
-    """Of how many places along an axis one is shown."""
+    """Return the stride of the positions that are shown along both axes."""
     max_count = int((~np.isnan(chart.loads)).sum(axis=(1, 2)).max())
     return max(int(np.ceil(np.sqrt(max_count / _MAX_CELLS))), 1)
 
 
 def _contour_rows(chart: Capacity, k: int, unit: float) -> list[list[Any]]:
-    """Of each contour that is there its load in words and its lines."""
+    """Return label and lines of each contour."""
     contour_lines = load_contours(chart, k)
     name, scale = display_unit("kg", max((level for level, _ in contour_lines), default=0.0))
     return [
@@ -160,12 +160,12 @@ def _outline_shape(outline: MachineOutline, unit: float) -> list[Any]:
 
 
 def _round_points(points: Array, unit: float) -> list[int]:
-    """x, y, x, y ... in units."""
+    """Return rounded coordinates x, y, x, y ... in multiples of `unit`."""
     return [int(x) for x in np.rint(points / unit).ravel()]
 
 
 def _reading_unit(unit: str) -> tuple[str, float]:
-    """Degrees and millimetres."""
+    """Return display unit and scale: degrees or millimetres."""
     return display_unit(unit, 0.0)
 
 
@@ -174,10 +174,10 @@ def _smallest_spacing(values: Array) -> float:
 
 
 def _round_to_tenths(value: float) -> float:
-    """Strokes and angles to 0.1 mm or deg, without rounding noise at their limits."""
+    """Round strokes and angles to 0.1 mm or deg."""
     return round(float(value), 1) + 0.0  # no -0.0
 
 
 def _rounded_or_none(value: float, digits: int = _SIGNIFICANT_DIGITS) -> float | None:
-    """A number with few digits, None where there is none."""
+    """Round to some significant digits; None if not finite."""
     return float(f"{value:.{digits}g}") if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What a page draws on the machine: forces of its drives and loads, springs between its bodies."""
+"""Markers of a page: forces of drives and loads, springs and dampers."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ _SAMPLED_CONFIGURATIONS = 300  # postures that tell how short a strut gets
 def actuator_markers(
     machine: Machine, recording: Recording, rows: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Where the driven joints act and how strongly, in shares of what has a full arrow."""
+    """Return position and force over time of the driven joints, as shares of a full arrow."""
     model = machine.model
     loop_links = [loop.successor for loop in machine.closure.equations.loops]
     loop_links += [loop.predecessor for loop in machine.closure.equations.loops]
@@ -88,7 +88,7 @@ def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, fl
 
 
 def load_markers(machine: Machine, recording: Recording, rows: np.ndarray) -> list[dict[str, Any]]:
-    """Where forces from outside act and how strongly, in shares of the largest."""
+    """Return frame and force over time of external forces, as shares of the largest."""
     known_forces = [
         *machine.external_forces,
         *(x for task in machine.tasks.values() for x in task.loads),

@@ -1,4 +1,4 @@
-"""Self-contained pages of text, tables and pictures, that need no network."""
+"""Self-contained HTML documents of text, tables and figures."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -83,7 +83,7 @@ def write_page(path: str | Path, text: str) -> Path:
 
 
 def definition_list(rows: Iterable[tuple[str, str]]) -> str:
-    """Names with what they are; what is nothing is left out."""
+    """Return a definition list as HTML, without entries of empty text."""
     items = (f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in rows if text)
     return f"<dl>{''.join(items)}</dl>"
 
@@ -91,7 +91,7 @@ def definition_list(rows: Iterable[tuple[str, str]]) -> str:
 def html_table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], classes: Iterable[str] = ()
 ) -> str:
-    """Cells are HTML; those of columns whose head ends in * are text, the others numbers."""
+    """Return an HTML table of HTML cells; a heading that ends in * marks a text column."""
     cell_attributes = ["" if name.endswith("*") else ' class="n"' for name in headings]
     heading_cells = "".join(
         f"<th{k}>{name.rstrip('*')}</th>"

@@ -1,4 +1,4 @@
-"""An identification as one self-contained page: what was found, and how well it predicts."""
+"""Page of an identification: fit, forces, base parameters, correlations."""
 
 import dataclasses
 from html import escape
@@ -198,7 +198,6 @@ def _base_parameter_section(result: Identification) -> str:
 
 
 def _format_share(numerator: float, denominator: float) -> str:
-    """A share of at most 1000 %."""
     share = abs(numerator / denominator) if denominator else np.inf
     return (
         f"{100 * share:.2g} %"
@@ -210,7 +209,7 @@ def _format_share(numerator: float, denominator: float) -> str:
 
 
 def _format_group(text: str) -> str:
-    """A group in words, the end of long ones to be opened."""
+    """Return a group as HTML; the end of a long one is folded."""
     if len(text) <= _MAX_GROUP_LENGTH:
         return escape(text)
     cut_position = text.rfind(" ", 0, _MAX_GROUP_LENGTH)

@@ -1,4 +1,4 @@
-"""What a machine looks like: what its URDFs draw, or a skeleton."""
+"""Visuals of a machine: shapes of its URDFs, or a skeleton."""
 
 import warnings
 from collections.abc import Collection
@@ -66,7 +66,7 @@ def _warn(text: str) -> None:
 
 
 def _largest_joint_distance(machine: Machine) -> float:
-    """Largest distance between two joints on one body [m]; 1 where all are in one place."""
+    """Return the largest distance between two joints on one body [m]; 1 if all are 0."""
     joint_placements = machine.model.jointPlacements
     return (
         max(float(np.linalg.norm(placement.translation)) for placement in joint_placements) or 1.0
@@ -74,7 +74,7 @@ def _largest_joint_distance(machine: Machine) -> float:
 
 
 def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
-    """Of each body, by its joint, where its frames and the next joints are (3,) [m]; names."""
+    """Return parent joint, position (3,) [m] and name of all frames and joints on bodies."""
     model = machine.model
     bodies = (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
     points = [(frame.parentJoint, frame.placement.translation, frame.name) for frame in bodies]
@@ -85,12 +85,12 @@ def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
 
 
 def largest_body_extent(machine: Machine) -> float:
-    """Largest distance from a joint to a frame of the body it moves [m]; 1 where all meet."""
+    """Return the largest distance from a joint to a frame of its body [m]; 1 if all are 0."""
     return max(float(np.linalg.norm(end)) for _, end, _ in _body_points(machine)) or 1.0
 
 
 def _first_links(machine: Machine) -> dict[int, str]:
-    """The first link of the body that each joint moves."""
+    """Return the first link of each body, by joint."""
     links: dict[int, str] = {}
     for frame in machine.model.frames:
         if frame.type == pin.FrameType.BODY:

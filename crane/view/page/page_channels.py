@@ -90,7 +90,7 @@ class ThinningGrid:
     def from_recording(
         cls, recording: Recording, frame_rows: np.ndarray, page_share: float = 1.0
     ) -> "ThinningGrid":
-        """Spans for a recording that takes a share of the page."""
+        """Return a grid for a recording that takes a share of the page."""
         time, columns = recording.time, 1 + 3 * len(recording.joints) + len(recording.channels)
         wanted_spans = max(MIN_SPANS, int(SPANS_PER_SECOND * (time[-1] - time[0])))
         count = max(min(wanted_spans, int(page_share * MAX_SPANS / columns)), 500)
@@ -99,7 +99,7 @@ class ThinningGrid:
         return cls(time, frame_rows, np.arange(count) * len(time) // count)
 
     def time_axis(self) -> dict[str, Any]:
-        """Times of what `thin_out` keeps, and where the frames are among them."""
+        """Return the times of the values of `thin_out`, and the rows of the frames."""
         if self.span_starts is None:
             return {
                 "time": pack_base64(self.time, "f8"),
@@ -112,7 +112,7 @@ class ThinningGrid:
         }
 
     def thin_out(self, values: Array) -> dict[str, str]:
-        """Values (N,) thinned out: lowest and highest of each span, samples at the frames."""
+        """Return smallest and largest of values (N,) in each span, and the values at frames."""
         if self.span_starts is None:
             return {"low": pack_base64(values, "f4"), "high": "", "frames": ""}
         return {
@@ -123,7 +123,6 @@ class ThinningGrid:
 
 
 def _column_series(column: PageColumn, grid: ThinningGrid, scale: float) -> dict[str, Any]:
-    """The values of a column, of its reference and its limits."""
     series_data: dict[str, Any] = {"series": grid.thin_out(scale * column.values)}
     if column.reference is not None:
         series_data["reference"] = grid.thin_out(scale * column.reference)
@@ -276,7 +275,6 @@ def _sum_blockwise(first: Array, second: Array) -> Array:
 
 
 def _group_and_label(machine: Machine, name: str, unit: str) -> tuple[str, str]:
-    """Group and label of a channel."""
     if name in machine.joints:
         return ("Passive strokes" if machine.unit(name) == "m" else "Passive angles"), name
     joint = name.removesuffix(VELOCITY_SUFFIX)
@@ -299,14 +297,14 @@ def _peak_magnitude(values: Array) -> float:
 
 
 def _varies(values: Array) -> bool:
-    """Whether a column is more than a constant and rounding noise."""
+    """Return whether a column varies by more than rounding errors."""
     return float(np.ptp(values)) > 1e-9 * max(1.0, _peak_magnitude(values))
 
 
 def _with_colours(
     machine: Machine, group_columns: list[PageColumn]
 ) -> Iterator[tuple[PageColumn, int, int]]:
-    """Each column with a hue, the same for one joint everywhere, and a shade of it."""
+    """Yield each column with a hue, which is the same in all plots of a joint, and a shade."""
     hue_by_joint: Mapping[str, int] = {joint: i for i, joint in enumerate(machine.active)}
     used_hues: dict[int, int] = {}
     for column in group_columns:

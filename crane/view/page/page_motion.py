@@ -79,19 +79,19 @@ def joint_tree(machine: Machine) -> dict[str, Any]:
 
 
 def frame_data(machine: Machine, link: str) -> dict[str, Any]:
-    """Where a link's frame is: its joint, and its pose in the joint's frame."""
+    """Return the joint of a link's frame, and its pose in the joint's frame."""
     frame = machine.model.frames[machine.frame(link)]
     return {"joint": frame.parentJoint - 1, "placement": column_major_pose(frame.placement)}
 
 
 def column_major_pose(pose: pin.SE3) -> list[float]:
-    """A pose as 16 numbers, column by column."""
+    """Return a pose as 16 numbers, column by column."""
     values: list[float] = pose.homogeneous.ravel("F").tolist()
     return values
 
 
 def payload_frame_data(machine: Machine) -> dict[str, Any] | None:
-    """Where the centre of mass of the machine's payload is; None without one."""
+    """Return the centre of mass of the payload as a frame; None without payload."""
     model = machine.model
     payload_chains = [chain for chain in machine.chains if chain.name == "payload"]
     if not payload_chains:
@@ -146,7 +146,7 @@ def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
 
 
 def motion_data(time: Array, q: Array) -> dict[str, Any]:
-    """Frames for the script: times (N,) [s] and postures (N, nq)."""
+    """Return packed times (N,) [s] and configurations (N, nq) for the script."""
     return {"time": pack_base64(time, "f8"), "q": [quantise(column) for column in q.T]}
 
 
@@ -203,6 +203,6 @@ def recorded_configurations(machine: Machine, recording: Recording, rows: np.nda
 
 
 def _is_recorded(machine: Machine, recording: Recording, joint: str) -> bool:
-    """Whether the channel of a passive joint is there, in the joint's unit or in none."""
+    """Return whether a passive joint is recorded, in its unit or without unit."""
     unit = recording.channel_units.get(joint)
     return unit is not None and unit in ("", machine.unit(joint))

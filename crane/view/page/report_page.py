@@ -1,4 +1,4 @@
-"""One self-contained page that shows a machine, its forces and its numbers in any browser."""
+"""Report page of a machine and its run, for any browser without network."""
 
 import json
 import webbrowser
@@ -92,12 +92,12 @@ def report_html(
 
 
 def open_in_browser(path: str | Path) -> bool:
-    """Open a page in the user's browser; False where there is none."""
+    """Open a page in the user's browser; return False if there is none."""
     return webbrowser.open(Path(path).resolve().as_uri())
 
 
 def _machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
-    """What is known of the machine itself."""
+    """Return the data of the machine."""
     return {
         "machine": machine.name,
         "task": "home posture" if recording is None else label(recording),
@@ -131,7 +131,7 @@ def _run_data(
     second_recording: Recording | None,
     frame_share: float,
 ) -> dict[str, Any]:
-    """What was recorded, once or twice."""
+    """Return the data of one or two recordings."""
     span_share = frame_share * (1.0 if second_recording is None else 0.5)
     grid = ThinningGrid.from_recording(recording, scene.frame_rows, span_share)
     runs: list[dict[str, Any]] = [
@@ -210,5 +210,5 @@ def _rotate_view(direction: tuple[float, float, float], heading: float) -> list[
 
 
 def _script_json(value: Any) -> str:
-    """JSON that may stand inside of a script element."""
+    """Return JSON that is safe inside a script element."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

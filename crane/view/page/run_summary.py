@@ -1,4 +1,4 @@
-"""The few facts and numbers that a page tells of a run in words."""
+"""Summary of a run for its page: facts, forces, limits that were reached."""
 
 from typing import Any
 
@@ -100,7 +100,7 @@ def mechanical_work(recording: Recording) -> tuple[float, float]:
 
 
 def reached_limit_sentences(machine: Machine, recording: Recording) -> list[str]:
-    """Sentences on active joints that were at or beyond the ends of their ranges."""
+    """Return sentences about active joints that reached their limits."""
     sentences = []
     for i, joint in enumerate(machine.active):
         q: Array = recording.q[:, recording.joints.index(joint)]

@@ -38,20 +38,20 @@ class CommandRecorder:
     _object_count: int = 0
 
     def send(self, command: Any) -> None:
-        """Keep a command."""
+        """Record a command."""
         if hasattr(command, "object"):
             self._assign_identifier(command.object)
         self.commands.append(command.lower())
 
     def _assign_identifier(self, element: Any) -> None:
-        """Number an object of meshcat and what it is made of."""
+        """Number a meshcat object and its parts."""
         element.uuid, self._object_count = str(self._object_count), self._object_count + 1
         for part in filter(None, map(vars(element).get, _IDENTIFIED_PARTS)):
             self._assign_identifier(part)
 
 
 def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
-    """Put the visuals of each link into the group of that link."""
+    """Add the visuals of each link to the group of the link."""
     import meshcat.geometry as g
 
     for index, visual in enumerate(visuals):
@@ -74,7 +74,7 @@ def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
 
 
 def draw_surroundings(viewer: Any, lower: Array, upper: Array, ground_height: float) -> None:
-    """Background and a grid with round spacing at a height, around a box (3,), (3,) [m]."""
+    """Add background and a ground grid with round spacing around a box (3,), (3,) [m]."""
     import meshcat.geometry as g
 
     viewer["/Background"].set_property("top_color", _TOP_COLOUR)
@@ -244,7 +244,7 @@ def _tip_heading(machine: Machine, q: Array, size: float) -> float:
 def _scene_bounds(
     visuals: Sequence[Visual], poses: Mapping[str, Array], element_end_poses: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """Lowest and highest corner of everything in all frames, ends of springs included."""
+    """Return the corners of the bounding box over all frames, ends of springs included."""
     points = [pose[:, :3, 3] for pose in element_end_poses.values()]
     for visual in visuals:
         pose, corners = poses[visual.link], visual.bounding_corners()

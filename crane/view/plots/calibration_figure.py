@@ -43,7 +43,7 @@ def plot_calibration(calibration: Calibration, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def calibration_figure(calibration: Calibration) -> Figure:
-    """A panel per channel; instants that were held out stand on a darker ground."""
+    """Return a panel per channel; held-out instants have a darker background."""
     sensors = calibration.channels[:_MAX_PANELS]
     columns = 2 if len(sensors) > 1 else 1
     rows = -(-len(sensors) // columns)
@@ -85,7 +85,7 @@ def draw_channel(axes: Axes, sensor: CalibrationChannel) -> str:
 
 
 def mask_spans(time: "np.ndarray", mask: "np.ndarray") -> list[tuple[float, float]]:
-    """Stretches of time over which something holds."""
+    """Return the intervals (start, end) in which a mask (N,) is true."""
     edges = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     return [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
@@ -97,7 +97,7 @@ _DIRECTION_LABELS = {-1: "back", 0: "rest", 1: "out"}
 
 
 def channel_residual_figure(channel: CalibrationChannel, name: str) -> Figure:
-    """A channel over time, measured, before and fitted; below what the fitted one leaves."""
+    """Return a channel over time, measured, before and fitted, with the residual below."""
     figure = Figure(figsize=(5.8, 3.3))
     grid = {"height_ratios": (2.2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})

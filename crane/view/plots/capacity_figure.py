@@ -1,4 +1,4 @@
-"""Rated loads over radius and height: contours, coloured by what ends them."""
+"""Load charts over radius and height: contours, coloured by limiting factor."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ def plot_capacity(chart: Capacity, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def capacity_figure(chart: Capacity) -> Figure:
-    """The figure of rated loads: one panel per slew angle."""
+    """Return the figure of a load chart, a panel per slew angle."""
     lower, upper = drawing_extent(chart)
     panel_count = len(chart.slews)
     columns = min(panel_count, 3)
@@ -88,18 +88,18 @@ def capacity_figure(chart: Capacity) -> Figure:
 
 
 def capacity_heading(chart: Capacity) -> str:
-    """What pictures of a chart are headed with."""
+    """Return the heading of a load chart."""
     rule_text = "" if chart.rule.name == "none" else f" by {chart.rule.name}"
     return result_title(chart.machine.name, f"lifting capacity at {chart.frame}{rule_text}")
 
 
 def factor_colours(chart: Capacity) -> Mapping[int, str]:
-    """Of each cause that ends loads, by its index."""
+    """Return the colour of each active limiting factor, by index."""
     return {k: FACTOR_COLOURS[i % len(FACTOR_COLOURS)] for i, k in enumerate(chart.active_factors)}
 
 
 def legend_patches(chart: Capacity) -> list[Patch]:
-    """The legend: causes in their colours."""
+    """Return the legend: limiting factors in their colours."""
     patches = [
         Patch(color=colour, label=escape_label(str(chart.limiting_factors[k])))
         for k, colour in factor_colours(chart).items()
@@ -110,7 +110,7 @@ def legend_patches(chart: Capacity) -> list[Patch]:
 
 
 def home_outlines(chart: Capacity) -> list[MachineOutline]:
-    """The machine at home, turned to each slew angle."""
+    """Return outlines of the machine at home, turned to each slew angle."""
     outlines, machine = [], chart.machine
     for slew_coordinate in chart.slews:
         q = machine.home.copy()
@@ -121,7 +121,7 @@ def home_outlines(chart: Capacity) -> list[MachineOutline]:
 
 
 def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
-    """Lowest and highest corner (2,) of what is shown [m]."""
+    """Return the lower and upper corner (2,) of the drawing [m]."""
     b, a = np.nonzero(~np.isnan(chart.loads).all(axis=0))
     points = [np.column_stack([chart.radii[a], chart.heights[b]])]
     for home_outline in home_outlines(chart):
@@ -136,7 +136,7 @@ def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
 
 
 def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
-    """Loads at one slew angle."""
+    """Draw the loads at slew angle k."""
     lower, upper = drawing_extent(chart)
     axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal")
     axes.grid(visible=False)
@@ -176,7 +176,7 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
 
 
 def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
-    """Lines (n, 2) of equal load at one slew angle, by their load [kg]; the same at all angles."""
+    """Return contours (n, 2) at slew angle k by load [kg]; levels are equal at all angles."""
     if min(len(chart.radii), len(chart.heights)) < 2:
         return []
     finite_loads = chart.loads[np.isfinite(chart.loads)]
@@ -210,7 +210,7 @@ def _continued(loads: Array) -> Array:
 
 
 def _parts_within(chart: Capacity, k: int, line: Array) -> list[Array]:
-    """Parts of a line (n, 2) within the cells that have loads."""
+    """Return the parts of a line (n, 2) within cells that have loads."""
     along = np.arange(len(line))
     fine = np.linspace(0.0, len(line) - 1.0, _DENSE * (len(line) - 1) + 1)
     points = np.column_stack([np.interp(fine, along, x) for x in line.T])
@@ -225,7 +225,7 @@ def _parts_within(chart: Capacity, k: int, line: Array) -> list[Array]:
 
 
 def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
-    """Lines of equal load, labelled in kg or t."""
+    """Draw contours, labelled in kg or t."""
     contour_lines = load_contours(chart, k)
     levels = [level for level, lines in contour_lines if lines]
     if not levels:
@@ -293,7 +293,7 @@ def contour_label_positions(
 
 
 def _contour_levels(low: float, high: float) -> list[float]:
-    """Round loads, denser where they are small, as the load falls with the radius."""
+    """Return round contour levels, denser at small loads."""
     levels = set()
     for load in np.geomspace(max(low, 1e-3 * high), high, _MAX_CONTOURS):
         power = 10.0 ** np.floor(np.log10(load))

@@ -1,4 +1,4 @@
-"""Rated loads on one page to print: charts, what they hold for, and the table."""
+"""Load charts on one page to print: charts, conditions and load table."""
 
 import textwrap
 from pathlib import Path
@@ -52,7 +52,7 @@ def plot_capacity_sheet(chart: Capacity, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def capacity_sheet_figure(chart: Capacity) -> Figure:
-    """The page as a figure."""
+    """Return the page as a figure."""
     table = chart.table
     figure = Figure(figsize=(_PAGE_WIDTH, _PAGE_HEIGHT))
     top = _PAGE_HEIGHT - _PAGE_MARGIN
@@ -81,7 +81,7 @@ def _write_text(
     size: float = _TEXT_SIZE,
     **options: Any,
 ) -> None:
-    """A line of text at a place [inch]."""
+    """Write a line of text at x, y [inch]."""
     x, y = x / _PAGE_WIDTH, y / _PAGE_HEIGHT
     figure.text(x, y, escape_text(text), fontsize=size, color=colour, **options)
 
@@ -123,7 +123,7 @@ def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> 
 
 
 def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> None:
-    """What the loads hold for, and what ends them, in the colours of the charts."""
+    """Write conditions and limiting factors, in the colours of the charts."""
     left, y = left + 0.2, top - 0.1
     line_length = int((_FACTS_WIDTH - 0.2) * 72 / (0.56 * _TEXT_SIZE))
     for name, text in capacity_facts(chart):
@@ -200,7 +200,7 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
 
 
 def _draw_row_band(figure: Figure, y: float, right: float) -> None:
-    """A tint behind a row."""
+    """Draw a tinted band behind a row."""
     patch = Rectangle(
         (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
         (right - _PAGE_MARGIN) / _PAGE_WIDTH,

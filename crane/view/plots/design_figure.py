@@ -1,4 +1,4 @@
-"""Designs as a picture: the front of two goals, or where numbers ended, and how much it helped."""
+"""Figures of design optimizations: parameters of all solutions, Pareto front."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def plot_design(result: Design, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def design_figure(result: Design) -> Figure:
-    """Solutions over their ranges, and of two goals or more the first two against each other."""
+    """Return solutions over their ranges, and of several objectives the first two."""
     is_multi_objective = len(result.objectives) > 1
     height = max(2.2, 0.9 + 0.34 * len(result.parameter_names))
     figure = Figure(

@@ -19,7 +19,7 @@ def escape_label(text: str) -> str:
 
 
 def escape_text(text: str) -> str:
-    """The same of a text of any length that is in no legend."""
+    """Escape a text of any length that is not in a legend, see `escape_label`."""
     printable = "".join(c if c.isprintable() or c == "\u00a0" else " " for c in text)
     return printable.replace("$", r"\$")
 
@@ -57,6 +57,6 @@ def envelope(time: Array, values: Array) -> tuple[Array, Array]:
 
 
 def thin_path(points: Array) -> Array:
-    """Of a path (N, 3) every so many points, first and last among them."""
+    """Thin a path (N, 3); the first and the last point are kept."""
     step = -(-len(points) // _MAX_POINTS)
     return points if step == 1 else np.vstack([points[:-1:step], points[-1:]])

@@ -29,7 +29,7 @@ _SEGMENT_COUNT = 8  # of a recording, whose periodograms are averaged
 def force_time_figure(
     comparison: ForceComparison, drive_index: int, unit: str, name: str
 ) -> Figure:
-    """Measured and modelled force of drive i over time, and their difference below."""
+    """Return measured and modelled force of a drive over time, with the residual below."""
     figure = Figure(figsize=(5.8, 3.3))
     grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
@@ -97,7 +97,7 @@ def residual_spectrum_figure(
 
 
 def correlation_figure(R: Array, names: Sequence[str]) -> Figure:
-    """A correlation matrix (r, r) in colours, columns in the order of the named rows."""
+    """Return a correlation matrix (r, r) in colours, with named rows."""
     names = [escape_label(name) for name in names]
     size = float(np.clip(0.11 * len(names), 4.0, 9.0))
     letter_size = float(np.clip(60 * size / max(len(names), 1), 3.0, 7.5))
@@ -117,7 +117,7 @@ def correlation_figure(R: Array, names: Sequence[str]) -> Figure:
 
 
 def force_figures(result: Identification) -> list[Figure]:
-    """Measured and modelled forces of the training, a figure per drive."""
+    """Return measured and modelled forces of the training data, a figure per drive."""
     return [
         force_time_figure(
             result.training, i, FORCE_UNITS[result.described_machine.unit(joint)], joint
@@ -180,19 +180,18 @@ def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") ->
 
 @mpl.rc_context(FIGURE_STYLE)
 def _single_figure(draw: Callable[..., None], *values: object) -> Figure:
-    """A figure of one drawing alone."""
     figure = Figure(figsize=(4.6, 3.4), layout="constrained")
     draw(figure.subplots(), *values)
     return figure
 
 
 def valve_curve_figure(curve: ValveCurve, unit: str = "m") -> Figure:
-    """Steady speeds over the signal, and the curve through them."""
+    """Return steady speeds over the valve signal with the fitted curve."""
     return _single_figure(draw_valve_curve, curve, unit)
 
 
 def draw_valve_curve(axes: Axes, curve: ValveCurve, unit: str = "m") -> None:
-    """`valve_curve_figure` on axes that are there."""
+    """Draw `valve_curve_figure` on existing axes."""
     scale, text = (1e3, "mm/s") if unit == "m" else (1.0, "rad/s")
     stride = -(-len(curve.signal) // _MAX_DOTS)
     axes.plot(
@@ -209,12 +208,12 @@ def draw_valve_curve(axes: Axes, curve: ValveCurve, unit: str = "m") -> None:
 
 
 def friction_figure(friction: CylinderFriction, unit: str = "m") -> Figure:
-    """Measured friction over speed, and the law through it."""
+    """Return measured friction over speed with the fitted law."""
     return _single_figure(draw_friction, friction, unit)
 
 
 def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> None:
-    """`friction_figure` on axes that are there."""
+    """Draw `friction_figure` on existing axes."""
     scale, text, force = (1e3, "mm/s", "N") if unit == "m" else (1.0, "rad/s", "N m")
     stride = -(-len(friction.speed) // _MAX_DOTS)
     axes.plot(

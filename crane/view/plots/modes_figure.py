@@ -66,7 +66,7 @@ def plot_parameter_modes(
 
 @mpl.rc_context(FIGURE_STYLE)
 def modes_figure(model: LinearModel) -> Figure:
-    """Poles, each with what it moves most, and a panel of responses per input that has any."""
+    """Return poles with dominant states, and a panel of frequency responses per input."""
     frequencies = _frequency_grid(model)
     responses = np.abs(model.response(frequencies))
     responding_inputs = [
@@ -88,7 +88,7 @@ def modes_figure(model: LinearModel) -> Figure:
 
 @mpl.rc_context(FIGURE_STYLE)
 def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]]) -> Figure:
-    """Above frequencies, below damping, over the first name; a colour per value of the others."""
+    """Return frequency and damping over the first parameter; colours for the others."""
     names = list(models[0][0])
     families: dict[tuple[float, ...], list[tuple[float, LinearModel]]] = {}
     for values, model in models:
@@ -123,7 +123,7 @@ def _cycle_colours(count: int) -> list[str]:
 
 
 def _track_modes(family: Sequence[tuple[float, LinearModel]]) -> list[tuple[Array, Array, Array]]:
-    """Of the modes that ring, each followed by its shape: places, frequencies, damping."""
+    """Track oscillatory modes by their shapes; return parameter, frequency, damping of each."""
     branches: list[list[tuple[float, Mode]]] = []
     for x, model in family:
         modes = [mode for mode in model.modes if mode.is_oscillatory]
@@ -152,7 +152,7 @@ def _track_modes(family: Sequence[tuple[float, LinearModel]]) -> list[tuple[Arra
 
 
 def _modal_assurance(model: LinearModel, first: Mode, second: Mode) -> float:
-    """The modal assurance criterion of two shapes, 1 where they are the same."""
+    """Return the modal assurance criterion of two mode shapes, 1 for equal shapes."""
     units = model.machine.closure.units
     a, b = first.shape / units, second.shape / units
     product = np.linalg.norm(a) * np.linalg.norm(b)
@@ -160,7 +160,7 @@ def _modal_assurance(model: LinearModel, first: Mode, second: Mode) -> float:
 
 
 def _frequency_grid(model: LinearModel) -> Array:
-    """Frequencies [Hz] around what rings, or all poles, close at the former."""
+    """Return frequencies [Hz] around all poles, dense around oscillatory modes."""
     oscillating_frequencies = [mode.frequency for mode in model.modes if mode.is_oscillatory]
     used_frequencies = (
         oscillating_frequencies
@@ -180,7 +180,7 @@ def _frequency_grid(model: LinearModel) -> Array:
 
 
 def _draw_poles(axes: Axes, model: LinearModel) -> None:
-    """Over frequency and damping, which show slow and fast poles alike."""
+    """Draw poles over frequency and damping."""
     drawn_modes = [mode for mode in model.modes if mode.frequency > 0]
     axes.axhline(0.0, color=INK_COLOUR, lw=0.6)
     for mode in drawn_modes:
@@ -210,7 +210,7 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
 
 
 def _position_outputs(model: LinearModel) -> list[int]:
-    """Outputs that are coordinates of active joints."""
+    """Return the outputs that are coordinates of active joints."""
     return [i for i, name in enumerate(model.outputs) if name in model.machine.active]
 
 
@@ -247,7 +247,7 @@ def plot_sensitivities(sensitivities: Sensitivities, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
-    """A panel per output that depends on something, a line per number."""
+    """Return a panel per output with nonzero sensitivities, a line per parameter."""
     effects = sensitivities.derivatives * sensitivities.typical_changes
     panels = []
     for k, output in enumerate(sensitivities.outputs):

@@ -96,7 +96,7 @@ def _draw_stack(
     colors: Mapping[str, str],
     scale: float,
 ) -> None:
-    """Layers (N,) upwards where they are positive, downwards where negative."""
+    """Stack layers (N,) upwards where positive, downwards where negative."""
     time, shaft = _block_means(balance.time), scale * _block_means(balance.shaft_power)
     positive_sum, negative_sum = np.zeros_like(time), np.zeros_like(time)
     min_power = 1e-3 * max(float(np.abs(balance.shaft_power).max()), 1e-9)
@@ -120,13 +120,13 @@ def _draw_stack(
 
 
 def _axis_end(stack_edge: Array, shaft: Array) -> float:
-    """How far an axis goes: a line that fills or empties within a sample may leave it."""
+    """Return the limit of an axis, which may cut single samples of filling lines."""
     stack_end = min(float(stack_edge.max()), 1.5 * float(np.quantile(stack_edge, 0.998)))
     return 1.06 * max(stack_end, float(shaft.max()), 0.02 * float(np.abs(shaft).max()), 1e-3)
 
 
 def _block_means(values: Array) -> Array:
-    """Means of so many neighbours that a picture can show them."""
+    """Return means over blocks of samples."""
     block_size = -(-len(values) // _MAX_POINTS)
     return np.add.reduceat(values, starts := np.arange(0, len(values), block_size)) / np.diff(
         [*starts, len(values)]
@@ -148,13 +148,13 @@ _MIN_BAR_SHARE = 1e-3  # share of the largest run's energy that has a bar
 
 
 def plot_power_comparison(comparison: PowerComparison, path: str | Path) -> None:
-    """Write the picture to a file; see `plot_power`."""
+    """Write the figure to a file; see `plot_power`."""
     write_figure(path, lambda: power_comparison_figure(comparison))
 
 
 @mpl.rc_context(FIGURE_STYLE)
 def power_comparison_figure(comparison: PowerComparison) -> Figure:
-    """What the shafts' energy goes into, a bar per run, and above it what they give over time."""
+    """Return shaft power over time, and energy by class with a bar per run."""
     runs = list(comparison.balances)
     energies = {run: comparison.energy_by_class(run) for run in runs}
     totals = {run: comparison.balances[run].totals[SHAFT_POWER] for run in runs}

@@ -1,4 +1,4 @@
-"""A recording as one figure: displacements, velocities and forces, and the path of the tip."""
+"""Figures of recordings, and the style of all figures."""
 
 import itertools
 import re
@@ -98,7 +98,7 @@ class _TimePanel:
     reference: Array | None = None
 
     def drawn_lines(self) -> Iterator[tuple[str, Array]]:
-        """Each line with its values (N,)."""
+        """Yield each line with its values (N,)."""
         for label, values in self.lines.items():
             release_pages()
             yield label, values if self.reference is None else self.reference - values
@@ -118,7 +118,7 @@ def plot_recording(recording: Recording, path: str | Path) -> None:
 
 
 def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
-    """Draw a figure into a file whose suffix is a known format; see `plot_recording`."""
+    """Draw a figure and write it to a file; see `plot_recording`."""
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
     if file_format not in FIGURE_FORMATS:
@@ -176,7 +176,7 @@ def recording_figure(recording: Recording) -> Figure:
 
 
 def _joint_panels(recording: Recording, column: int) -> list[_TimePanel]:
-    """Displacement, velocity, force and error of an active joint, its cylinder's; some empty."""
+    """Return the panels of an active joint and its cylinder; some without lines."""
     name, channels = recording.joints[column], recording.channels
     unit = recording.units[name]
     is_revolute, reference_name = unit == "rad", f"reference_{name}"
@@ -224,7 +224,7 @@ def _joint_panels(recording: Recording, column: int) -> list[_TimePanel]:
 
 
 def _row_scales(panels: Sequence[_TimePanel]) -> dict[str, tuple[str, float]]:
-    """The unit that panels of a row are read in, and its scale, the same for equal units."""
+    """Return display unit and scale by unit, the same for all panels of a row."""
     peaks: dict[str, float] = {}
     for panel in panels:
         for _, values in panel.drawn_lines():
@@ -255,7 +255,7 @@ def _draw_row(
     row: int,
     letters: Iterator[str],
 ) -> None:
-    """A row of panels at the places of some joints; `panels` has those of all, row by row."""
+    """Draw a row of panels of some joints; `panels` has all panels by row."""
     scales = _row_scales(panels[row])
     for index, grid_cell in grid_cells.items():
         panel = panels[row][index]
@@ -276,7 +276,7 @@ def _draw_tip_path(
     figure: Figure, grid: GridSpec, recording: Recording, tip: Array,
     path_plane: tuple[int, int] | None, letters: Iterator[str],
 ) -> None:  # fmt: skip
-    """The path of the tip in the last column, and its distance from a reference below it."""
+    """Draw the path of the tip and its distance from a reference, in the last column."""
     reference, distance = point_channel(recording, "reference_tip"), tip_error(recording)
     grid_rows = slice(3) if reference is None else slice(2)
     if path_plane is None:
@@ -308,14 +308,14 @@ def _path_plane(tip: Array, reference: Array | None) -> tuple[int, int] | None:
 
 
 def _path_bounds(tip: Array, reference: Array | None) -> tuple[Array, Array]:
-    """Lowest and highest corner (3,) of a path and its reference [m]."""
+    """Return the lower and upper corner (3,) of a path and its reference [m]."""
     paths = [tip] if reference is None else [tip, reference]
     lower, upper = zip(*((x.min(axis=0), x.max(axis=0)) for x in paths), strict=True)
     return np.min(lower, axis=0), np.max(upper, axis=0)
 
 
 def _drawing_box(tip: Array, reference: Array | None) -> tuple[Array, Array]:
-    """Corners (3,) of a box around them that is nowhere flat [m]."""
+    """Return the corners (3,) of a box around a path that is not flat [m]."""
     lower, upper = _path_bounds(tip, reference)
     span = np.maximum(upper - lower, 0.4 * max(float((upper - lower).max()), 1e-2)) * 1.1
     return (lower + upper - span) / 2, (lower + upper + span) / 2
@@ -324,7 +324,7 @@ def _drawing_box(tip: Array, reference: Array | None) -> tuple[Array, Array]:
 def _draw_plane_path(
     axes: Axes, tip: Array, reference: Array | None, plane: tuple[int, int]
 ) -> None:
-    """The path of the tip [m] in a plane, to scale."""
+    """Draw the path of the tip [m] in a plane, to scale."""
     i, j = plane
     x, y = thin_path(tip)[:, plane].T
     axes.plot(x, y, color=RECORDED_COLOUR, label="recording")
@@ -345,7 +345,7 @@ def _draw_plane_path(
 
 
 def _draw_space_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
-    """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
+    """Draw the path of the tip [m] in space, to scale, with its shadow."""
     tip, reference = thin_path(tip), None if reference is None else thin_path(reference)
     lower, upper = _drawing_box(tip, reference)
     span = upper - lower
@@ -383,7 +383,7 @@ def _draw_space_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
 
 
 def _inner_ticks(lower: float, upper: float, axis_share: float) -> list[float]:
-    """Round values away from the ends, where other axes begin; few on a short axis."""
+    """Return round values away from the ends of an axis; few on a short axis."""
     margin = 0.12 * (upper - lower)
     lower, upper = lower + margin, upper - margin
     min_count, max_count = (2, 3) if axis_share > 0.5 else (1, 2)
@@ -399,13 +399,13 @@ def _inner_ticks(lower: float, upper: float, axis_share: float) -> list[float]:
 
 
 def _add_panel_letter(axes: Axes, letters: Iterator[str]) -> None:
-    """(a), (b), ... as panels are referred to in a text."""
+    """Label a panel (a), (b), ... for references in a text."""
     if letter := next(letters, ""):
         axes.annotate(f"({letter})", (0, 1), (-28, 7), "axes fraction", "offset points")
 
 
 def _add_caption(figure: Figure, recording: Recording) -> None:
-    """What is shown, and which line is what."""
+    """Add heading and legend."""
     heading_text = heading(recording)
     if heading_text:
         add_heading(figure, escape_label(heading_text))
@@ -425,7 +425,7 @@ def _add_caption(figure: Figure, recording: Recording) -> None:
 
 
 def joint_symbol(name: str) -> str:
-    """A joint's name as mathematics where it is a letter and a number, q1 as q with index 1."""
+    """Return a joint's name as a label; q1 is set as q with index 1."""
     if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
         return f"${match[1]}_{{{match[2]}}}$"
     return escape_label(name)

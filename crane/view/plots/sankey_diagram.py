@@ -1,4 +1,4 @@
-"""Where a run's energy went, as ribbons as wide as it is much: a Sankey diagram."""
+"""Sankey diagram of the energy of a hydraulic run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +81,7 @@ class _SankeyGroup:
 
     @property
     def total_energy(self) -> float:
-        """Energy of all its items [J]."""
+        """Energy of all ribbons [J]."""
         return sum(item.energy for item in self.ribbons)
 
 
@@ -211,7 +211,7 @@ class _SankeyDiagram:
         return figure
 
     def _place_groups(self, groups: list[_SankeyGroup], scale: float) -> float:
-        """Place all from above downwards; the height of the figure [inch]."""
+        """Place all groups downwards, and return the height of the figure [inch]."""
         y = -_TOP_MARGIN
         for group in groups:
             y -= _GROUP_GAP
@@ -225,7 +225,7 @@ class _SankeyDiagram:
         return max(_BOTTOM_MARGIN - y, _TOP_MARGIN + _TOTAL_HEIGHT + 1.2)
 
     def _draw_hydraulic_bar(self, groups: list[_SankeyGroup]) -> float:
-        """Draw the bar that feeds the groups, and its ribbons; its top [inch]."""
+        """Draw the hydraulic bar and its ribbons, and return its top [inch]."""
         scale, (_, x, target_x, _) = self._scale, _COLUMN_POSITIONS
         first_centre, last_centre = (
             self._owner_groups[0].ribbons[0].centre,
@@ -247,7 +247,7 @@ class _SankeyDiagram:
         return top
 
     def _draw_sources(self, bar_top: float) -> None:
-        """Draw what gives, on the left, beside the bar at a height."""
+        """Draw the sources on the left of the bar with top `bar_top`."""
         scale, (x, bar_x, group_x, _) = self._scale, _COLUMN_POSITIONS
         target_top, loss_top = bar_top, self._pump_group.top
         sources = {f"{escape_label(pump)}\nshaft": (energy, self._pump_losses[pump])
@@ -344,7 +344,7 @@ class _SankeyDiagram:
     def _draw_ribbon(
         self, start: tuple[float, float], end: tuple[float, float], size: float, color: str
     ) -> None:
-        """From one top edge to another."""
+        """Draw a ribbon between two top edges."""
         self._axes.add_patch(_ribbon_patch(start, end, size, color))
 
     _axes: Axes

@@ -1,4 +1,4 @@
-"""A design study as one picture: curves, maps, or scatter plots with rank correlations."""
+"""Figures of design studies: curves, maps, or scatter plots with rank correlations."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -99,7 +99,7 @@ def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
 
 
 def _draw_curves(axes: Axes, study: Study, name: str) -> None:
-    """One measure over one parameter, the values of each task below that of all together."""
+    """Draw one measure over one parameter, over all tasks and by task."""
     x = study.columns[study.parameters[0]]
     order = np.argsort(x)
     x = x[order]
@@ -152,7 +152,7 @@ def _draw_curves(axes: Axes, study: Study, name: str) -> None:
 
 
 def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
-    """One measure over a grid of two parameters, hatched where it cannot be measured."""
+    """Draw one measure over a grid of two parameters; grey where it is not possible."""
     first_values, second_values = (
         study.columns[name].reshape(study.grid_shape) for name in study.parameters
     )
@@ -191,7 +191,7 @@ def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
 
 
 def _draw_cloud(axes: Axes, x: Array, values: Array, best_variant: Sequence[int]) -> None:
-    """A measure over a parameter, ticks where it is missing, and how well their ranks agree."""
+    """Draw a measure over a parameter with ticks for missing values and rank correlation."""
     is_finite = np.isfinite(values)
     axes.plot(x[is_finite], values[is_finite], "o", ms=3, color=RECORDED_COLOUR, alpha=0.7)
     axes.plot(x[best_variant], values[best_variant], "*", ms=11, color=DASHED_STYLE["color"])
@@ -203,7 +203,7 @@ def _draw_cloud(axes: Axes, x: Array, values: Array, best_variant: Sequence[int]
 
 
 def _draw_scatter(study: Study, shown_measures: list[str]) -> Figure:
-    """Measures over parameters, all other parameters varying too."""
+    """Draw measures over each parameter, while all parameters vary."""
     size = (2.5 * len(study.parameters) + 0.8, 2.0 * len(shown_measures) + 0.6)
     figure = Figure(figsize=(max(4.5, size[0]), size[1]), layout="constrained")
     panels = figure.subplots(

@@ -1,4 +1,4 @@
-"""Tool forces over the reach: how large, which way, and what ends them."""
+"""Figures of tool forces: magnitude, direction and limiting factors."""
 
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def plot_tool_force(chart: ToolForce, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def tool_force_figure(chart: ToolForce) -> Figure:
-    """The figure: a row per slew, forces with arrows on the left, causes on the right."""
+    """Return a row per slew angle: forces with arrows, and limiting factors."""
     count = len(chart.slews)
     radius_range, height_range = float(np.ptp(chart.radii)), float(np.ptp(chart.heights))
     directions = chart.section_directions()
@@ -113,7 +113,7 @@ def tool_force_figure(chart: ToolForce) -> Figure:
 def _draw_arrows(
     axes: Axes, chart: ToolForce, forces: Array, directions: Array, largest_force: float
 ) -> None:
-    """Which way the tool pushes, at some places, as long as the force is large."""
+    """Draw the direction of the force at some positions; the length shows the magnitude."""
     step = max(1, max(forces.shape) // _MAX_ARROWS)
     rows, columns = (np.arange(n % step // 2, n, step) for n in forces.shape)
     b, a = np.meshgrid(rows, columns, indexing="ij")

@@ -1,4 +1,4 @@
-"""A working range as brochures draw it: the lip's reach, the machine, and dimension lines."""
+"""Figures of working ranges: reach of the lip, machine and dimension lines."""
 
 import string
 from collections.abc import Mapping
@@ -133,7 +133,7 @@ def _draw_horizontal_lines(
 def _dimension_columns(
     vertical: dict[str, Dimension], ground_height: float
 ) -> list[list[tuple[str, Dimension]]]:
-    """What shares a line: one above the ground and one below it, the shorter ones first."""
+    """Return pairs of dimensions above and below ground that share a line, shortest first."""
     sides = [
         sorted(
             (
@@ -156,7 +156,7 @@ def _draw_dimension_line(
     end: tuple[float, float],
     measured_point: Array,
 ) -> None:
-    """A dimension line with its letter, and a thin one from the place that it measures."""
+    """Draw a dimension line with its letter, and a thin line to the measured point."""
     axes.plot(
         [measured_point[0], end[0]],
         [measured_point[1], end[1]],
@@ -178,7 +178,6 @@ def _draw_dimension_line(
 
 
 def _draw_level_bottom(axes: Axes, result: WorkingRange) -> None:
-    """The level bottom itself."""
     for dimension in result.dimensions:
         if "level bottom" in dimension.name:
             line_ends = [

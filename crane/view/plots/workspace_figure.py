@@ -1,4 +1,4 @@
-"""A workspace as one picture: what the tip reaches, and which strokes close."""
+"""Figures of workspaces: reach of the tip, and map of the strokes."""
 
 from pathlib import Path
 
@@ -156,7 +156,7 @@ def _draw_section(
 
 
 def _grid_images(reachable_space: Workspace) -> list[Array]:
-    """Images (k, 2) of even steps of the two strokes of the map."""
+    """Return images (k, 2) in the section of grid lines of the two strokes."""
     patch = reachable_space.stroke_map.patch
     section_positions = np.full((*patch.is_closed.shape, 2), np.nan)
     tip_positions = [
@@ -192,7 +192,7 @@ def _home_tip(reachable_space: Workspace) -> Array:
 
 
 def skeleton_lines(reachable_space: Workspace) -> Array:
-    """Lines (k, 2, 2) between the joints of the machine at home, in the section."""
+    """Return lines (k, 2, 2) between the joints of the machine at home, in the section."""
     machine, model = reachable_space.machine, reachable_space.machine.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
@@ -217,7 +217,7 @@ def skeleton_lines(reachable_space: Workspace) -> Array:
 
 
 def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, label: str) -> None:
-    """A number (a, b) over the two strokes of the map, or over the only one."""
+    """Draw values (a, b) over the two strokes of the map, or over the single stroke."""
     machine, stroke_map = reachable_space.machine, reachable_space.stroke_map
     patch = stroke_map.patch
     names = [machine.active[i] for i in patch.stroke_pair]

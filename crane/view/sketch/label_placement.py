@@ -1,4 +1,4 @@
-"""Where labels go: beside what they name, on nothing else."""
+"""Placement of labels beside their points, clear of lines and symbols."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
 
 
 def _candidates(label: SketchLabel, half_size: Array, point_size: float) -> tuple[Array, Array]:
-    """Boxes (k, 2, 2) as lowest and highest corners [m], and their gaps (k,) [points]."""
+    """Return boxes (k, 2, 2) as lower and upper corners [m], and their gaps (k,) [points]."""
     directions = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
     # a box whose nearest point lies in that direction: corners for slanted ones, sides for others
     corner_directions = np.clip(1.6 * directions, -1, 1)
@@ -92,7 +92,7 @@ def _candidates(label: SketchLabel, half_size: Array, point_size: float) -> tupl
 
 
 def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gaps: Array) -> Array:
-    """(k,) what a label would cover and how far it would be, without other labels."""
+    """Return costs (k,) of what a label covers and of its distance, without other labels."""
     point = canvas.point_size
     lower, upper = boxes[:, 0] - 1.2 * point, boxes[:, 1] + 1.2 * point
     cost = 0.14 * gaps
@@ -114,7 +114,7 @@ def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gap
 def _costs_with_labels(
     other_boxes: Sequence[Array], boxes: Array, cost: Array, point_size: float
 ) -> Array:
-    """Costs (k,) of the boxes (k, 2, 2) of a label with other labels in their boxes (2, 2)."""
+    """Return costs (k,) of boxes (k, 2, 2) of a label, with other labels in boxes (2, 2)."""
     for lower, upper in other_boxes:
         box_gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
         cost = cost + np.where(box_gap < 4 * point_size, 1000.0, 0)
@@ -124,7 +124,7 @@ def _costs_with_labels(
 def _choose_candidates(
     boxes: Sequence[Array], costs: Sequence[Array], point_size: float
 ) -> list[int]:
-    """Index of the candidate of each label."""
+    """Return the index of the chosen candidate of each label."""
     order = sorted(range(len(boxes)), key=lambda i: -float(costs[i].min()))
     chosen: dict[int, int] = {}
     for sweep in range(_MAX_SWEEPS):
@@ -140,7 +140,7 @@ def _choose_candidates(
 
 
 def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
-    """(k,) length of a line (2, 2) within boxes (k, 2), (k, 2)."""
+    """Return the length (k,) of a line (2, 2) within boxes (k, 2), (k, 2)."""
     start, direction = segment[0], segment[1] - segment[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         first_parameters, second_parameters = (
@@ -166,7 +166,7 @@ def _nonzero_length(vector: Array) -> float:
 def find_clear_point(
     polygon: Array, segments: Sequence[Array], excluded_polygons: Sequence[Array]
 ) -> tuple[Array, float]:
-    """A point (2,) within corners (k, 2), outside of others, and its distance to all lines [m]."""
+    """Find a point (2,) in a polygon, outside of others, and its distance to all lines [m]."""
     lower, upper = polygon.min(axis=0), polygon.max(axis=0)
     grid = np.stack(np.meshgrid(*np.linspace(lower, upper, 41).T), axis=-1).reshape(-1, 2)
     grid = grid[_is_within_polygon(grid, polygon)]
@@ -188,7 +188,7 @@ def find_clear_point(
 
 
 def _is_within_polygon(points: Array, corners: Array) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 2) lie within a polygon (k, 2)."""
+    """Return whether points (n, 2) lie within a polygon (k, 2)."""
     inside = np.zeros(len(points), dtype=bool)
     x, y = points.T
     for (a, b), (c, d) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

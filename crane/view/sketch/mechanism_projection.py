@@ -30,12 +30,12 @@ _MIN_PIN_COSINE = 0.7  # cosine to the plane's normal above which an axis is dra
 
 
 def project_mechanism(machine: Machine, q: Array, plane: DrawingPlane) -> SketchMechanism:
-    """The mechanism of a machine in a closed posture q (nq,), as a plane shows it."""
+    """Project the mechanism of a machine in a closed configuration q (nq,) onto a plane."""
     return _MechanismProjection(machine, q, plane).mechanism()
 
 
 class _MechanismProjection:
-    """Collects what a plane shows of a machine in one posture."""
+    """Projection of a machine in one configuration."""
 
     def __init__(self, machine: Machine, q: Array, plane: DrawingPlane):
         self.machine, self.plane, self.q = machine, plane, q
@@ -101,7 +101,7 @@ class _MechanismProjection:
         return self.plane.project((self.data.oMi[joint] * placement).translation)
 
     def _find_outer_points(self) -> list[list[Array]]:
-        """By body, where others hang on it: origins of joints, loops, the tip."""
+        """Return the points of each body at which others are attached: joints, loops, tip."""
         outer_points: list[list[Array]] = [[] for _ in self.parents]
         outer_points[0].append(
             self.plane.project(np.zeros(3)) if self._has_base() else self.origins[1]
@@ -116,14 +116,14 @@ class _MechanismProjection:
         return outer_points
 
     def _farthest_point(self, joint: int) -> Array:
-        """The point of a body that lies farthest from its joint."""
+        """Return the point of a body that is farthest from its joint."""
         position = self.origins[joint]
         return max(
             self.outer[joint], key=lambda x: float(np.abs(x - position).max()), default=position
         )
 
     def _has_base(self) -> bool:
-        """Whether the world's origin is where the machine stands: a turning axis goes through."""
+        """Return whether the first joint axis goes through the world's origin."""
         first = self.origins[1]
         axis = self.axes[1]
         axis_offset = first - (first @ axis) * axis
@@ -150,7 +150,7 @@ class _MechanismProjection:
         return pins, collars
 
     def _collar_position(self, joint: int, axis: Array) -> Array:
-        """The origin of a joint, or halfway along its axis where that hides beside a pin."""
+        """Return the origin of a joint, or the middle of its axis if a pin would hide it."""
         position, parent = self.origins[joint], self.parents[joint]
         pins = [*self.outer[joint], *([self.origins[parent]] if parent else [])]
         previous_origin = self.origins[parent] if parent else self.outer[0][0]
@@ -167,7 +167,7 @@ class _MechanismProjection:
         return position + (float((previous_origin - position) @ axis) + length / 2) * axis
 
     def _create_slide(self, joint: int) -> SketchSlide:
-        """A prismatic joint between the inner end of its parent and the far end of its body."""
+        """Return a prismatic joint between its parent's origin and the far end of its body."""
         parent, position = self.parents[joint], self.origins[joint]
         axis = self.axes[joint] / max(float(np.linalg.norm(self.axes[joint])), 1e-9)
         outer = self.outer[joint] or [position]
@@ -240,7 +240,7 @@ class _MechanismProjection:
         )
 
     def _regions(self) -> dict[int, Array]:
-        """Corners of what each loop encloses: its pin, then the pins on both ways back."""
+        """Return the corners that each loop encloses: its pin and those of both branches."""
         regions = {}
         for number in range(1, len(self.loop_frames) // 2 + 1):
             (first_joint, position), (second_joint, _) = self.loop_frames[
@@ -260,7 +260,7 @@ class _MechanismProjection:
 
 
 def _distinct_points(points: Sequence[Array], size: float) -> Array:
-    """Points (k, 2) of a mechanism of some size without those that repeat an earlier one."""
+    """Return points (k, 2) without those that repeat an earlier one."""
     distinct: list[Array] = []
     for point in points:
         if not any(
@@ -333,7 +333,7 @@ def machine_outline(
 def _forward_direction(
     machine: Machine, frame: str, section: WorkspaceSection, data: pin.Data
 ) -> Array:
-    """The direction (3,) of the section's first coordinate."""
+    """Return the direction (3,) of the section's first coordinate."""
     if section.is_radial:
         offset = data.oMf[machine.frame(frame)].translation - section.origin
         offset = offset - (offset @ section.second_direction) * section.second_direction

@@ -52,7 +52,7 @@ class SketchCanvas:
         self.occupied_discs: list[tuple[Array, float]] = []
 
     def draw_line(self, points: Array, colour: str, width: float, **options: Any) -> None:
-        """A line through points (k, 2) [m], its width in points."""
+        """Draw a line through points (k, 2) [m], its width in points."""
         options = {"solid_capstyle": "round", "solid_joinstyle": "round"} | options
         self.axes.plot(*points.T, color=colour, linewidth=width, **options)
         self.occupied_segments += list(np.stack([points[:-1], points[1:]], axis=1))
@@ -60,7 +60,7 @@ class SketchCanvas:
     def draw_polygon(
         self, points: Array, colour: str, width: float, fill_opacity: float, z_order: float
     ) -> None:
-        """A closed line around corners (k, 2) [m], filled with a tint of its colour."""
+        """Draw a polygon with corners (k, 2) [m], filled with a tint of its colour."""
         closed = np.vstack([points, points[:1]])
         self.axes.add_patch(
             Polygon(points, facecolor=colour, alpha=fill_opacity, linewidth=0, zorder=z_order)
@@ -70,7 +70,7 @@ class SketchCanvas:
     def draw_box(
         self, start: Array, end: Array, width: float, colour: str, z_order: float
     ) -> None:
-        """A white rectangle about the line from start to end [m], its width in points."""
+        """Draw a white rectangle about the line from start to end [m], its width in points."""
         axis = (end - start) / max(float(np.linalg.norm(end - start)), 1e-12)
         half_width = np.array([-axis[1], axis[0]]) * width / 2 * self.point_size
         corners = np.array(
@@ -90,18 +90,18 @@ class SketchCanvas:
         self.occupied_segments += list(np.stack([closed[:-1], closed[1:]], axis=1))
 
     def draw_joint(self, name: str, position: Array) -> None:
-        """A pin of the tree."""
+        """Draw a revolute joint of the tree."""
         self._draw_marker(position, 6.0, f"joint {name}", JOINT_MARKER)
         self.occupied_discs.append((position, 4.0))
 
     def draw_loop(self, name: str, position: Array, mate: Array) -> None:
-        """A pin that closes a loop: a ring where its first body has it, a dot for its second."""
+        """Draw a loop joint: a ring on its first body, a dot on its second."""
         self._draw_marker(position, 5.5, f"loop {name}", LOOP_MARKER)
         self._draw_marker(mate, 6.5, f"loop {name} mate", DOT_MARKER)
         self.occupied_discs.append((position, 6.0))
 
     def draw_collar(self, name: str, position: Array, axis: Array) -> None:
-        """A joint that turns about a line in the plane, drawn with that line."""
+        """Draw a revolute joint whose axis lies in the plane."""
         axis_point = axis * self.point_size
         self.draw_box(position - 7 * axis_point, position + 7 * axis_point, 11.0, INK_COLOUR, 4.5)
         axis_line = np.array([position - 20 * axis_point, position + 20 * axis_point])
@@ -115,7 +115,7 @@ class SketchCanvas:
     def draw_ground(
         self, position: Array, down_direction: Array, ground_gap: float | None
     ) -> None:
-        """What stands still: a support under a pin, or a hatched line below, so many points."""
+        """Draw the ground: a support under a pin, or a hatched line below a point [points]."""
         lateral = np.array([-down_direction[1], down_direction[0]])
         ground_point = (
             position
@@ -135,7 +135,7 @@ class SketchCanvas:
         )
 
     def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
-        """A line from start to end [m], hatched on the side of the unit vector down."""
+        """Draw a line from start to end [m], hatched on the side of a unit vector."""
         self.draw_line(np.array([start, end]), INK_COLOUR, 1.2, zorder=2)
         direction = (end - start) / np.linalg.norm(end - start)
         count = max(int(np.linalg.norm(end - start) / (5 * self.point_size)), 2)
@@ -150,18 +150,18 @@ class SketchCanvas:
         self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
 
     def draw_centre_of_mass(self, position: Array) -> None:
-        """A circle with two black quarters."""
+        """Draw a centre of mass."""
         for z_order, style in zip((5.2, 5.3, 5.3), (CENTRE_MARKER, *QUARTER_MARKERS), strict=True):
             self._draw_marker(position, z_order, "centre of mass", style)
         self.occupied_discs.append((position, 4.5))
 
     def draw_tip(self, position: Array) -> None:
-        """A cross whose arms stick out of whatever pin is there."""
+        """Draw the tip as a cross that is larger than a pin."""
         self._draw_marker(position, 5.4, "tip", TIP_MARKER)
         self.occupied_discs.append((position, 6.0))
 
     def draw_number(self, number: int, position: Array) -> None:
-        """The number of a loop, within what it encloses."""
+        """Draw the number of a loop in its region."""
         self.axes.text(
             float(position[0]),
             float(position[1]),
@@ -186,7 +186,7 @@ class SketchCanvas:
 
 
 def marker_options(style: dict[str, Any]) -> dict[str, Any]:
-    """Options of a line that shows a symbol alone."""
+    """Return options of a line that shows only its marker."""
     default_style = {
         "linestyle": "none",
         "color": INK_COLOUR,
@@ -197,7 +197,7 @@ def marker_options(style: dict[str, Any]) -> dict[str, Any]:
 
 
 def convex_hull(points: Array) -> Array:
-    """Corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
+    """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
     ordered = sorted(map(tuple, points.tolist()))
 
     def turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
@@ -222,7 +222,7 @@ _LINE_HEIGHT = 12.5  # height of a line of words [points]
 
 
 def format_joint_symbol(name: str) -> str:
-    """A joint's name as it is set: q1 as q with index 1, X_lift as X with index lift."""
+    """Return a joint's name as a label: q1 as q with index 1, X_lift as X with index lift."""
     if match := re.fullmatch(r"([A-Za-z])(\d+|_[A-Za-z]+)", name):
         return f"${match[1]}_{{\\mathrm{{{match[2].removeprefix('_')}}}}}$"
     return escape_label(name)
@@ -292,7 +292,7 @@ def create_sketch_layout(
 
 
 def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
-    """Lowest and highest corner (2,) of all points [m]."""
+    """Return the lower and upper corner (2,) of all points [m]."""
     points = [drawn_pin.position for drawn_pin in mechanism.pins] + [
         item.position for item in mechanism.collars
     ]
@@ -303,7 +303,7 @@ def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
 
 
 def _coordinate_lines(machine: Machine, q: Array, line_length: int) -> list[str]:
-    """The active coordinates in lines of no more than so many letters."""
+    """Return the active coordinates as lines of limited length."""
     lines: list[str] = []
     length = line_length
     for joint, value in zip(machine.active, q[machine.closure.active], strict=True):

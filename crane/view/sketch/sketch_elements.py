@@ -36,11 +36,11 @@ class DrawingPlane:
 
     @property
     def normal(self) -> Array:
-        """(3,) unit vector towards whoever looks at it."""
+        """(3,) unit vector towards the viewer."""
         return np.cross(self.right, self.up)
 
     def project(self, vectors: Array) -> Array:
-        """Coordinates (..., 2) of points or directions (..., 3)."""
+        """Return the coordinates (..., 2) of points or directions (..., 3)."""
         return vectors @ np.column_stack([self.right, self.up])
 
 
@@ -100,7 +100,7 @@ def joint_axes(machine: Machine, data: pin.Data) -> Array:
 
 
 def _revolute_axes(machine: Machine, data: pin.Data) -> tuple[Array, list[int]]:
-    """Directions (k, 3) of all revolute axes, and the joint that carries each."""
+    """Return the directions (k, 3) of all revolute axes, and the parent joint of each."""
     model, equations = machine.model, machine.closure.equations
     all_axes, axes, carriers = joint_axes(machine, data), [], []
     for i, name in enumerate(machine.joints, start=1):
@@ -115,7 +115,7 @@ def _revolute_axes(machine: Machine, data: pin.Data) -> tuple[Array, list[int]]:
 
 
 def _plane_directions(normal: Array) -> tuple[Array, Array]:
-    """Directions to the right and up in the plane with a normal, near those of the world."""
+    """Return right and up directions of a plane, close to those of the world."""
     vertical_part = np.eye(3)[2] - normal[2] * normal
     up = (
         vertical_part if np.linalg.norm(vertical_part) > 0.5 else np.eye(3)[1] - normal[1] * normal

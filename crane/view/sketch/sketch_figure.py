@@ -1,4 +1,4 @@
-"""The mechanism of a machine as a figure: what every text on it begins with."""
+"""Sketch of a mechanism as a figure."""
 
 import re
 from collections.abc import Sequence
@@ -145,7 +145,7 @@ def sketch_figure(
 
 
 def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, ...]]:
-    """One entry per sub-chain and per kind of symbol, each of lines on top of each other."""
+    """Return one entry per sub-chain and kind of symbol, each of superposed lines."""
     entries: list[tuple[Line2D, ...]] = []
     for i, chain in enumerate(machine.chains):
         if not chain.joints:
@@ -166,7 +166,7 @@ def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, 
 
 
 def _ghost_line(index: int, points: Array | None = None) -> Line2D:
-    """A dashed line in the look of another assembly, without points that of the legend."""
+    """Return a dashed line of another assembly mode; without points for the legend."""
     x, y = np.zeros((2, 0)) if points is None else points.T
     label = f"other assembly {index + 1}"
     style = _GHOST_DASHES[index % len(_GHOST_DASHES)]
@@ -178,7 +178,7 @@ def _ghost_line(index: int, points: Array | None = None) -> Line2D:
 def _draw_ghost(
     canvas: SketchCanvas, ghost: SketchMechanism, home_mechanism: SketchMechanism, index: int
 ) -> None:
-    """The lines of another assembly, of what is elsewhere than at home."""
+    """Draw the parts of another assembly mode that are not at home."""
     outlines = [
         (x.points, y.points) for x, y in zip(ghost.bodies, home_mechanism.bodies, strict=True)
     ]
@@ -204,7 +204,7 @@ def _draw_ghost(
 
 
 def _draw_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
-    """A tint in what each loop encloses, the small ones above the large."""
+    """Tint the region of each loop, small regions above large ones."""
     for number, corners in sorted(
         mechanism.regions.items(), key=lambda item: -_polygon_area(item[1])
     ):
@@ -231,7 +231,7 @@ def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
 def _ground_gap(
     mechanism: SketchMechanism, position: Array, down_direction: Array
 ) -> float | None:
-    """How far below a point the ground is [points]; None for a pin, which has a support."""
+    """Return the distance from a point down to the ground [points]; None for a pin."""
     tolerance = COINCIDENCE_TOLERANCE * mechanism.size
     if any(
         np.abs(drawn_pin.position - position).max() < tolerance for drawn_pin in mechanism.pins
@@ -313,7 +313,7 @@ def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
 
 
 def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
-    """One label per joint, loop and tip; joints at the same pin share one."""
+    """Return one label per joint, loop and tip; joints at the same pin share one."""
     labels = []
     remaining = [shown for shown in mechanism.pins if not shown.loop_number]
     while remaining:
@@ -354,7 +354,7 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
 
 
 def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
-    """Names with their numbers in order, q2 before q10."""
+    """Return names in natural order, q2 before q10."""
     return sorted(
         (drawn_pin.name for drawn_pin in pins),
         key=lambda name: [(x.isdigit(), x.zfill(9)) for x in re.split(r"(\d+)", name)],
@@ -362,7 +362,7 @@ def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
 
 
 def _extent_across(points: Array) -> float:
-    """Extent (m) of points (k, 2) across the line through them."""
+    """Return the extent [m] of points (k, 2) across the line through them."""
     normal = np.linalg.svd(points - points.mean(axis=0))[2][-1]
     return float(np.ptp(points @ normal))
 

@@ -1,4 +1,4 @@
-"""The circuit of a machine as a figure: rails, functions above them, pumps and the rest below."""
+"""Drawing of a hydraulic circuit: rails, functions above, pumps and other items below."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -62,7 +62,7 @@ def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
 
 
 class _CircuitDrawing:
-    """A circuit as it is laid out."""
+    """Layout of a circuit."""
 
     def __init__(self, machine: Machine, hydraulics: Hydraulics):
         self._machine, self._hydraulics = machine, hydraulics
@@ -112,7 +112,7 @@ class _CircuitDrawing:
         return figure, canvas
 
     def _used_nets(self) -> list[list[str]]:
-        """Nets that have a rail, by row; the last row of functions is the first that hangs."""
+        """Return the nets with a rail by row; items hang below the last row of functions."""
         rows: list[set[str]] = []
         for k, functions in enumerate(self._function_rows):
             row = {net for x in functions for net in x.rails.values()}
@@ -135,14 +135,14 @@ class _CircuitDrawing:
         )
 
     def _valve_height(self, row: int) -> float:
-        """Height of the valves above the highest rail."""
+        """Return the height of the valves above the highest rail."""
         functions = self._function_rows[row]
         text_height = 4 + 7.6 * max(len(x.valve_texts) for x in functions)
         required_height = 12 + max(max(x.height_below for x in functions), text_height)
         return required_height + 4.0 * self._open_centres.line_count(row) + 2
 
     def _actuator_height(self, row: int) -> float:
-        """Height of the actuators' middle above the valves."""
+        """Return the height of the actuators' middle above the valves."""
         functions = self._function_rows[row]
         rows = max(sum(h for _, h in valve_rows(x)) for x in functions)
         return rows + 20 + (6 if self._open_centres.line_count(row) else 0)
@@ -257,7 +257,7 @@ def _circuit_functions(machine: Machine, hydraulics: Hydraulics) -> list[Circuit
 def _split_into_rows(
     functions: Sequence[CircuitFunction], count: int
 ) -> list[list[CircuitFunction]]:
-    """Rows of nearly equal length, the longer ones first, with the nets of open centres."""
+    """Split functions into rows of similar length, with the nets of open centres."""
     nets: dict[str, int] = {}
     rows: list[list[CircuitFunction]] = []
     remaining = iter(functions)
@@ -276,7 +276,7 @@ def _split_into_rows(
 
 
 def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[SupplyItem]]:
-    """Items in rows that are at most so wide; what must stay together is in the first."""
+    """Pack items into rows of limited width; items with `stays_in_row` stay together."""
     rows: list[list[SupplyItem]] = [[]]
     for item in items:
         used_width = sum(x.width for x in rows[-1])
@@ -289,7 +289,7 @@ def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[Supp
 def _rail_nets(
     hydraulics: Hydraulics, functions: Sequence[CircuitFunction], centres: OpenCentreLines
 ) -> list[str]:
-    """All nets that may have a rail, from the top."""
+    """Return all nets that may have a rail, from the top."""
     signals = [f"LS {name}" for name in hydraulics.pumps]
     signals += [f"N {name}" for name in hydraulics.pumps]
     nodes = [TANK_NODE, *hydraulics.pumps, *hydraulics.lines, *hydraulics.accumulators]
@@ -298,7 +298,7 @@ def _rail_nets(
 
 
 def _rail_label(hydraulics: Hydraulics, net: str) -> str:
-    """What a rail is called."""
+    """Return the label of a rail."""
     kind, _, name = net.partition(" ")
     is_single_pump = len(hydraulics.pumps) == 1
     label = net

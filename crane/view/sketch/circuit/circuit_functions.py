@@ -49,7 +49,7 @@ class CircuitFunction:
 
     @property
     def ports(self) -> list[str]:
-        """Ports of its valve below, from the left."""
+        """Lower ports of the valve, from the left."""
         has_separate_returns = self.valve.return_a != self.valve.return_b
         availability = {
             "Ta": has_separate_returns,
@@ -62,7 +62,7 @@ class CircuitFunction:
 
     @property
     def rails(self) -> dict[str, str]:
-        """Nets that lead down to rails, by port of the valve or chamber."""
+        """Nets with lines down to rails, by port of the valve or chamber."""
         valve = self.valve
         nets = {"P": valve.supply, "T": valve.return_b}
         if "Ta" in self.ports:
@@ -73,14 +73,14 @@ class CircuitFunction:
 
     @property
     def height_below(self) -> float:
-        """Height of what stands below the valve."""
+        """Height required below the valve."""
         if self.valve.sharing:
             return _METERING_HEIGHT
         return _COMPENSATOR_HEIGHT if self.valve.margin > 0 else 8.0
 
     @property
     def valve_texts(self) -> list[str]:
-        """Words about the valve."""
+        """Labels of the valve."""
         valve = self.valve
         margin = valve.margin or (self.supply.margin if valve.sharing else 0.0)
         root_pressure_drop = (margin or _ORIFICE_DROP) ** 0.5
@@ -99,14 +99,14 @@ class CircuitFunction:
 
 
 def port_lane(function: CircuitFunction, port: str) -> float:
-    """Where a port of the valve goes down to its rail, from the section's middle."""
+    """Return the offset of a port's lane from the middle of the section."""
     if port == "P" and function.centre_nets is not None:
         return _SUPPLY_LANE_BESIDE_CENTRE
     return _PORT_LANES[port]
 
 
 def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
-    """What stands between the valve and the actuator, upwards, with heights."""
+    """Return names and heights of the rows between valve and actuator, upwards."""
     cylinder, valve = function.cylinder, function.valve
     rows: list[tuple[str, float]] = []
     for side in "ab":
@@ -158,11 +158,11 @@ class OpenCentreLines:
         return [x for x in self._function_rows[row] if x.centre_nets and x.valve.supply == name]
 
     def line_count(self, row: int) -> int:
-        """How many lines of open centres a row has."""
+        """Return the number of open-centre lines of a row."""
         return sum(bool(self._functions_of_pump(row, name)) for name in self._pump_names)
 
     def line_heights(self, row: int, valve_height: float) -> dict[str, float]:
-        """Heights at which they are handed on below the valves, by pump."""
+        """Return the heights of the open-centre lines below the valves, by pump."""
         heights: dict[str, float] = {}
         for name in self._pump_names:
             if self._functions_of_pump(row, name):
@@ -170,7 +170,7 @@ class OpenCentreLines:
         return heights
 
     def required_nets(self, row: int) -> set[str]:
-        """Nets of a row that need a rail."""
+        """Return the nets of a row that need a rail."""
         nets: set[str] = set()
         for name in self._pump_names:
             row_functions = self._functions_of_pump(row, name)

@@ -1,4 +1,4 @@
-"""One function of a circuit: its valve above the rails, and its actuator on top."""
+"""Section of a circuit drawing: the valve of one function above the rails, and its actuator."""
 
 from collections.abc import Mapping
 
@@ -67,7 +67,7 @@ class CircuitSection:
         self._chamber_nets = {side: f"{function.joint}.{side}" for side in "ab"}
 
     def draw(self) -> tuple[SheetPoint, SheetPoint] | None:
-        """Draw it; where its open centre begins and ends, if it has one."""
+        """Draw the section, and return the ends of its open centre if it has one."""
         function, canvas, x = self._function, self._canvas, self._x
         upper_ports = ["A", "C", "B"] if function.centre_nets else ["A", "B"]
         spool = SpoolSymbol(
@@ -111,7 +111,7 @@ class CircuitSection:
         return spool.port_positions["C"], spool.port_positions["C'"]
 
     def _valve_side_net(self, side: str) -> str:
-        """Net of a chamber's line at the valve."""
+        """Return the net of a chamber's line at the valve."""
         cylinder, net = self._function.cylinder, self._chamber_nets[side]
         has_counterbalance = getattr(cylinder, f"counterbalance_{side}") is not None
         has_rupture_valve = getattr(cylinder, f"rupture_{side}") > 0
@@ -125,7 +125,7 @@ class CircuitSection:
             self._canvas.draw_wire(current_nets[side], (position, start), (position, end))
 
     def _draw_port_line(self, spool: SpoolSymbol, port: str, net: str, component: str) -> None:
-        """From a port of the valve to its rail, through a compensator where there is one."""
+        """Draw the line from a port to its rail, with a compensator if there is one."""
         canvas, function, x = self._canvas, self._function, self._x
         lane, (position, y), rail_height = (
             x + port_lane(function, port),
@@ -259,7 +259,7 @@ class CircuitSection:
         )
 
     def _draw_port_valves(self, side: str, sign: int, y: float, height: float) -> None:
-        """Relief and suction valves of a chamber, each with the tank."""
+        """Draw relief and suction valve of a chamber, each with a tank."""
         canvas, cylinder, net = self._canvas, self._function.cylinder, self._chamber_nets[side]
         lane, top = self._x + sign * CHAMBER_LANE, y + height - (12 if cylinder.relief else 6)
         if cylinder.relief:
@@ -309,7 +309,7 @@ class CircuitSection:
     def _draw_counterbalance_valve(
         self, side: str, y: float, height: float, current_nets: dict[str, str]
     ) -> None:
-        """A counterbalance valve: free inflow, outflow when the other chamber's line opens it."""
+        """Draw a counterbalance valve, piloted by the line of the other chamber."""
         canvas, sign = self._canvas, (-1 if side == "a" else 1)
         other_chamber = "b" if side == "a" else "a"
         lane, other_lane = self._x + sign * CHAMBER_LANE, self._x - sign * CHAMBER_LANE
@@ -390,7 +390,7 @@ class CircuitSection:
             current_nets[side] = chamber_net
 
     def _draw_actuator(self) -> None:
-        """The actuator, and what it is."""
+        """Draw the actuator with its labels."""
         canvas, function, position = self._canvas, self._function, (self._x, self._actuator_middle)
         cylinder, nets = function.cylinder, (self._chamber_nets["a"], self._chamber_nets["b"])
         if cylinder.motor:

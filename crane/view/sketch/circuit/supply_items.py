@@ -1,4 +1,4 @@
-"""What hangs below the rails: tank, engine, pumps, accumulators, elements."""
+"""Items below the rails of a circuit drawing: tank, engine, pumps, accumulators, elements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,13 +39,13 @@ class SupplyItem:
     stays_in_row: bool
 
     def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        """Draw it, its left edge at x, hanging from y."""
+        """Draw the item with its left edge at x and its top at y."""
 
 
 def create_supply_items(
     hydraulics: Hydraulics, functions: Sequence[CircuitFunction]
 ) -> list[SupplyItem]:
-    """All that hangs below the rails, from the left."""
+    """Return all items below the rails, from the left."""
     items: list[SupplyItem] = [_create_tank(hydraulics)]
     if hydraulics.engine is not None:
         items.append(_create_engine(hydraulics.engine))
@@ -71,7 +71,7 @@ def _draw_labels(
     name: str,
     texts: Sequence[str],
 ) -> None:
-    """Name and words below each other, the first line at y."""
+    """Write a name at y and texts below it."""
     canvas.draw_text(
         x,
         y,

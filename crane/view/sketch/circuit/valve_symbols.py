@@ -7,7 +7,7 @@ from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, 
 
 
 def format_number(value: float) -> str:
-    """Three digits, without an exponent where that can be read."""
+    """Return a number with three digits, without exponent in the usual range."""
     if value == 0 or 1e-3 <= abs(value) < 1e6:
         digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
         text = f"{value:.{digits}f}"
@@ -16,29 +16,29 @@ def format_number(value: float) -> str:
 
 
 def format_pressure(pressure: float) -> str:
-    """A pressure."""
+    """Return a pressure [Pa] as text in bar."""
     return f"{format_number(pressure / 1e5)} bar"
 
 
 def format_flow(flow: float) -> str:
-    """A flow per minute, without its unit."""
+    """Return a flow [m3/s] in l/min, without unit."""
     return format_number(flow * 6e4)
 
 
 def format_volume(cubic: float) -> str:
-    """A volume."""
+    """Return a volume [m3] as text."""
     return (
         f"{format_number(cubic * 1e3)} l" if cubic >= 1e-4 else f"{format_number(cubic * 1e6)} cm³"
     )
 
 
 def format_area(area: float) -> str:
-    """An area, without its unit, cm2."""
+    """Return an area [m2] in cm2, without unit."""
     return format_number(area * 1e4)
 
 
 def format_displacement(displacement: float) -> str:
-    """A volume per angle as one per turn."""
+    """Return a displacement [m3/rad] as text per revolution."""
     volume_per_turn = displacement * 2 * math.pi
     return (
         f"{format_number(volume_per_turn * 1e3)} l/rev"
@@ -94,7 +94,7 @@ class SpoolSymbol:
         return [half_range * (2 * i / (count - 1) - 1) for i in range(count)]
 
     def draw(self, canvas: CircuitCanvas, component: str) -> None:
-        """Draw it."""
+        """Draw the symbol."""
         x, y, w = self._x, self._y, self._width
         first, last = x - 1.5 * w, x + (2.5 if self._has_float_position else 1.5) * w
         corners = [(first, y), (last, y), (last, y + SPOOL_HEIGHT), (first, y + SPOOL_HEIGHT)]
@@ -149,7 +149,6 @@ class SpoolSymbol:
         return x + self._lower_ports[name], self._y
 
     def _draw_closed_ports(self, canvas: CircuitCanvas, x: float, used_ports: set[str]) -> None:
-        """What is closed."""
         for row, level, sign in (
             (self._lower_ports, self._y, 1),
             (self._upper_ports, self._y + SPOOL_HEIGHT, -1),
@@ -215,7 +214,7 @@ def _draw_ports(
 def draw_relief_valve(
     canvas: CircuitCanvas, pose: SymbolPose, component: str, nets: tuple[str, str]
 ) -> None:
-    """A pressure relief valve: closed, opened by its inlet against a spring."""
+    """Draw a pressure relief valve."""
     _draw_ports(canvas, pose, component, nets, RELIEF_HALF_LENGTH, 5.5)
     canvas.draw_shape(pose((-5.5, -5.5), (5.5, -5.5), (5.5, 5.5), (-5.5, 5.5)), gid=component)
     canvas.draw_arrow(*pose((2.2, -5.5), (2.2, 5.5)))
@@ -232,7 +231,7 @@ def draw_compensator(
     nets: tuple[str, str],
     senses_outlet: bool,
 ) -> None:
-    """A pressure compensator: open, throttled by the pressure before it (or behind)."""
+    """Draw a pressure compensator, closed by its inlet or outlet pressure."""
     _draw_ports(canvas, pose, component, nets, COMPENSATOR_HALF_LENGTH, 6.0)
     canvas.draw_shape(pose((-6, -6), (6, -6), (6, 6), (-6, 6)), gid=component)
     canvas.draw_arrow(*pose((0, -6), (0, 6)))
@@ -250,7 +249,7 @@ def draw_check_valve(
     nets: tuple[str, str],
     has_spring: bool = False,
 ) -> None:
-    """A check valve, with a spring where it is loaded."""
+    """Draw a check valve, optionally with a spring."""
     for net, sign in zip(nets, (-1, 1), strict=True):
         canvas.add_port(component, net, pose.transform_point(0, sign * CHECK_HALF_LENGTH))
     canvas.draw_line(pose((0, -CHECK_HALF_LENGTH), (0, -3.8)), linewidth=1.0)
@@ -270,7 +269,7 @@ def draw_throttle(
     is_laminar: bool = False,
     is_adjustable: bool = False,
 ) -> None:
-    """An orifice, or a throttle whose flow is laminar; with an arrow where it is adjusted."""
+    """Draw an orifice or a laminar throttle; an arrow shows that it is adjustable."""
     for net, sign in zip(nets, (-1, 1), strict=True):
         canvas.add_port(component, net, pose.transform_point(0, sign * THROTTLE_HALF_LENGTH))
     canvas.draw_line(
@@ -289,7 +288,7 @@ def draw_throttle(
 def draw_rupture_valve(
     canvas: CircuitCanvas, pose: SymbolPose, component: str, nets: tuple[str, str]
 ) -> None:
-    """A hose rupture valve: a check valve that a spring holds open, in a box."""
+    """Draw a hose rupture valve."""
     _draw_ports(canvas, pose, component, nets, CHECK_HALF_LENGTH + 2, 6.5)
     canvas.draw_shape(pose((-6, -6.5), (6, -6.5), (6, 6.5), (-6, 6.5)), gid=component)
     canvas.draw_circle(pose.transform_point(0, 0.5), 2.2, zorder=3.1)
@@ -301,7 +300,7 @@ def draw_rupture_valve(
 def draw_shuttle_valve(
     canvas: CircuitCanvas, position: SheetPoint, component: str, net: str
 ) -> None:
-    """A shuttle valve, which hands on the higher of two pressures."""
+    """Draw a shuttle valve."""
     x, y = position
     canvas.add_port(component, net, position)
     canvas.draw_shape(
@@ -316,7 +315,7 @@ def draw_shuttle_valve(
 def draw_tank(
     canvas: CircuitCanvas, position: SheetPoint, component: str, net: str, half_width: float = 5.0
 ) -> None:
-    """The tank, its line ending in the oil."""
+    """Draw a tank with its line."""
     x, y = position
     canvas.add_port(component, net, position)
     canvas.draw_line(
