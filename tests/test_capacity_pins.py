@@ -45,7 +45,7 @@ def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
         for k, cause in enumerate(chart.limiting_factors):
             if cause.reason != "pin force":
                 continue
-            found = chart.each[cell][k] / 0.8
+            found = chart.values_by_factor[cell][k] / 0.8
             if not found:
                 assert force(excavator, q, 0.0, cause.element) >= PINS[cause.element]
                 continue
@@ -144,8 +144,8 @@ def test_pins_that_are_not_there_are_named(excavator):
     [
         ({"pins.boom": 0.0}, {}, "'pins.boom' is 0 N, give a force above 0"),
         ({"pins.bom": 1.0}, {}, "'pins.bom' is unknown, did you mean 'pins.boom'"),
-        ({}, {"slope": 0.1}, "rated on level ground, and but the ground slopes by 5.73 degrees"),
-        ({}, {"rule": "sfs4677"}, "rated on level ground, and but the ground slopes by 5 degrees"),
+        ({}, {"slope": 0.1}, "rated on level ground, but the ground slopes by 5.73 degrees"),
+        ({}, {"rule": "sfs4677"}, "rated on level ground, but the ground slopes by 5 degrees"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(excavator, change, given, said):

@@ -93,7 +93,7 @@ def test_the_table_has_the_cells_of_the_chart(chart):
             starred += bool(star)
     assert 10 < starred < 60
     for height, row, far in zip(table.heights, rows, table.max_radii, strict=True):
-        there = chart.at_places([far, far + 0.02], [height])
+        there = chart.at_positions([far, far + 0.02], [height])
         assert np.isfinite(there.loads[:, 0, 0]).all() and np.isnan(there.loads[:, 0, 1]).all()
         assert [int(x.rstrip("*")) for x in row[-3:-1]] == np.floor(there.loads[:, 0, 0]).tolist()
         assert float(row[-1]) == pytest.approx(far, abs=0.005)
@@ -235,7 +235,7 @@ def test_the_page_holds_the_chart(chart, tmp_path):
             assert cell[2] == pytest.approx(chart.loads[s, b, a], rel=1e-6)
             assert cell[3] == chart.limiting_factor_index[s, b, a]
             each = [math.inf if x is None else x for x in cell[4]]
-            assert each == pytest.approx(chart.each[s, b, a].tolist(), rel=1e-6)
+            assert each == pytest.approx(chart.values_by_factor[s, b, a].tolist(), rel=1e-6)
             assert cell[5][1] == pytest.approx(1e3 * chart.q_a[s, b, a, 1], abs=0.05 + 1e-9)
             assert all(x == round(x, 1) for x in cell[5])  # no rounding noise at limits
             assert cell[6][1][0] == pytest.approx(1e-5 * pressures["X_boom"][s, b, a, 0], rel=1e-4)

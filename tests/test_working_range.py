@@ -76,7 +76,7 @@ def test_the_level_bottom_ends_at_the_reach(excavator, found):
     assert one.value - 0.02 < max(windows) < one.value + 0.02
     ends = [-lip[np.abs(lip[:, 0] - u) < 0.02, 1].min() for u in one.section_position[0] + [0.0, 2.44]]
     assert ends == pytest.approx([one.value] * 2, abs=0.02)
-    assert found.level == 2.44
+    assert found.level_length_length == 2.44
 
 
 def test_the_front_slews_within_its_radius(excavator, found, grid):

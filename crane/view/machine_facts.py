@@ -14,13 +14,13 @@ from crane.recordings.recording import FORCE_UNITS
 
 
 class MachineFact(NamedTuple):
-    """One fact, and the rows of its table where it has one.
+    """One fact with an optional table.
 
     Attributes:
-        name: What it is about.
-        text: What is to be said.
-        heading: Of the columns, "" where a cell says by itself what it is.
-        rows: Cells, as many as there are columns; empty ones say nothing.
+        name: Subject of the fact.
+        text: Statement.
+        heading: Headings of the columns; "" for columns that need none.
+        rows: Cells of the table.
     """
 
     name: str

@@ -7,10 +7,10 @@ from crane.common.progress import PROGRESS, MainThreadMonitor, current_activity
 
 
 def show_cell_progress(shell: Any) -> None:
-    """From this cell of a notebook on, tell what goes on in those that take long.
+    """Show the progress of long cells of a notebook from now on.
 
     Args:
-        shell: IPython's, of a kernel.
+        shell: IPython shell of the kernel.
     """
     bar = _CellProgressBar()
     shell.events.register("pre_run_cell", lambda *_: bar.start())

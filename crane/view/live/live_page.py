@@ -34,13 +34,13 @@ def format_coordinate(machine: Machine, joint: str, value: float) -> str:
 def readout_html(
     machine: Machine, readout: Readout, payload_mass: float, recorded_forces: Array | None = None
 ) -> str:
-    """Forces, tip, passive joints and the state of the loops as HTML.
+    """Return forces, tip, passive joints and the state of the loops as HTML.
 
     Args:
         machine: The machine.
-        readout: Where it is.
+        readout: Configuration with its forces.
         payload_mass: Mass at the tip [kg].
-        recorded_forces: (n,) forces of a recording at this moment [N], [N m].
+        recorded_forces: (n,) forces of a recording at this instant [N], [N m].
     """
     headings = [
         "joint",
@@ -108,14 +108,14 @@ _SLIDER_STEPS = 1000  # of a slider
 class LivePage:
     """Widgets on a viser server that act on a session.
 
-    Callbacks of the server only leave a note in a queue; `process_requests` does what the notes
-    say, in the one thread that calls it, the last note of each slider alone.
+    Callbacks of the server put requests into a queue; `process_requests` processes them in one
+    thread, of each slider only the last request.
 
     Args:
         server: A viser server.
-        session: What is shown.
-        playback: A recording to play.
-        requests: The queue, where notes are a widget's key and value.
+        session: Session that is shown.
+        playback: Recording that can be played.
+        requests: Queue of requests: key and value of a widget.
     """
 
     def __init__(

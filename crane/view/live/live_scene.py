@@ -32,7 +32,7 @@ class LiveScene:
 
     Args:
         server: The server.
-        session: What is shown.
+        session: Session that is shown.
     """
 
     def __init__(self, server: Any, session: Session):
@@ -100,10 +100,10 @@ class LiveScene:
         camera.look_at, camera.position = self.camera_view()
 
     def camera_view(self, aspect: float = 1.0) -> tuple[Array, Array]:
-        """What a camera looks at and where it stands [m], everything in view.
+        """Return target and position of a camera that shows the whole machine [m].
 
-        In a window that stands upright, as a phone's, the panel covers the lower part: the machine
-        goes into the part above it, and no wider than the window.
+        In a portrait window, such as a phone's, the panel covers the lower part; the machine is
+        shown above it.
 
         Args:
             aspect: Width of the window over its height.
@@ -151,9 +151,9 @@ def _add_shape(scene: Any, name: str, visual: Visual) -> None:
 
 
 def _motion_bounds(visuals: Sequence[Visual], session: Session) -> tuple[Array, Array]:
-    """Lowest and highest corner (3,) of everything, at home and where single joints can take it.
+    """Return the corners (3,) of the space that is reached from home by single joints.
 
-    Joints that swing around by half a turn or more are left at home: all around is too far away.
+    Joints with a range of half a turn or more stay at home, because the space would be too large.
     """
     machine, home_readout = session.machine, session.posture
     points = []

@@ -24,14 +24,14 @@ _REFUSAL_MESSAGE = (
 
 
 class AccessGuard:
-    """What a request has to have before anything is sent.
+    """Check of requests: token, host and origin.
 
     Args:
-        host: Name or number that is listened on.
+        host: Name or address that is listened on.
 
     Attributes:
-        host: The same.
-        token: First part of the path, drawn for this view.
+        host: As given.
+        token: Random first part of the path.
     """
 
     def __init__(self, host: str):
@@ -48,12 +48,12 @@ class AccessGuard:
         return f"http://{host_text}:{port}/{self.token}/"
 
     def authorized_path(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
-        """The path behind the token; None where the request is refused.
+        """Return the path behind the token; None if the request is refused.
 
         Args:
-            path: That was asked for.
-            hosts: All headers `Host`.
-            origins: All headers `Origin`, which programs that are no browsers leave out.
+            path: Requested path.
+            hosts: All `Host` headers.
+            origins: All `Origin` headers; only browsers send them.
         """
         if len(hosts) != 1 or not self._is_known_host(hosts[0]):
             return None
@@ -103,9 +103,9 @@ class AccessGuard:
 
 
 def restrict_widget_updates(server: Any) -> None:
-    """Let windows say of sliders a number within their range, of buttons that they are pressed.
+    """Accept from clients only slider values within their ranges and button presses.
 
-    viser would take anything, for any property, and tell it to all other windows.
+    viser would accept any value of any property and send it to all other clients.
     """
     from viser._messages import GuiUpdateMessage
 
@@ -157,13 +157,13 @@ def serve_live_view(
     host: str = "127.0.0.1",
     port: int | None = None,
 ) -> None:
-    """Serve a live view until SIGINT or SIGTERM, and leave nothing running.
+    """Serve a live view until SIGINT or SIGTERM.
 
     Args:
-        session: What is shown.
-        playback: A recording to play.
-        host: Address to listen on; the default is this computer alone.
-        port: Where; the first free one from 8080 on if not given.
+        session: Session that is shown.
+        playback: Recording that can be played.
+        host: Address to listen on; by default only this computer.
+        port: Port; by default the first free one from 8080.
 
     Raises:
         InputError: viser is not installed, or there is no such host.

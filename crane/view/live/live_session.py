@@ -22,19 +22,19 @@ from crane.recordings.recording_summary import DISPLAY_UNITS
 
 
 class Playback:
-    """The active coordinates and forces of a recording at any time within it.
+    """Active coordinates and forces of a recording, interpolated in time.
 
     Args:
-        machine: The machine it belongs to.
+        machine: The recorded machine.
         recording: The recording.
 
     Attributes:
         start: Time of the first sample [s].
         end: Time of the last sample [s].
-        configurations: (N, nq) closed postures of all samples [m], [rad].
+        configurations: (N, nq) closed configurations of all samples [m], [rad].
 
     Raises:
-        RecordingError: It lacks an active joint of the machine.
+        RecordingError: The recording lacks an active joint of the machine.
         ClosureError: The loops cannot be closed at a sample.
     """
 
@@ -58,9 +58,9 @@ class Playback:
         )
 
     def interpolate(self, time: float) -> tuple[Array, Array]:
-        """Active coordinates (n,) [m], [rad] and forces (n,) [N], [N m] at a time [s].
+        """Return active coordinates (n,) [m], [rad] and forces (n,) [N], [N m] at a time [s].
 
-        They run straight from sample to sample.
+        Values are interpolated linearly between samples.
         """
         next_index = int(
             np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
@@ -88,21 +88,21 @@ _UNLIMITED_ANGLE_RANGE, _UNLIMITED_STROKE_RANGE = (
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """A closed posture and its numbers.
+    """A closed configuration with tip, forces and loop conditions.
 
     Attributes:
         configuration: (nq,) coordinates [m], [rad].
-        q_a: (n,) the active ones.
-        tip: (3,) position of the tip [m], None without one.
-        gravity: (n,) active forces that hold the weight, the payload's too [N], [N m].
+        q_a: (n,) active coordinates [m], [rad].
+        tip: (3,) position of the tip [m]; None without a tip.
+        gravity: (n,) active forces that hold the weight and the payload [N], [N m].
         largest_gain: Entry of gamma with the largest magnitude among the passive joints
             [m/m], [rad/m], [m/rad], [rad/rad]; 0 without any.
-        gain_joints: The passive and the active joint it belongs to, empty without any.
+        gain_joints: Passive and active joint of this entry; empty without any.
         condition_number: Condition number of J_P, the passive columns of the loops' Jacobian in SI
-            units; 1 without loops. It grows without bound at the branch's edge.
-        weakest_loop: The loop that holds the passive joints least, empty without loops.
+            units; 1 without loops. It is infinite at a singular configuration.
+        weakest_loop: Loop that constrains the passive joints least; empty without loops.
         residual: Largest loop equation [m], [rad].
-        refusal: Why the last move went only this far; empty where it went all the way.
+        refusal: Reason why the last move was not completed; empty if it was.
     """
 
     configuration: Array
@@ -125,9 +125,9 @@ class Session:
 
     Attributes:
         machine: The machine without payload.
-        lower: (n,) where sliders begin [m], [rad].
-        upper: (n,) where they end.
-        readout: Where it is.
+        lower: (n,) lower ends of the sliders [m], [rad].
+        upper: (n,) upper ends of the sliders [m], [rad].
+        readout: Configuration with its forces.
         payload_mass: Mass at the tip [kg].
         max_payload: Largest payload that a slider offers [kg]: half of the moving mass, or a
             little more, as a round number.
@@ -152,17 +152,17 @@ class Session:
         self.posture = self._compute_readout(machine.home)
 
     def move(self, joint: str, value: float) -> Readout:
-        """Move one active joint, the others held.
+        """Move one active joint; all others are held.
 
-        Where the loops cannot be closed, the machine goes as far towards the value as they can,
-        and the posture says why it stopped.
+        If the loops cannot be closed at the value, the machine moves as far towards it as
+        possible, and the readout states the reason.
 
         Args:
-            joint: An active joint.
-            value: Its coordinate within its slider's range [m], [rad].
+            joint: Active joint.
+            value: Coordinate within the range of the slider [m], [rad].
 
         Raises:
-            InputError: Unknown joint, or a value that is not finite or out of range.
+            InputError: The joint is unknown, or the value is not finite or out of range.
         """
         active = self.machine.active
         if joint not in active:
@@ -203,9 +203,9 @@ class Session:
         return readout
 
     def set_active_coordinates(self, q_a: ArrayLike) -> Readout:
-        """Put all active joints (n,) where they are told, wherever they were before.
+        """Set all active coordinates (n,).
 
-        The machine stays where it is if the loops cannot be closed there.
+        The machine does not move if the loops cannot be closed there.
         """
         try:
             q = self.machine.closure.solve(q_a, initial_guess=self.posture.configuration)
@@ -220,7 +220,7 @@ class Session:
         return self.posture
 
     def set_payload(self, mass: float) -> Readout:
-        """Hang a mass [kg] at the tip, in place of what hung there before.
+        """Set the mass of the payload at the tip [kg].
 
         Raises:
             InputError: The machine has no tip, or the mass is negative or not finite.
@@ -253,11 +253,10 @@ class Session:
         return self._kinematics.positions_at_configurations(q)
 
     def _path_configurations(self, target: Array) -> list[Array] | None:
-        """Postures on the straight way to a target (n,), up to where it leaves the branch.
+        """Return configurations on the straight line to a target (n,), as far as the branch goes.
 
-        Small steps, so that it never jumps to where a longer step would find the branch again,
-        and smaller ones towards its edge and away from it.
-        None where there is no machine code to take them.
+        Steps are small, so that none jumps over a gap of the branch, and smaller near its end.
+        None if the closure is not compiled.
         """
         closure = self.machine.closure
         if not closure.is_compiled:
@@ -281,10 +280,10 @@ class Session:
         return path
 
     def _compute_readout(self, q: Array) -> Readout:
-        """A closed posture (nq,) with its numbers.
+        """Return the readout of a closed configuration (nq,).
 
         Raises:
-            BranchEdgeError: The passive joints are not determined there.
+            SingularConfigurationError: The passive joints are not determined.
         """
         machine, closure = self.machine, self.machine.closure
         gamma = closure.gamma(q)
@@ -312,9 +311,9 @@ class Session:
         )
 
     def _loop_condition(self, q: Array) -> tuple[float, str]:
-        """Condition number of J_P, and the loop that a force of least effect belongs to.
+        """Return the condition number of J_P, and the loop that constrains least.
 
-        In shares of the machine's size, so that metres and radians compare.
+        Lengths are scaled by the characteristic length, to compare metres and radians.
         """
         closure = self.machine.closure
         equations, rows = closure.equations, closure.structure.independent_rows

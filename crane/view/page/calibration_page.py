@@ -28,14 +28,14 @@ _MIN_MATRIX_PARAMETERS = 3  # numbers, whose correlations need no picture
 
 @mpl.rc_context(FIGURE_STYLE)
 def write_calibration_report(calibration: Calibration, path: str | Path) -> Path:
-    """Write what a calibration found as one HTML file that needs no network.
+    """Write a calibration as one self-contained HTML file.
 
-    Numbers with their intervals; each channel before and after, fitted and held out; what is left
-    against speed, pressure and direction; what the model lacks; what the recordings cannot tell
-    apart; options that make the same machine.
+    The page has parameters with intervals; each channel before and after the fit, for training and
+    held-out data; residuals against speed, pressure and direction; score tests; correlated
+    parameters; and options that reproduce the machine.
 
     Args:
-        calibration: What was found.
+        calibration: The calibration.
         path: The file to write; replaced if it exists.
 
     Returns:

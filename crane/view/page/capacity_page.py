@@ -30,10 +30,10 @@ _SIGNIFICANT_DIGITS, _LOAD_DIGITS = 5, 7
 
 
 def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
-    """Write rated loads as one HTML file that needs no network.
+    """Write a load chart as one self-contained HTML file.
 
     Args:
-        chart: What to show; of more than 1500 places per slew angle every second, third ...
+        chart: Load chart; positions are thinned to 1500 per slew angle.
         path: The file to write; replaced if it exists.
 
     Returns:
@@ -99,10 +99,10 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
 def _cell_rows(
     chart: Capacity, k: int, pressures: dict[str, Array], unit: float, shapes: dict[str, int]
 ) -> list[list[Any]]:
-    """Of each place at a slew angle what the page tells of it.
+    """Return one row per position at a slew angle.
 
-    Radius, height, load, cause, loads by cause, strokes, pressures by joint, and the number of
-    its outline.
+    Radius, height, load, limiting factor, loads by factor, strokes, pressures by joint, outline
+    index.
     """
     machine, active = chart.machine, chart.machine.closure.active
     stride = _cell_stride(chart)

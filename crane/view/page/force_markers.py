@@ -60,11 +60,11 @@ def actuator_markers(
 
 
 def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, float]:
-    """The force or torque of each driven joint that has a full arrow [N or N m].
+    """Return the force of each driven joint that is drawn as a full arrow [N], [N m].
 
-    In proportion to their limits (`effort`) where all have one, so that arrows tell how hard each
-    works for what it can. Else to forces, torques by the longest body as their lever. The joint
-    that is largest by that has a full arrow at its peak.
+    Forces are scaled by the effort limits if all joints have one, so that arrows show the
+    utilization of each drive. Otherwise torques are divided by the length of the longest body. The
+    joint with the largest scaled force has a full arrow at its peak.
 
     Args:
         machine: The machine.
@@ -117,13 +117,13 @@ def load_markers(machine: Machine, recording: Recording, rows: np.ndarray) -> li
 
 
 def spring_markers(machine: Machine, q: Array) -> list[dict[str, Any]]:
-    """What acts between two frames of a machine: where, what it looks like, and its lengths.
+    """Return the force elements between two frames: ends, symbols and lengths.
 
-    A coil where there is a spring, a strut where there is a damper or gas, else a line.
+    Springs are drawn as coils, dampers and gas springs as struts, others as lines.
 
     Args:
         machine: The machine.
-        q: (N, nq) postures that are shown.
+        q: (N, nq) configurations of the page.
     """
     element_pairs = [
         (element, element.between)

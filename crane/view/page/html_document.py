@@ -41,8 +41,8 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
 
     Args:
         path: The file to write; replaced if it exists.
-        heading: What it is called.
-        parts: Its HTML.
+        heading: Heading of the page.
+        parts: HTML of its parts.
 
     Returns:
         The path.

@@ -30,16 +30,16 @@ _VALIDATION_COLOUR = "#2a9d6f"
 def identification_report(
     result: Identification, path: str | Path, recording: str = "", validation: str = ""
 ) -> Path:
-    """Write what an identification found as one HTML file that needs no network.
+    """Write an identification as one self-contained HTML file.
 
-    Summary; fit of every actuator; measured and modelled forces, residuals and their spectra;
-    base parameters with intervals; their correlations; what forces cannot tell.
+    The page has a summary; the fit of every actuator; measured and modelled forces, residuals and
+    their spectra; base parameters with intervals; correlations; and unobservable parameters.
 
     Args:
-        result: What was found.
+        result: The identification.
         path: The file to write; replaced if it exists.
-        recording: What it was identified from, in words.
-        validation: What it was judged by.
+        recording: Description of the training data.
+        validation: Description of the validation data.
 
     Returns:
         The path.

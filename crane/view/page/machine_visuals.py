@@ -25,12 +25,11 @@ _MAX_ROD_STROKE_RATIO = (
 
 
 def read_visuals(machine: Machine) -> list[Visual]:
-    """The visuals of every link, and a skeleton of bodies with mass that have none.
+    """Return the visuals of every link, and a skeleton of bodies with mass that have none.
 
-    Where no URDF has any, the skeleton is of all that there is. A mesh whose file is missing or
-    damaged is a box, and what cannot be drawn is left out, with a warning; where nothing but boxes
-    would be left, the skeleton is there, too. Bodies that slide and have no visuals are rods or
-    blocks.
+    Without any visuals, all bodies are drawn as a skeleton. A mesh with a missing or damaged file
+    is drawn as a box, and shapes that cannot be drawn are left out, with a warning; if only boxes
+    remain, the skeleton is added. Sliding bodies without visuals are drawn as rods or blocks.
     """
     visuals: list[Visual] = []
     missing_meshes: list[str] = []
@@ -99,10 +98,10 @@ def _first_links(machine: Machine) -> dict[int, str]:
 
 
 def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> list[Visual]:
-    """What shows bodies with mass that slide, but for those that are drawn, by joints.
+    """Return rods and blocks for sliding bodies with mass that have no visuals.
 
-    On what moves, a rod as long as the stroke, whose end is in the mouth of the barrel when it is
-    out; on what stands still, or without limits that any barrel has, a block.
+    A body on a moving body is a rod as long as the stroke, whose end is in the mouth of the barrel
+    when extended; a body on the ground, or with a long stroke, is a block.
     """
     model, links, size = machine.model, _first_links(machine), largest_body_extent(machine)
     width, limits = 0.11 * size, machine.coordinates
@@ -126,13 +125,13 @@ def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> lis
 
 
 def skeleton_visuals(machine: Machine, bodies: Collection[int] | None = None) -> list[Visual]:
-    """Bars from each joint to the joints and frames of the body it moves.
+    """Return bars from each joint to the joints and frames of its body.
 
-    Where springs are held by what stands still there is a ball alone: a bar would hide them.
+    Ends of springs on the ground are drawn as spheres only; a bar would hide the springs.
 
     Args:
         machine: The machine.
-        bodies: By the joints that move them; all, and what stands still, if not given.
+        bodies: Joints of the bodies to draw; by default all, and the ground.
     """
     model, links, radius = (
         machine.model,

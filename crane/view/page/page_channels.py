@@ -1,8 +1,7 @@
-"""A recording's columns as a page plots them: grouped, in units to read, thinned out.
+"""Plot data of a page: columns of a recording, grouped, in display units, thinned.
 
-A column of few samples is kept as it is. Of more, the page has the lowest and highest value in
-each of many spans of time, so that no peak is lost, and the samples at the frames, which are the
-values at the cursor.
+Short columns are complete. Of long columns, the page has the smallest and the largest value in
+each of many time spans, so that no peak is lost, and the samples at the frames, for the cursor.
 """
 
 import itertools
@@ -54,12 +53,12 @@ class PageColumn:
     """One column of a recording, in SI units.
 
     Attributes:
-        name: As in the recording's file.
-        group: Title of the group it is plotted in.
-        label: What the plot calls it.
+        name: Name in the recording.
+        group: Title of its plot group.
+        label: Label in the plot.
         unit: Its unit.
         values: (N,).
-        reference: (N,) what it should be; None if not recorded.
+        reference: (N,) reference; None if not recorded.
         limits: Limits of a coordinate.
     """
 
@@ -74,12 +73,12 @@ class PageColumn:
 
 @dataclass(frozen=True, eq=False)
 class ThinningGrid:
-    """How the samples of one recording are thinned out.
+    """Grid on which the samples of a recording are thinned.
 
     Attributes:
-        time: (N,) of the samples [s].
-        frame_rows: Samples that are frames.
-        span_starts: First sample of each span; None where every sample is kept.
+        time: (N,) times of the samples [s].
+        frame_rows: Rows of the samples that are frames.
+        span_starts: First sample of each span; None if every sample is kept.
     """
 
     time: Array
@@ -137,14 +136,13 @@ def plot_groups(
     grid: ThinningGrid,
     second_recording: tuple[Recording, ThinningGrid] | None = None,
 ) -> list[dict[str, Any]]:
-    """Everything that a page plots, by group.
+    """Return the plot data of a page by group.
 
     Args:
         machine: The machine.
-        recording: What it did.
-        grid: How its samples are thinned out.
-        second_recording: A second recording, with its grid: its columns of the same names are
-            second lines.
+        recording: Recording of its run.
+        grid: Grid on which its samples are thinned.
+        second_recording: Second recording with its grid; its columns are drawn as second lines.
     """
     columns_by_group: dict[tuple[str, str], list[PageColumn]] = {}
     for column in page_columns(machine, recording):
@@ -195,10 +193,9 @@ def plot_groups(
 
 
 def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]:
-    """All columns but time, each in its group; references with what they are references of.
+    """Yield all columns except time, with their groups, and references with their columns.
 
-    Beside them what follows from them: errors, references less coordinates, and the sum of
-    kinetic and potential energy.
+    Errors (reference minus coordinate) and the sum of kinetic and potential energy are added.
     """
     channels = recording.channels
     used_references = set()

@@ -15,11 +15,11 @@ _LEVELS = 2**32 - 1
 
 
 def pack_base64(values: np.ndarray, dtype_name: str) -> str:
-    """Base64 of little-endian numbers.
+    """Return little-endian numbers as base64.
 
     Args:
-        values: Any shape, written row by row.
-        dtype_name: numpy's name of the type, "f4", "f8" or "u4".
+        values: Array of any shape, in row-major order.
+        dtype_name: numpy type, "f4", "f8" or "u4".
     """
     return base64.b64encode(
         np.ascontiguousarray(values, dtype=f"<{dtype_name}").tobytes()
@@ -27,13 +27,13 @@ def pack_base64(values: np.ndarray, dtype_name: str) -> str:
 
 
 def quantise(values: Array) -> dict[str, Any]:
-    """Coordinates in four bytes each, to 1.2e-10 of their range (float32 would have 6e-8).
+    """Pack coordinates into four bytes each, to 1.2e-10 of their range (float32: 6e-8).
 
     Args:
-        values: (N,) finite.
+        values: (N,) finite values.
 
     Returns:
-        low, step and levels: value = low + step level; no levels where all are low.
+        low, step and levels with value = low + step * level; no levels if all values are equal.
     """
     low = float(values.min())
     step = (float(values.max()) - low) / _LEVELS
@@ -47,10 +47,10 @@ MAX_FRAMES = 36_000  # twenty minutes at full rate; longer recordings get fewer 
 
 
 def joint_tree(machine: Machine) -> dict[str, Any]:
-    """Joints, bodies' masses and link frames for the script; matrices column by column.
+    """Return joints, masses and link frames for the script; matrices in column-major order.
 
     Returns:
-        joints, each after its parent, with the first of their coordinates; -1 is the world.
+        Joints, each after its parent, with the index of their first coordinate; -1 is the world.
     """
     model = machine.model
     joints = []
@@ -118,11 +118,11 @@ def payload_frame_data(machine: Machine) -> dict[str, Any] | None:
 
 
 def frame_rows(time: Array, frame_share: float = 1.0) -> np.ndarray:
-    """Rows of the samples that are frames: 30 per second, of a long recording fewer.
+    """Return the rows of the samples that are frames: 30 per second, fewer of long recordings.
 
     Args:
-        time: (N,) increasing [s].
-        frame_share: Of the frames that a page has at most.
+        time: (N,) increasing times [s].
+        frame_share: Share of the largest number of frames of a page.
     """
     duration = float(time[-1] - time[0])
     return nearest_frame_rows(
@@ -134,10 +134,10 @@ def frame_rows(time: Array, frame_share: float = 1.0) -> np.ndarray:
 
 
 def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
-    """Rows of the samples nearest to the frames of a film, the first and the last among them.
+    """Return the rows of the samples nearest to equidistant frames, first and last included.
 
     Args:
-        time: (N,) increasing [s].
+        time: (N,) increasing times [s].
         fps: Frames per second.
     """
     frame_times = np.arange(time[0], time[-1], 1 / fps)
@@ -151,11 +151,10 @@ def motion_data(time: Array, q: Array) -> dict[str, Any]:
 
 
 def check_joints(machine: Machine, recording: Recording) -> None:
-    """See that a recording is of this machine.
+    """Check that a recording is of this machine.
 
     Raises:
-        RecordingError: It lacks an active joint, has one that the machine does not have, or one
-            in another unit.
+        RecordingError: The recording lacks an active joint, or has an unknown joint or unit.
     """
     for joint in machine.active:
         if joint not in recording.joints:
@@ -177,10 +176,10 @@ def check_joints(machine: Machine, recording: Recording) -> None:
 
 
 def recorded_configurations(machine: Machine, recording: Recording, rows: np.ndarray) -> Array:
-    """(len(rows), nq) closed postures of some samples of a recording.
+    """Return closed configurations (len(rows), nq) of some samples of a recording.
 
     Raises:
-        RecordingError: It is of a machine with other joints.
+        RecordingError: The recording is of a machine with other joints.
         ClosureError: The loops cannot be closed.
         InputError: A coordinate is not finite.
     """

@@ -45,17 +45,17 @@ def report(
     path: str | Path,
     second_recording: Recording | None = None,
 ) -> Path:
-    """Write a machine, moving as recorded or in its home posture, as one HTML file.
+    """Write a report of a machine at home or in a recorded run, as one HTML file.
 
-    The page holds the viewer, the motion and all columns of the recording; nothing is loaded from
-    anywhere. Space plays, the arrow keys step, and every recorded instant is shown as recorded.
+    The page contains the viewer, the motion and all columns of the recording and needs no network.
+    The space key plays, and the arrow keys step.
 
     Args:
         machine: The machine.
-        recording: What it did; None for the home posture.
+        recording: Recording of its run; None for the home configuration.
         path: The file to write; replaced if it exists.
-        second_recording: A second recording of the machine: a ghost, and second lines in the
-            plots. Where its times do not overlap with those of the first, both start together.
+        second_recording: Second recording of the machine, shown as a ghost and as second lines. If
+            its times do not overlap with those of the first, both start together.
 
     Returns:
         The path.
@@ -63,7 +63,7 @@ def report(
     Raises:
         RecordingError: A recording is of a machine with other joints.
         ClosureError: The loops cannot be closed at a recorded sample.
-        InputError: A posture is not finite.
+        InputError: A configuration is not finite.
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
     check_page_suffix(path)
@@ -76,13 +76,13 @@ def report_html(
     second_recording: Recording | None = None,
     frame_share: float = 1.0,
 ) -> str:
-    """The page of `report`, as HTML.
+    """Return the page of `report` as HTML.
 
     Args:
-        machine: See there.
-        recording: See there.
-        second_recording: See there.
-        frame_share: Of the frames and spans of time that a page has at most.
+        machine: See `report`.
+        recording: See `report`.
+        second_recording: See `report`.
+        frame_share: Share of the largest number of frames and time spans of a page.
     """
     scene = build_scene(machine, recording, frame_share)
     page_data = _machine_data(machine, scene, recording)

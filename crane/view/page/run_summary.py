@@ -16,10 +16,11 @@ _LIMIT_TOLERANCE = 1e-4  # share of a range that counts as at its end
 
 
 def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, Any]:
-    """What the page's panel says.
+    """Return the content of the summary panel.
 
     Returns:
-        facts: Pairs of words; forces: rows (joint, range, peak and RMS force); limits: sentences.
+        facts: pairs of name and text; forces: rows (joint, range, peak and RMS force); limits:
+            sentences.
     """
     moving_masses = [inertia.mass for inertia in list(machine.model.inertias)[1:]]
     facts = [("moving mass", format_quantity(sum(moving_masses), "kg", 4))]
@@ -86,9 +87,9 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
 
 
 def mechanical_work(recording: Recording) -> tuple[float, float]:
-    """Work [J] that the active joints gave to the machine, and that it gave back to them.
+    """Return the work of the active joints on the machine, and of the machine on them [J].
 
-    The integrals of the positive and of the negative part of sum tau v, by the trapezoidal rule.
+    These are the integrals of the positive and the negative part of sum tau v (trapezoidal rule).
     """
     power = compute_in_blocks(
         lambda part: (recording.tau[part] * recording.v[part]).sum(axis=1, keepdims=True),

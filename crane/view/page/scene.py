@@ -28,9 +28,9 @@ _CYLINDER_ROTATION = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 
 
 @dataclass
 class CommandRecorder:
-    """Stands in for meshcat's window: no server, no port, only a list of commands.
+    """Replacement of meshcat's window that records commands, without server and port.
 
-    Meshcat's identifiers tell time and computer. Here they are numbers in the order of the
+    Meshcat's identifiers depend on time and computer. Here they are numbers in the order of the
     commands, so that equal runs give equal pages.
     """
 
@@ -112,19 +112,19 @@ _MIN_SIZE = 1e-3  # [m], of a scene in which everything is a point
 
 @dataclass(frozen=True)
 class Scene:
-    """What a page shows in space.
+    """Three-dimensional content of a page.
 
     Attributes:
-        commands: Commands of the meshcat viewer, in their order. Each link that has visuals is
-            the group machine/<link>, its pose in the first frame that group's transform.
-        frame_rows: (N,) samples of the recording that are frames; one 0 for a still posture.
-        time: (N,) their times [s].
-        configurations: (N, nq) their postures.
-        lower: (3,) lowest corner of what is drawn [m].
-        upper: (3,) highest corner [m].
-        ground_height: Height that the machine stands at [m].
-        heading: Angle about z from the x axis to where the tip points in the first frame, seen
-            from the first joint that moves it [rad]; 0 without a tip, or with one on that axis.
+        commands: Commands of the meshcat viewer, in order. Each link with visuals is a group
+            machine/<link>, whose transform is the pose in the first frame.
+        frame_rows: (N,) rows of the recording that are frames; one 0 without a recording.
+        time: (N,) times of the frames [s].
+        configurations: (N, nq) configurations of the frames.
+        lower: (3,) lower corner of the scene [m].
+        upper: (3,) upper corner of the scene [m].
+        ground_height: Height of the ground [m].
+        heading: Angle about z from the x axis to the tip in the first frame, seen from the first
+            joint that moves it [rad]; 0 without a tip.
     """
 
     commands: Sequence[dict[str, Any]]
@@ -140,18 +140,18 @@ class Scene:
 def build_scene(
     machine: Machine, recording: Recording | None = None, frame_share: float = 1.0
 ) -> Scene:
-    """The machine in its home posture, or moving as recorded.
+    """Build the scene of a machine at home, or of a recorded run.
 
     Args:
         machine: The machine.
-        recording: Its motion. Where it lacks the channel of a passive joint, the loops are closed
-            at its active coordinates.
+        recording: Recording of its run. If the channel of a passive joint is missing, the loops
+            are closed at the active coordinates.
         frame_share: See `frame_rows`.
 
     Raises:
         RecordingError: The recording is of a machine with other joints.
         ClosureError: The loops cannot be closed at a recorded sample.
-        InputError: A posture is not finite.
+        InputError: A configuration is not finite.
     """
     import meshcat
 
@@ -194,7 +194,7 @@ def build_scene(
 
 
 def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Array]:
-    """Poses (N, 4, 4) of some links in the world, at postures q (N, nq).
+    """Return the poses (N, 4, 4) of some links in the world, at configurations q (N, nq).
 
     Raises:
         InputError: A pose is not finite.
@@ -214,10 +214,10 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
 
 
 def ground_height(machine: Machine, visuals: Sequence[Visual]) -> float:
-    """Height that the machine stands at [m]: the lowest point of what cannot move.
+    """Return the height of the ground [m]: the lowest point of fixed visuals.
 
-    The origin's height where nothing of what is drawn stands still: how low the tip reaches says
-    nothing about the ground.
+    Without fixed visuals this is the height of the origin, because the reach of the tip does not
+    determine the ground.
     """
     heights = [
         float((frame.placement * corner)[2])

@@ -29,11 +29,11 @@ _MAX_PANELS = 18  # panels
 
 
 def plot_calibration(calibration: Calibration, path: str | Path) -> None:
-    """Write the picture of a calibration to a file.
+    """Write the figure of a calibration to a file.
 
     Args:
-        calibration: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        calibration: The calibration.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -66,9 +66,9 @@ def calibration_figure(calibration: Calibration) -> Figure:
 
 
 def draw_channel(axes: Axes, sensor: CalibrationChannel) -> str:
-    """Draw a channel measured, before and fitted; the unit it is read in.
+    """Draw a channel measured, before and fitted, and return its display unit.
 
-    The axis holds what was measured and what is fitted, whatever was before.
+    The limits of the axis contain the measured and the fitted values only.
     """
     all_values = np.concatenate([sensor.measured, sensor.simulated_after])
     unit, scale = display_unit(sensor.unit, float(np.ptp(all_values)))
@@ -120,10 +120,10 @@ def channel_residual_figure(channel: CalibrationChannel, name: str) -> Figure:
 
 
 def residual_dependence_figure(dependence: ResidualDependence) -> Figure:
-    """What is left of a channel against speed, pressure and direction of a drive.
+    """Return the residual of a channel against speed, pressure and direction of a drive.
 
-    Dots are instants, the line has the means of groups of as many each; of directions the span of
-    95 of 100 instants and the mean.
+    Dots are instants, the line shows means of groups of equal size; for directions, bars show the
+    central 95 % and dots the means.
     """
     figure = Figure(figsize=(11.8, 2.5))
     grid = {"left": 0.065, "right": 0.993, "top": 0.87, "bottom": 0.19, "wspace": 0.06}
@@ -187,7 +187,7 @@ _MAX_POINTS = 4000  # instants that a line needs
 
 
 def plot_comparison(comparison: Comparison, path: str | Path) -> None:
-    """Write the figure of a comparison: measured lines, dashed what the model says.
+    """Write the figure of a comparison: measured lines, simulated ones dashed.
 
     Raises:
         OutputError: The file cannot be written.
@@ -196,10 +196,10 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
 
 
 def comparison_figure(comparison: Comparison) -> Figure:
-    """The figure of a comparison, a panel per channel.
+    """Return the figure of a comparison, a panel per channel.
 
     Raises:
-        InputError: It has none.
+        InputError: The comparison has no channel.
     """
     if not comparison.channels:
         raise InputError("the file has no channel that the simulation has too")

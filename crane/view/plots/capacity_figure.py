@@ -46,11 +46,11 @@ _ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
 
 def plot_capacity(chart: Capacity, path: str | Path) -> None:
-    """Write the picture of rated loads to a file.
+    """Write the figure of a load chart to a file.
 
     Args:
-        chart: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        chart: The chart.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -193,9 +193,9 @@ def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
 
 
 def _continued(loads: Array) -> Array:
-    """Loads (b, a), and around them those that two places beside continue, in a straight line.
+    """Extrapolate loads (b, a) linearly by one cell around the positions that have loads.
 
-    Of cells at the border the contours would miss the outer half else.
+    Otherwise contours would not reach the outer half of cells at the border.
     """
     b, a = loads.shape
     wide = np.pad(loads, 2, constant_values=np.nan)
@@ -258,11 +258,11 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
 def contour_label_positions(
     lines: Sequence[tuple[str, list[Array]]], size: float
 ) -> list[tuple[float, float]]:
-    """Where on lines there is room for their labels: none upon another, few on a bundle of lines.
+    """Return positions of labels on contours that do not overlap.
 
     Args:
-        lines: Words, and lines (n, 2) [m] that they stand on.
-        size: Points of a metre.
+        lines: Labels with their lines (n, 2) [m].
+        size: Points per metre.
     """
     occupied = np.empty((0, 2))
     positions: list[tuple[float, float]] = []

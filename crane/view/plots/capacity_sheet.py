@@ -38,11 +38,11 @@ _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
 
 def plot_capacity_sheet(chart: Capacity, path: str | Path) -> None:
-    """Write rated loads as one A4 page on its side.
+    """Write a load chart as one A4 page in landscape format.
 
     Args:
-        chart: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        chart: The chart.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -87,11 +87,7 @@ def _write_text(
 
 
 def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> float:
-    """One panel per slew angle.
-
-    Returns:
-        Where they end on the right [inch].
-    """
+    """Draw one panel per slew angle, and return the right end of the panels [inch]."""
     lower, upper = drawing_extent(chart)
     panel_count, available_width = len(chart.slews), _PAGE_WIDTH - 2 * _PAGE_MARGIN - _FACTS_WIDTH
     aspect = (upper - lower)[1] / (upper - lower)[0]
@@ -146,10 +142,10 @@ def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> Non
 
 
 def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float) -> float:
-    """Rows by height, columns by radius and slew.
+    """Draw the load table: rows by height, columns by radius and slew angle.
 
     Returns:
-        Where it ends above [inch].
+        Top of the table [inch].
     """
     rows, names = table.format_rows(), slew_labels(chart)
     slew_count = len(names)

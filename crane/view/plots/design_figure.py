@@ -17,11 +17,11 @@ from crane.view.plots.recording_figure import (
 
 
 def plot_design(result: Design, path: str | Path) -> None:
-    """Write the picture of a design to a file.
+    """Write the figure of a design optimization to a file.
 
     Args:
-        result: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        result: The result.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.

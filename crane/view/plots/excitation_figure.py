@@ -27,7 +27,7 @@ _MAX_POINTS = 2000  # instants that a line needs
 
 
 def plot_excitation(excitation: Excitation, path: str | Path) -> None:
-    """Write the figure of a reference.
+    """Write the figure of an excitation trajectory.
 
     Raises:
         OutputError: The suffix is none of png, svg, pdf, or the file cannot be written.

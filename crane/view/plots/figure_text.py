@@ -8,10 +8,10 @@ _MAX_LENGTH = 80  # characters
 
 
 def escape_label(text: str) -> str:
-    r"""A text that matplotlib sets as it stands.
+    r"""Return a text that matplotlib shows literally.
 
-    It would read what is between two $ as mathematics (and refuse `$\bad$`), and leave out of
-    legends what begins with an underscore.
+    Without escapes matplotlib reads text between two $ as mathematics (and raises for `$\bad$`),
+    and leaves labels with a leading underscore out of legends.
     """
     shortened = text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 1]}…"
     shortened = escape_text(shortened)
@@ -28,9 +28,9 @@ _MAX_POINTS = 40_000  # points of a curve, several per column of dots of any pri
 
 
 def envelope(time: Array, values: Array) -> tuple[Array, Array]:
-    """A curve (N,) that looks the same: of each stretch of time its lowest and highest sample.
+    """Thin a curve (N,) to the smallest and the largest sample of each time span.
 
-    First and last sample and all extremes stay; a short curve stays as it is.
+    First and last sample are kept; short curves are unchanged.
     """
     count = len(values)
     if count <= _MAX_POINTS:

@@ -62,14 +62,14 @@ def force_time_figure(
 def residual_spectrum_figure(
     fits: list[tuple[str, ForceComparison, str]], drive_index: int, unit: str
 ) -> Figure:
-    """Spectral densities of the residuals of drive i, averaged (Welch 1967).
+    """Return averaged spectral densities of the residuals of a drive (Welch 1967).
 
-    Rows that are left out count as zero.
+    Samples that are left out count as zero.
 
     Args:
         fits: Name, comparison and colour of each curve.
         drive_index: Column of the drive.
-        unit: Of its force.
+        unit: Unit of its force.
     """
     from scipy.signal import welch
 
@@ -139,11 +139,11 @@ _MAX_DOTS = 4000  # dots
 
 @mpl.rc_context(FIGURE_STYLE)
 def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") -> Figure:
-    """Both sides of (29) over time, a row per recording.
+    """Return both sides of equation (29) over time, a row per recording.
 
     Args:
-        runs: By title.
-        unit: Of the cylinder's coordinate, "m" or "rad".
+        runs: Both sides of the equation by title.
+        unit: Unit of the cylinder's coordinate, "m" or "rad".
     """
     figure = Figure(figsize=(7.2, 0.6 + 1.9 * len(runs)), layout="constrained")
     rows = figure.subplots(len(runs), 1, squeeze=False)[:, 0]

@@ -44,8 +44,8 @@ def plot_modes(model: LinearModel, path: str | Path) -> None:
     """Write poles and frequency responses of a linear model to a file.
 
     Args:
-        model: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        model: The linear model.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -56,7 +56,7 @@ def plot_modes(model: LinearModel, path: str | Path) -> None:
 def plot_parameter_modes(
     models: Sequence[tuple[dict[str, float], LinearModel]], path: str | Path
 ) -> None:
-    """Write frequency and damping of what rings over what was varied, see `linear_models`.
+    """Write frequency and damping of oscillatory modes over parameters, see `linear_models`.
 
     Raises:
         OutputError: The suffix is not .png, .svg or .pdf, or the file cannot be written.
@@ -233,11 +233,11 @@ _MAX_PANELS = 18  # panels
 
 
 def plot_sensitivities(sensitivities: Sensitivities, path: str | Path) -> None:
-    """Write the picture to a file.
+    """Write the figure to a file.
 
     Args:
-        sensitivities: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        sensitivities: The sensitivities.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.

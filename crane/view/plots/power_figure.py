@@ -42,11 +42,11 @@ _MAX_POINTS = 1500  # points of a stack
 
 
 def plot_power(balance: PowerBalance, path: str | Path) -> None:
-    """Write the picture to a file.
+    """Write the figure to a file.
 
     Args:
-        balance: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        balance: The power balance.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -56,9 +56,9 @@ def plot_power(balance: PowerBalance, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def power_figure(balance: PowerBalance) -> Figure:
-    """Two stacks over time under the power of the shafts: by what it goes into, and by joint.
+    """Return the power of the shafts over time, stacked by class and by joint.
 
-    What is negative, as a load that drives its cylinder, is stacked below zero.
+    Negative powers, such as of a load that drives its cylinder, are stacked below zero.
     """
     by_class = {name: np.zeros_like(balance.time) for name in CLASS_COLOURS}
     by_owner: dict[str, Array] = {}

@@ -86,10 +86,10 @@ LINE_STYLES: Mapping[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class _TimePanel:
-    """One quantity of one joint over time [SI]: lines (N,) by what they are called.
+    """One quantity of one joint over time: lines (N,) by label, in SI units.
 
-    With what they should be, errors to that: computed as they are drawn, as a long recording is
-    more than memory has room for.
+    With a reference, the lines are errors, which are computed while they are drawn, because long
+    recordings exceed the memory.
     """
 
     quantity: str
@@ -108,8 +108,8 @@ def plot_recording(recording: Recording, path: str | Path) -> None:
     """Write the figure of a recording to a file.
 
     Args:
-        recording: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        recording: The recording.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -135,7 +135,7 @@ def add_heading(figure: Figure, text: str) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def recording_figure(recording: Recording) -> Figure:
-    """The figure of a recording.
+    """Return the figure of a recording.
 
     One column per active joint with its displacement, velocity and force over time, in the units
     that the page of a run has, many joints in several bands below each other; of cylinders with

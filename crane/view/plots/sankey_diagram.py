@@ -86,11 +86,11 @@ class _SankeyGroup:
 
 
 def plot_sankey(balance: PowerBalance, path: str | Path) -> None:
-    """Write the picture to a file.
+    """Write the figure to a file.
 
     Args:
-        balance: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        balance: The power balance.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -113,7 +113,7 @@ class _SankeyDiagram:
     """The drawing.
 
     Args:
-        balance: What to show.
+        balance: The power balance.
     """
 
     def __init__(self, balance: PowerBalance):

@@ -34,7 +34,7 @@ def plot_study(study: Study, path: str | Path) -> None:
 
     Args:
         study: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.

@@ -37,8 +37,8 @@ def plot_tool_force(chart: ToolForce, path: str | Path) -> None:
     """Write the picture of tool forces to a file.
 
     Args:
-        chart: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        chart: The chart.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.

@@ -35,8 +35,8 @@ def plot_working_range(result: WorkingRange, path: str | Path) -> None:
     """Write the picture of a working range to a file.
 
     Args:
-        result: What to show.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        result: The result.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.

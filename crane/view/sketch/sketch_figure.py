@@ -70,7 +70,7 @@ def sketch(
 
     Args:
         machine: The machine.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
         q_a: (n,) active coordinates within their limits [m], [rad]; home if not given.
         plane: "xy", "xz" or "yz" to look along an axis of the world; the plane that the machine
             moves in if not given.

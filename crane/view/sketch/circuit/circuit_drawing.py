@@ -36,7 +36,7 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
 
     Args:
         machine: A machine with hydraulics.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
