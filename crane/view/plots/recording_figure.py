@@ -137,13 +137,12 @@ def add_heading(figure: Figure, text: str) -> None:
 def recording_figure(recording: Recording) -> Figure:
     """Return the figure of a recording.
 
-    One column per active joint with its displacement, velocity and force over time, in the units
-    that the page of a run has, many joints in several bands below each other; of cylinders with
-    valves also pressures, flows and signals. Where the channels tip_x, tip_y, tip_z exist, the
-    path of the tip is beside them, in space, or in the plane of two coordinates where the third
-    hardly changes. References (channels reference_<joint>,
-    reference_velocity_<joint>, reference_tip_x, ...) are dashed; errors (references less
-    displacements) have a row of their own, and the tip its distance from its reference.
+    There is one column per active joint with displacement, velocity and force over time; for
+    cylinders with valves also pressures, flows and signals. Many joints are drawn in several
+    bands. With the channels tip_x, tip_y, tip_z, the path of the tip is drawn in space, or in a
+    plane if one coordinate hardly changes. References (channels reference_<joint>,
+    reference_velocity_<joint>, reference_tip_x, ...) are dashed; errors (reference minus
+    displacement) have a separate row, and the tip its distance from the reference.
     """
     tip, joints = point_channel(recording, "tip"), recording.joints
     path_plane = (
@@ -297,9 +296,9 @@ def _draw_tip_path(
 
 
 def _path_plane(tip: Array, reference: Array | None) -> tuple[int, int] | None:
-    """The two coordinates that a path lies in the plane of, but for 1 % of its size; else None.
+    """Return the two coordinates of the plane of a path, to 1 % of its size; None if not plane.
 
-    Of a straight path upright planes go first, that of x and z before that of y and z.
+    For a straight path the plane of x and z is preferred, then that of y and z.
     """
     lower, upper = _path_bounds(tip, reference)
     is_flat = upper - lower <= _FLATNESS_TOLERANCE * (upper - lower).max()

@@ -48,13 +48,13 @@ _NEUTRAL_COLOUR = "#8c9aa8"
 
 @dataclass
 class _SankeyRibbon:
-    """A ribbon on the right.
+    """One ribbon on the right.
 
     Attributes:
-        label: What it is.
+        label: Label of the ribbon.
         energy: [J].
         color: Its colour.
-        centre: Of its middle [inch].
+        centre: Height of its middle [inch].
     """
 
     label: str
@@ -65,13 +65,13 @@ class _SankeyRibbon:
 
 @dataclass
 class _SankeyGroup:
-    """What one owner's energy goes into.
+    """Energy of one owner, by ribbon.
 
     Attributes:
-        label: Whose it is.
-        ribbons: Into what.
-        returned_energy: That it gets from elsewhere than the pumps [J].
-        top: Of its top [inch].
+        label: Name of the owner.
+        ribbons: Ribbons of the owner's energy.
+        returned_energy: Energy that does not come from the pumps [J].
+        top: Height of its top [inch].
     """
 
     label: str
@@ -100,11 +100,11 @@ def plot_sankey(balance: PowerBalance, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def sankey_figure(balance: PowerBalance) -> Figure:
-    """Energies from the shafts by pump and joint into what they go into, in kJ and %.
+    """Return the energies from the shafts by pump and joint to losses and loads, in kJ and %.
 
-    What a load gives back while it drives its cylinder enters its joint from the left.
-    What has less than 0.4 % is drawn as others, less than 0.1 % not at all. Percentages are of
-    what the shafts give.
+    Energy that a load returns while it drives its cylinder enters its joint from the left.
+    Energies of less than 0.4 % are summed as others, which are left out below 0.1 %. Percentages
+    are of the energy of the shafts.
     """
     return _SankeyDiagram(balance).figure
 

@@ -30,10 +30,10 @@ _INFEASIBLE_COLOUR = "#d9d9d9"
 
 
 def plot_study(study: Study, path: str | Path) -> None:
-    """Write the picture of a study to a file.
+    """Write the figure of a study to a file.
 
     Args:
-        study: What to show.
+        study: The study.
         path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
@@ -44,10 +44,10 @@ def plot_study(study: Study, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def study_figure(study: Study) -> Figure:
-    """The figure of a study, a panel per measure; measures that do not change are left out.
+    """Return the figure of a study, a panel per measure that varies.
 
-    Of one parameter curves, of a grid of two maps with the best variant marked; of anything else
-    points over each parameter with their rank correlation.
+    One parameter gives curves, a grid of two gives maps with the best variant; otherwise points
+    are drawn over each parameter with their rank correlation.
     """
     shown_measures = [name for name in study.measures if _is_varying(study.columns[name])]
     shown_measures = (shown_measures or list(study.measures))[:_MAX_PANELS]

@@ -34,7 +34,7 @@ _MAX_ARROWS = 12  # along the larger side
 
 
 def plot_tool_force(chart: ToolForce, path: str | Path) -> None:
-    """Write the picture of tool forces to a file.
+    """Write the figure of tool forces to a file.
 
     Args:
         chart: The chart.

@@ -32,7 +32,7 @@ _LINE_GAP_SHARE = 0.055  # between dimension lines, of the drawing's larger exte
 
 
 def plot_working_range(result: WorkingRange, path: str | Path) -> None:
-    """Write the picture of a working range to a file.
+    """Write the figure of a working range to a file.
 
     Args:
         result: The result.

@@ -45,10 +45,10 @@ _GRID_LINE_COUNT = 10  # of the grid, per stroke
 
 
 def plot_workspace(reachable_space: Workspace, path: str | Path) -> None:
-    """Write the picture of a workspace to a file.
+    """Write the figure of a workspace to a file.
 
     Args:
-        reachable_space: What to show.
+        reachable_space: The workspace.
         path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
@@ -59,11 +59,12 @@ def plot_workspace(reachable_space: Workspace, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def workspace_figure(reachable_space: Workspace) -> Figure:
-    """The figure of a workspace.
+    """Return the figure of a workspace.
 
-    Left what the tip covers in the section, the images of even steps of the two strokes that
-    move it most, and the machine at home; right over these two strokes the condition of the drive
-    and the least singular value of the tip's slopes, grey where the loops do not close.
+    On the left are the reach of the tip in the section, images of grid lines of the two strokes
+    that move it most, and the machine at home. On the right, over these two strokes, are the
+    condition number of the drive and the smallest singular value of the tip's Jacobian, grey where
+    the loops do not close.
     """
     lower, upper = (
         reachable_space.section_positions.min(axis=0),

@@ -21,13 +21,13 @@ _MAX_SWEEPS = 6
 
 @dataclass(frozen=True, eq=False)
 class SketchLabel:
-    """Words beside a point.
+    """A label beside a point.
 
     Attributes:
-        text: The words.
-        position: (2,) what they name [m].
-        radius: Of the symbol there [points].
-        gid: The text's name in the figure.
+        text: Text.
+        position: (2,) labelled point [m].
+        radius: Radius of the symbol at the point [points].
+        gid: Identifier of the text in the figure.
     """
 
     text: str
@@ -37,11 +37,11 @@ class SketchLabel:
 
 
 def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
-    """Put labels beside what they name, clear of each other and of all lines and symbols.
+    """Place labels beside their points, clear of each other and of all lines and symbols.
 
-    Candidates stand in rings around each point; each costs what it covers, its distance, and
-    nearness to other symbols. The label with the dearest best place chooses first, then all choose
-    again in turn.
+    Candidates lie on rings around each point. The cost of a candidate depends on what it covers,
+    on its distance, and on the distance to other symbols. The label with the most expensive best
+    candidate is placed first, then all are placed again in turn.
     """
     axes, point = canvas.axes, canvas.point_size
     figure = axes.figure

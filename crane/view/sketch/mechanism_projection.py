@@ -271,12 +271,12 @@ def _distinct_points(points: Sequence[Array], size: float) -> Array:
 
 
 class MachineOutline(NamedTuple):
-    """A machine in one posture, in the coordinates of a section [m].
+    """Outline of a machine in one configuration, in the coordinates of a section [m].
 
     Attributes:
         bodies: Hulls (k, 2) of bodies between their pins, those that carry the tip last.
         cylinders: (c, 3, 2) closed end, mouth and rod's end.
-        stationary_hull: (k, 2) hull of what stands still, nothing without supports.
+        stationary_hull: (k, 2) hull of the stationary parts; empty without supports.
     """
 
     bodies: list[Array]
@@ -287,13 +287,13 @@ class MachineOutline(NamedTuple):
 def machine_outline(
     machine: Machine, frame: str, section: WorkspaceSection, q: Array
 ) -> MachineOutline:
-    """The outline of a machine, seen across the plane through its slewing axis.
+    """Compute the outline of a machine in the plane through its slewing axis.
 
     Args:
         machine: The machine.
-        frame: What the section is of.
+        frame: Frame of the section.
         section: The section; its plane turns with the slewing joint.
-        q: (nq,) closed posture.
+        q: (nq,) closed configuration.
     """
     if machine.tip is None:
         machine = dataclasses.replace(machine, tip=frame)

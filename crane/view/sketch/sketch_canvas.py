@@ -35,7 +35,7 @@ TIP_MARKER: Any = {"marker": "+", "markersize": 17.0, "markeredgewidth": 1.3}
 
 
 class SketchCanvas:
-    """Draws onto axes in metres, with widths in points; remembers what labels must not cover.
+    """Draws on axes in metres, with widths in points, and collects what labels must not cover.
 
     Args:
         axes: Axes of equal scales.
@@ -236,15 +236,15 @@ def create_sketch_layout(
     legend: Sequence[tuple[Line2D, ...]],
     other_mechanisms: Sequence[SketchMechanism] = (),
 ) -> tuple[Figure, SketchCanvas]:
-    """A figure with axes for the mechanism, and what draws on them.
+    """Return a figure with axes for the mechanism, and the canvas of the axes.
 
     Args:
-        mechanism: What is to fit.
-        plane: Names its coordinates.
-        machine: Named in the heading, with its active coordinates.
-        q: (nq,) posture.
-        legend: Its entries, each of lines that are drawn on top of each other.
-        other_mechanisms: What is to fit, too.
+        mechanism: Mechanism that has to fit.
+        plane: Plane with the labels of its coordinates.
+        machine: Machine for the heading.
+        q: (nq,) configuration.
+        legend: Entries of the legend, each of superposed lines.
+        other_mechanisms: Further mechanisms that have to fit.
     """
     corners = np.array([_mechanism_bounds(fitted) for fitted in (mechanism, *other_mechanisms)])
     lower, upper = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)

@@ -22,12 +22,12 @@ VIEW_DIRECTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class DrawingPlane:
-    """A plane to draw in.
+    """Plane of a drawing.
 
     Attributes:
         right: (3,) unit vector of the first coordinate.
         up: (3,) unit vector of the second coordinate.
-        labels: What the coordinates are called.
+        labels: Labels of the coordinates.
     """
 
     right: Array
@@ -45,19 +45,19 @@ class DrawingPlane:
 
 
 def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPlane:
-    """The plane to draw a machine in.
+    """Find the plane in which a machine moves.
 
-    At least half of the revolute axes, those of the loops included, are parallel in the home
-    posture and perpendicular to the plane; among equals, it is the plane that holds the vertical.
-    The plane turns with the body that carries the first of these joints.
+    At least half of the revolute axes, including those of loops, are parallel in the home
+    configuration and perpendicular to the plane. Of several such planes, one that contains the
+    vertical is preferred. The plane turns with the body that carries the first of these joints.
 
     Args:
         machine: The machine.
-        q: (nq,) closed posture.
-        view: A key of `VIEW_DIRECTIONS`, to look along an axis of the world instead.
+        q: (nq,) closed configuration.
+        view: A key of `VIEW_DIRECTIONS`, for a view along an axis of the world instead.
 
     Raises:
-        InputError: Unknown view, or too few axes are parallel.
+        InputError: The view is unknown, or too few axes are parallel.
     """
     if view is not None:
         if view not in VIEW_DIRECTIONS:
@@ -85,11 +85,11 @@ def find_plane(machine: Machine, q: Array, view: str | None = None) -> DrawingPl
 
 
 def joint_axes(machine: Machine, data: pin.Data) -> Array:
-    """(njoints, 3) directions of all joints in the world, the first row unused.
+    """Return the directions (njoints, 3) of all joints in the world; the first row is unused.
 
     Args:
         machine: The machine.
-        data: After forward kinematics.
+        data: Pinocchio data after forward kinematics.
     """
     model = machine.model
     axes = np.zeros((model.njoints, 3))
@@ -138,12 +138,12 @@ def _label_plane(right_direction: Array, up_direction: Array) -> DrawingPlane:
 
 @dataclass(frozen=True, eq=False)
 class SketchPin:
-    """A revolute joint seen along its axis, or the joint that closes a loop.
+    """A revolute joint seen along its axis, or a loop joint.
 
     Attributes:
-        name: The joint or loop.
-        position: (2,) where its first body has it [m].
-        mate_position: (2,) where its second body has it [m]; the same in a closed posture.
+        name: Name of the joint or loop.
+        position: (2,) position on its first body [m].
+        mate_position: (2,) position on its second body [m]; the same in a closed configuration.
         loop_number: Number of the loop from 1, 0 for a joint of the tree.
     """
 
@@ -159,7 +159,7 @@ class SketchCollar:
 
     Attributes:
         name: The joint.
-        position: (2,) a point of its axis [m].
+        position: (2,) point on its axis [m].
         axis: (2,) unit vector of its axis.
     """
 
@@ -170,7 +170,7 @@ class SketchCollar:
 
 @dataclass(frozen=True, eq=False)
 class SketchSlide:
-    """A prismatic joint in the plane: a rod in a barrel, or a block on a rail that stands still.
+    """A prismatic joint in the plane: a rod in a barrel, or a block on a fixed rail.
 
     Attributes:
         name: The joint.
@@ -197,7 +197,7 @@ class SketchSlide:
 
 @dataclass(frozen=True, eq=False)
 class SketchBody:
-    """What is rigid: points (k, 2) [m] that a line or a polygon joins.
+    """A rigid body: points (k, 2) [m] that a line or a polygon connects.
 
     Attributes:
         points: (k, 2).
@@ -214,16 +214,16 @@ class SketchBody:
 
 @dataclass(frozen=True, eq=False)
 class SketchMechanism:
-    """Everything a sketch shows, in the coordinates of its plane.
+    """All elements of a sketch, in the coordinates of its plane.
 
     Attributes:
         pins: Revolute joints seen along their axes, and all loops.
         collars: Other revolute joints.
         slides: Prismatic joints.
         bodies: Bodies that move.
-        ground: What stands still: points (2,) [m], each with the unit vector (2,) into the ground.
-        regions: By the number of a loop, (k, 2) corners of what it encloses.
-        tip: (2,) [m], None without one.
+        ground: Points (2,) on the ground [m], each with the unit vector (2,) into the ground.
+        regions: Corners (k, 2) of the region that each loop encloses, by number of the loop.
+        tip: (2,) position of the tip [m]; None without a tip.
         size: Largest extent of all points [m].
     """
 

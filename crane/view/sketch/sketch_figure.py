@@ -71,16 +71,17 @@ def sketch(
     Args:
         machine: The machine.
         path: File to write; the suffix .png, .svg or .pdf determines the format.
-        q_a: (n,) active coordinates within their limits [m], [rad]; home if not given.
-        plane: "xy", "xz" or "yz" to look along an axis of the world; the plane that the machine
-            moves in if not given.
+        q_a: (n,) active coordinates within their limits [m], [rad]; home by default.
+        plane: "xy", "xz" or "yz" for a view along an axis of the world; by default the plane in
+            which the machine moves.
         show_centres_of_mass: Whether to mark the centres of mass.
-        other_configurations: Postures (nq,) to be drawn dashed behind it, such as other
-            assemblies.
+        other_configurations: Configurations (nq,) that are drawn dashed, such as other assembly
+            modes.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
-        InputError: Wrong shape or not finite, unknown view, or a machine that moves in no plane.
+        InputError: A value has the wrong shape or is not finite, the view is unknown, or the
+            machine does not move in a plane.
         LimitError: A coordinate lies outside of its limits.
         ClosureError: The loops cannot be closed there.
     """
@@ -98,12 +99,12 @@ def sketch_figure(
     show_centres_of_mass: bool = False,
     other_configurations: Sequence[Array] = (),
 ) -> Figure:
-    """The figure of a mechanism; see `sketch`.
+    """Return the figure of a mechanism; see `sketch`.
 
-    Bodies are lines and polygons between their pins in the colours of the sub-chains, those that
-    carry the tip with wider lines. Pins of the tree are circles, pins that close a loop are rings
-    with a dot, joints about a line in the plane are boxes on that line, prismatic joints are
-    cylinders. Each loop has a number and a tint. Axes are equal, in metres.
+    Bodies are lines and polygons between their pins in the colours of the sub-chains, with wider
+    lines if they carry the tip. Revolute joints of the tree are circles, loop joints are rings
+    with a dot, revolute joints about a line in the plane are boxes on that line, prismatic joints
+    are cylinders. Each loop has a number and a tint. Axes are equal, in metres.
     """
     if machine.coordinates.floating_base_columns:
         columns = [at + i for at in machine.coordinates.floating_base_columns for i in range(6)]

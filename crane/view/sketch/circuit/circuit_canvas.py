@@ -42,13 +42,13 @@ def _fit_text(text: str, size: float, available_width: float, weight: str) -> tu
 
 @dataclass(frozen=True)
 class SymbolPose:
-    """Where a symbol stands, drawn about the origin with its flow upwards.
+    """Pose of a symbol, which is drawn about the origin with its flow upwards.
 
     Attributes:
         x: To the right [points].
         y: Upwards [points].
         quarter_turns: Quarter turns counterclockwise.
-        is_mirrored: Whether left and right are changed before.
+        is_mirrored: Whether the symbol is mirrored left to right before it is turned.
     """
 
     x: float
@@ -73,10 +73,10 @@ class SymbolPose:
 
 @dataclass(frozen=True)
 class CircuitWire:
-    """A straight piece of a line.
+    """A straight segment of a line.
 
     Attributes:
-        net: What it belongs to; pieces of two nets are not joined, even where they cross.
+        net: Net of the segment; segments of different nets are not connected, even if they cross.
         start: [points]
         end: [points]
     """
@@ -100,7 +100,7 @@ class CircuitWire:
 
 @dataclass(frozen=True)
 class SymbolPort:
-    """Where a symbol is joined to a net.
+    """Connection of a symbol to a net.
 
     Attributes:
         component: The symbol's name.
@@ -114,14 +114,14 @@ class SymbolPort:
 
 
 class CircuitCanvas:
-    """Draws onto axes whose coordinates are points.
+    """Draws on axes whose coordinates are points.
 
     Args:
         axes: Axes of equal scales.
 
     Attributes:
-        wires: All pieces of wires.
-        ports: Of all symbols.
+        wires: Segments of all wires.
+        ports: Ports of all symbols.
     """
 
     def __init__(self, axes: Axes):

@@ -47,10 +47,10 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
 
 @mpl.rc_context(FIGURE_STYLE)
 def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
-    """The figure of a circuit, and what it was drawn with; see `sketch_circuit`.
+    """Return the figure of a circuit and its canvas; see `sketch_circuit`.
 
     Functions stand side by side in the order of the active joints, at most four in a row, each
-    over the rails that it is joined to; pumps, tank, accumulators and elements hang below the
+    above the rails that it is connected to; pumps, tank, accumulators and elements are below the
     lowest rails. Coordinates are points.
     """
     hydraulics = machine.hydraulics

@@ -24,16 +24,16 @@ class CircuitFunction:
     """A cylinder or motor with its valve.
 
     Attributes:
-        joint: What it drives.
+        joint: Joint that it drives.
         cylinder: The actuator.
         valve: Its valve.
         supply: The pump that feeds it.
-        is_revolute: Whether its joint is a revolute one.
-        stroke: Between the joint's limits [m], [rad]; infinite without.
-        tapped_chambers: Chambers, of "a" and "b", that something else is joined to.
-        has_load_sensing: Whether its load is told to a pump or to other valves.
-        shares_load_sensing: Whether others tell theirs to the same.
-        centre_nets: Nets before and behind its open centre, None where it is closed.
+        is_revolute: Whether the joint is revolute.
+        stroke: Difference of the joint's limits [m], [rad]; infinite without limits.
+        tapped_chambers: Chambers "a" and "b" that other components are connected to.
+        has_load_sensing: Whether its load pressure goes to a pump or to other valves.
+        shares_load_sensing: Whether other functions share this load-sensing line.
+        centre_nets: Nets before and behind its open centre; None for a closed centre.
     """
 
     joint: str
@@ -126,14 +126,14 @@ def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
 
 
 class OpenCentreLines:
-    """Open centres of all pumps.
+    """Open-centre lines of all pumps.
 
     Args:
         hydraulics: The circuit.
         function_rows: Its functions by row.
 
     Attributes:
-        row_nets: That go from one row of functions to another.
+        row_nets: Nets that go from one row of functions to another.
     """
 
     def __init__(self, hydraulics: Hydraulics, function_rows: Sequence[Sequence[CircuitFunction]]):
@@ -195,13 +195,13 @@ class OpenCentreLines:
         rail_heights: Mapping[str, float],
         line_heights: Mapping[str, float],
     ) -> None:
-        """Join the open centres of a row.
+        """Connect the open centres of a row.
 
         Args:
-            canvas: What they are drawn with.
+            canvas: Canvas of the drawing.
             row: Number of the row.
-            centre_ends: Middle of a section and where its open centre begins and ends, by joint.
-            rail_heights: Heights by net.
+            centre_ends: Middle of a section and both ends of its open centre, by joint.
+            rail_heights: Heights of the rails by net.
             line_heights: See `line_heights`.
         """
         for number, name in enumerate(line_heights):

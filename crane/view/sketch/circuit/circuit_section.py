@@ -32,16 +32,16 @@ _PORT_BENDS = {"Ta": 3.0, "LS": 5.0, "P": 7.0, "T": 4.0}  # below the valve
 
 
 class CircuitSection:
-    """Draws a function.
+    """Draws one function of a circuit.
 
     Args:
-        canvas: What it is drawn with.
-        function: What is drawn.
-        x: Its middle.
+        canvas: Canvas of the drawing.
+        function: The function.
+        x: Middle of the section.
         valve_bottom: Lower edge of the valve.
-        actuator_middle: Middle of the actuator.
-        rail_heights: Heights by net.
-        line_heights: Heights at which open centres are handed on, by pump.
+        actuator_middle: Height of the middle of the actuator.
+        rail_heights: Heights of the rails by net.
+        line_heights: Heights of the open-centre lines by pump.
     """
 
     def __init__(

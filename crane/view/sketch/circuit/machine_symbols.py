@@ -127,15 +127,15 @@ def draw_cylinder(
     nets: tuple[str, str],
     area_ratio: float,
 ) -> None:
-    """A double-acting cylinder, chamber A on the left.
+    """Draw a double-acting cylinder, chamber A on the left.
 
     Args:
-        canvas: What it is drawn with.
-        position: Its middle.
-        component: Its name.
-        nets: Of chambers A and B.
-        area_ratio: Of area B to area A: below 1 the rod is in B, above in A, and goes through at
-            1.
+        canvas: Canvas of the drawing.
+        position: Middle of the symbol.
+        component: Name of the component.
+        nets: Nets of chambers A and B.
+        area_ratio: Ratio of area B to area A. Below 1 the rod is in B, above 1 in A; at 1 it goes
+            through both.
     """
     pose, rod_pose = SymbolPose(*position), SymbolPose(*position, is_mirrored=area_ratio > 1)
     canvas.draw_shape(

@@ -24,13 +24,13 @@ CONTROL_LABELS = {"pressure": "p", "load-sensing": "LS", "negative": "NFC", "pos
 
 @dataclass(frozen=True)
 class SupplyItem:
-    """Something that hangs on rails.
+    """An item that is connected to rails above it.
 
     Attributes:
-        width: What it takes.
-        height: Below the place where it hangs.
-        wires: Nets that lead up from it, with their places from its left edge.
-        stays_in_row: Whether it stands in the row of what is before it.
+        width: Width of the item.
+        height: Height of the item.
+        wires: Nets of its lines upwards, with offsets from its left edge.
+        stays_in_row: Whether it stays in the row of the previous item.
     """
 
     width: float

@@ -52,17 +52,17 @@ _END_WIDTH = 12.0  # of springs and signals
 
 
 class SpoolSymbol:
-    """A valve's boxes: straight, middle, crossed, and floating where it floats.
+    """Boxes of a directional valve: straight, middle, crossed and, if any, floating position.
 
     Args:
         x: Middle of the middle box.
         y: Lower edge.
-        lower_ports: Its ports below from the left, of "Ta", "LS", "P", "C", "T".
-        upper_ports: Those above, of "A", "C", "B".
+        lower_ports: Lower ports from the left, of "Ta", "LS", "P", "C", "T".
+        upper_ports: Upper ports, of "A", "C", "B".
         has_float_position: Whether it has a floating position.
 
     Attributes:
-        port_positions: By name, with "C'" for the open centre's outlet above.
+        port_positions: Positions by name; "C'" is the upper outlet of the open centre.
     """
 
     def __init__(
