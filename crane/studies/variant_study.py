@@ -186,22 +186,28 @@ def study(
         raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
     measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
     available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
-    names = {x: x for x in measures}
-    if len(tasks) > 1:
-        names = {
-            column: x
-            for x in measures
-            for column in (x, *(f"{x} {task}" for task in tasks if x in task_measure_units))
-        }
+    column_measures = _column_measures(measures, task_measure_units, tasks)
     columns = dict(zip(vary, values.T, strict=True)) | {
         column: np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
-        for column in names
+        for column in column_measures
     }
+    units |= {column: available[measure] for column, measure in column_measures.items()}
     return Study(
         name, tuple(vary), measures, tasks,
-        units | {column: available[measure] for column, measure in names.items()},
-        columns, reasons, grid_shape, resolution_notes(base_machine, measures),
+        units, columns, reasons, grid_shape, resolution_notes(base_machine, measures),
     )  # fmt: skip
+
+
+def _column_measures(
+    measures: Sequence[str], task_measures: Mapping[str, str], tasks: Sequence[str]
+) -> dict[str, str]:
+    """Return the measure of each column; with several tasks there is a column for each task."""
+    task_columns = tasks if len(tasks) > 1 else ()
+    return {
+        column: x
+        for x in measures
+        for column in (x, *(f"{x} {task}" for task in task_columns if x in task_measures))
+    }
 
 
 def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:

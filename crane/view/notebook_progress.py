@@ -43,7 +43,7 @@ class _CellProgressBar:
 
     def _show_progress(self, frame: FrameType | None, seconds: float) -> None:
         if not (activity := current_activity(frame)):
-            return  # of what is not the package's nothing is known
+            return  # progress is known only inside the package
         share = PROGRESS.finished_share(frame)
         value = "" if share is None else f' value="{share:.3f}"'
         share_text = "" if share is None else f"{share:.0%}, "

@@ -98,27 +98,9 @@ def design(
             raise InputError(
                 f"task '{task}' is unknown, {suggest_names(base_machine.tasks, task)}"
             )
-    expressions = [MeasureExpression(x) for _, x in objectives]
-    requirements = [parse_requirement(x) for x in require]
     options = MeasureOptions(frame, rating_rule, chosen_tasks, load_user_measures(measures))
-    known_measures = task_measures(base_machine) | stroke_measures(base_machine)
-    check_unique_names(options.user_measures, known_measures)
-    _check_names(base_machine, [*expressions, *(x for x, _ in requirements)], options)
-    base_job = DesignJob(
-        name,
-        dict(base_machine.parameter_changes),
-        dict(base_machine.locked_joints),
-        names,
-        lower,
-        upper,
-        tuple(x if sense == "minimise" else f"-({x})" for sense, x in objectives),
-        tuple(x.text for x, _ in requirements),
-        tuple(equal for _, equal in requirements),
-        frame,
-        rating_rule,
-        chosen_tasks,
-        transferable_measures(measures),
-        np.zeros(len(names)),
+    base_job = _base_job(
+        base_machine, name, (names, lower, upper), objectives, require, options, measures
     )
     initial_values = np.array([MachineVariants(base_machine).values[x] for x in names])
     initial_solution = DesignProblem(base_job).solution(initial_values, initial_values, "as it is")
@@ -164,6 +146,36 @@ def design(
         _restore_signs(initial_solution, signs),
         tuple(_restore_signs(x, signs) for x in solutions),
         options,
+    )
+
+
+def _base_job(
+    machine: Machine,
+    name: str,
+    ranges: tuple[tuple[str, ...], Array, Array],
+    objectives: Sequence[tuple[str, str]],
+    require: Sequence[str],
+    options: MeasureOptions,
+    measures: str | Path | Mapping[str, MeasureFunction] | None,
+) -> DesignJob:
+    """Check the expressions, and return the job with all objectives."""
+    expressions = [MeasureExpression(x) for _, x in objectives]
+    requirements = [parse_requirement(x) for x in require]
+    check_unique_names(options.user_measures, task_measures(machine) | stroke_measures(machine))
+    _check_names(machine, [*expressions, *(x for x, _ in requirements)], options)
+    return DesignJob(
+        name,
+        dict(machine.parameter_changes),
+        dict(machine.locked_joints),
+        *ranges,
+        tuple(x if sense == "minimise" else f"-({x})" for sense, x in objectives),
+        tuple(x.text for x, _ in requirements),
+        tuple(equal for _, equal in requirements),
+        options.frame,
+        options.rule,
+        options.tasks,
+        transferable_measures(measures),
+        np.zeros(len(ranges[0])),
     )
 
 

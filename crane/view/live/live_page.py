@@ -44,7 +44,7 @@ def readout_html(
     """
     headings = [
         "joint",
-        "holds the weight with" if not payload_mass else "holds weight and payload with",
+        "holding force" if not payload_mass else "holding force with payload",
     ]
     headings += ["recorded"] if recorded_forces is not None else []
     rows = []
@@ -68,12 +68,12 @@ def readout_html(
         unit = f"{machine.unit(passive_joint)}/{machine.unit(active_joint)}"
         rows = [
             [
-                "largest of gamma",
+                "largest gamma",
                 f"{readout.largest_gain:.3g} {unit}",
                 f"{passive_joint} per {active_joint}",
             ],
             [
-                "condition of J_P",
+                "condition number of J_P",
                 f"{readout.condition_number:.3g}",
                 f"loop {readout.weakest_loop}",
             ],
@@ -168,7 +168,7 @@ class LivePage:
         if client.camera.aspect < 1:
             look_at, position = self._scene.camera_view(client.camera.aspect)
             with client.atomic():
-                client.camera.position = position  # which takes what is looked at along
+                client.camera.position = position  # moves the target along
                 client.camera.look_at = look_at
 
     @property

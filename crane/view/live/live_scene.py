@@ -20,7 +20,7 @@ from crane.view.page.scene import ground_height
 
 _CAMERA_DIRECTION = np.array(
     [0.55, -1.0, 0.45]
-)  # from what is looked at to the camera, over its size
+)  # from the target to the camera, over the size of the scene
 _FIELD_OF_VIEW = 40.0  # of view, upright [deg]
 _FREE_HEIGHT_SHARE = 0.4  # share of a phone's height that viser's panel leaves free
 _PAYLOAD_DENSITY = 1000.0  # density of the ball that stands for the payload [kg/m3]

@@ -145,7 +145,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-_FIRST_PORT, _PORT_COUNT = 8080, 20  # to choose from where none is given
+_FIRST_PORT, _PORT_COUNT = 8080, 20  # default range of ports
 _FRAME_INTERVAL = 1 / 30  # of a recording that plays [s]
 
 RequestQueue = SimpleQueue[tuple[str, float] | None]

@@ -18,7 +18,7 @@ _FULL_ARROW_PERCENTILE = (
 _MIN_WEIGHT_SHARE = (
     1e-6  # share of the machine's weight that is rounding noise, as a force or torque
 )
-_SAMPLED_CONFIGURATIONS = 300  # postures that tell how short a strut gets
+_SAMPLED_CONFIGURATIONS = 300  # configurations that determine the shortest length
 
 
 def actuator_markers(

@@ -49,12 +49,12 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
     if count > 1:
         facts.insert(0, ("duration", f"{summary.duration:.4g} s"))
         delivered_work, returned_work = mechanical_work(recording)
-        text = f"{_format_quantity(delivered_work, 'J')} given"
+        text = f"{_format_quantity(delivered_work, 'J')} delivered"
         if returned_work > 1e-3 * delivered_work:
-            text += f", {_format_quantity(returned_work, 'J')} taken back"
-        facts.append(("actuators' work", text))
+            text += f", {_format_quantity(returned_work, 'J')} returned"
+        facts.append(("work of the actuators", text))
     channels = recording.channels
-    for name, label in (("dissipated", "lost to friction"), ("pump_work", "pump's work")):
+    for name, label in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
         if count < 2 or recording.channel_units.get(name) != "J":
             continue
         change = float(channels[name][-1] - channels[name][0])

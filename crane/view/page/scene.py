@@ -105,7 +105,7 @@ def _points_geometry(points: Array) -> Any:
     return g.PointsGeometry(np.ascontiguousarray(points.T, dtype=np.float32))
 
 
-_SAMPLED_FRAMES = 300  # frames that tell how large the scene is
+_SAMPLED_FRAMES = 300  # frames that determine the size of the scene
 _MIN_SIDE_SHARE = 1e-3  # share of a scene's size that each side has at least
 _MIN_SIZE = 1e-3  # [m], of a scene in which everything is a point
 

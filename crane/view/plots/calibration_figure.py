@@ -111,7 +111,7 @@ def channel_residual_figure(channel: CalibrationChannel, name: str) -> Figure:
             axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
         axes.yaxis.set_label_coords(-0.125, 0.5)
     upper.set_ylabel(f"[{unit}]")
-    lower.set_ylabel(f"left [{residual_unit}]")
+    lower.set_ylabel(f"residual [{residual_unit}]")
     lower.set_xlabel("time [s]")
     upper.margins(x=0.0)
     upper.set_title(escape_label(name), loc="left", fontsize=8.5)
@@ -150,7 +150,7 @@ def residual_dependence_figure(dependence: ResidualDependence) -> Figure:
         else:
             _draw_by_direction(axes, x, y)
             axes.set_xlabel(escape_label(f"direction of {dependence.drive}"))
-    panels[0].set_ylabel(escape_label(f"left of {dependence.name} [{unit}]"))
+    panels[0].set_ylabel(escape_label(f"residual of {dependence.name} [{unit}]"))
     return figure
 
 

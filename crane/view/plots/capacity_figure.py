@@ -105,7 +105,7 @@ def legend_patches(chart: Capacity) -> list[Patch]:
         for k, colour in factor_colours(chart).items()
     ]
     if np.isinf(chart.loads).any():
-        patches.append(Patch(color=_UNLIMITED_COLOUR, label="nothing ends it"))
+        patches.append(Patch(color=_UNLIMITED_COLOUR, label="no limit"))
     return patches
 
 

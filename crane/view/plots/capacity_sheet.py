@@ -30,10 +30,10 @@ _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     11.69,
     8.27,
     0.45,
-)  # A4 on its side, and what printers leave white [inch]
+)  # A4 landscape and margin [inch]
 _LINE_HEIGHT = 0.152  # between lines [inch]
 _TEXT_SIZE, _CELL_TEXT_SIZE = 7.5, 7.5  # sizes of letters [points]
-_FACTS_WIDTH = 3.5  # width of what stands beside the charts [inch]
+_FACTS_WIDTH = 3.5  # width of the facts beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
 
@@ -128,7 +128,7 @@ def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> Non
             y -= _LINE_HEIGHT
         y -= 0.05
     y -= 0.1
-    _write_text(figure, left, y, "ended by (of all places)", fontweight="bold")
+    _write_text(figure, left, y, "limited by (of all positions)", fontweight="bold")
     colours_by_factor = {
         str(chart.limiting_factors[k]): tint for k, tint in factor_colours(chart).items()
     }

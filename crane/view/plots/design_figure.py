@@ -65,7 +65,7 @@ def design_figure(result: Design) -> Figure:
     parameter_axes.set_yticks(rows, [escape_label(name) for name in result.parameter_names])
     parameter_axes.set_ylim(len(rows) - 0.5, -0.5)
     parameter_axes.set_xlim(-0.03, 1.03)
-    parameter_axes.set_xlabel("from the lower to the upper end of its range")
+    parameter_axes.set_xlabel("share of the range")
     parameter_axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, frameon=False)
     if is_multi_objective:
         front = np.array([x.objectives[:2] for x in result.solutions])

@@ -114,7 +114,7 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
     lower.set_xlabel(escape_label(f"{names[0]} [{unit}]" if unit else names[0]))
     if len(families) > 1:
         figure.legend(loc="outside lower center", ncols=min(len(families), 5))
-    add_heading(figure, escape_label(result_title(machine.name, "what rings")))
+    add_heading(figure, escape_label(result_title(machine.name, "oscillatory modes")))
     return figure
 
 

@@ -78,7 +78,7 @@ def power_figure(balance: PowerBalance) -> Figure:
     upper_axes, lower_axes = figure.subplots(2, 1, sharex=True)
     _draw_stack(upper_axes, balance, by_class, CLASS_COLOURS, scale)
     _draw_stack(lower_axes, balance, {x: by_owner[x] for x in order}, colors, scale)
-    upper_axes.set_title("by what it goes into", loc="left", fontsize=9)
+    upper_axes.set_title("by class", loc="left", fontsize=9)
     lower_axes.set_title("by joint", loc="left", fontsize=9)
     lower_axes.set_xlabel("time [s]")
     for axes in (upper_axes, lower_axes):

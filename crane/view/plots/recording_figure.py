@@ -26,7 +26,7 @@ from crane.recordings.recording import FORCE_UNITS, Recording
 from crane.recordings.recording_summary import heading, point_channel, tip_error
 from crane.view.plots.figure_text import envelope, escape_label, thin_path
 
-FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
+FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # metadata without dates
     "png": None,
     "svg": {"Date": None},
     "pdf": {"CreationDate": None},
@@ -61,7 +61,7 @@ FIGURE_STYLE: Any = {
 }
 # Distances of words from the axes of a box [points], of which matplotlib adds the last by itself.
 TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
-_FLATNESS_TOLERANCE = 0.01  # of a path's size, what it may leave a plane by
+_FLATNESS_TOLERANCE = 0.01  # distance from a plane, as a share of the size of a path
 MAX_COLUMNS = 5  # joints beside each other
 _LETTER_WIDTH, _LEGEND_ENTRY_WIDTH = 0.11, 1.0  # [in] of a title, and of an entry of a legend
 # Least height of an axis [SI], so that rounding noise of a joint at rest looks like rest.
@@ -69,7 +69,7 @@ MIN_AXIS_SPAN = {
     "rad": 3e-3, "m": 2e-4, "rad/s": 3e-3, "m/s": 2e-4, "N m": 0.02, "N": 0.2, "Pa": 1e4,
     "m3/s": 1e-7, "V": 0.01,
 }  # fmt: skip
-# Rows of a hydraulic machine: quantity, unit, channels of a joint by what a line is called.
+# rows of a hydraulic machine: quantity, unit, channel of a joint by label
 HYDRAULIC_ROWS = (
     ("pressure", "Pa", {"A": "pressure_{}_a", "B": "pressure_{}_b", "supply": "pressure_supply"}),
     ("flow", "m3/s", {"A": "flow_{}_a", "B": "flow_{}_b"}),

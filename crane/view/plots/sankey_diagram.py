@@ -138,7 +138,7 @@ class _SankeyDiagram:
         ]
         circuit_names = [x for x in names if part_owner(x) not in balance.joints]
         groups.append(self._create_group("circuit", circuit_names))
-        # what gives more than it takes feeds the others
+        # groups that return more than they receive become sources
         self._returning_groups: dict[str, float] = {}
         for group in groups:
             if group.returned_energy > group.total_energy:
@@ -203,7 +203,7 @@ class _SankeyDiagram:
         )
         axes.text(0.1, -0.1, escape_label(heading), fontsize=11, fontweight="bold", va="top")
         if not self._total_energy > 0 or not self._owner_groups:
-            axes.text(0.1, -0.6, "nothing is driven", va="top")
+            axes.text(0.1, -0.6, "no energy", va="top")
             return figure
         self._draw_sources(self._draw_hydraulic_bar(groups))
         for group in groups:

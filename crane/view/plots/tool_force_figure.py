@@ -92,7 +92,7 @@ def tool_force_figure(chart: ToolForce) -> Figure:
                          vmax=max(len(active_factors), 1) - 0.5, rasterized=True)  # fmt: skip
         slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
         left.set_title(f"largest force{slew_text}")
-        right.set_title("what ends it")
+        right.set_title("limiting factor")
         left.set_ylabel(f"{chart.section.coordinate_names[1]} [m]")
         for axes in (left, right):
             axes.set_aspect("equal")

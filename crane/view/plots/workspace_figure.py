@@ -87,7 +87,7 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
             right[0],
             reachable_space,
             reachable_space.stroke_map.condition,
-            "condition of the drive",
+            "condition number of the drive",
         )
         right[0].sharex(right[1])
         right[0].tick_params(labelbottom=False)
@@ -96,7 +96,7 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
         right[-1],
         reachable_space,
         reachable_space.stroke_map.least_singular_value,
-        "tip, least singular [m]",
+        "smallest singular value, tip [m]",
     )
     right[0].set_title(_stroke_title(reachable_space))
     _add_caption(figure, reachable_space)

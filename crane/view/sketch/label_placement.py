@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crane.common.samples import Array
 from crane.view.sketch.sketch_canvas import GREY, SketchCanvas
 
-_RING_GAPS = (2.0, 5.0, 9.0, 15.0, 23.0, 33.0, 45.0, 60.0)  # gaps to what is named [points]
+_RING_GAPS = (2.0, 5.0, 9.0, 15.0, 23.0, 33.0, 45.0, 60.0)  # gaps to the symbol [points]
 _LEADER_LINE_GAP = 12.0  # gap from which a thin line leads to the label [points]
 _ANGLES = np.linspace(0, 2 * np.pi, 32, endpoint=False) + np.pi / 4
 _MAX_SWEEPS = 6
@@ -104,7 +104,7 @@ def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gap
         cost = cost + np.where(distance < radius, 60.0, 0)
         if (
             np.abs(centre - label.position).max() > 1e-6 * point
-        ):  # nearer to another symbol than to its own
+        ):  # closer to another symbol than to its own
             cost = cost + np.where(distance - radius < gaps + 2.0, 5.0, 0)
     limits = np.array([canvas.axes.get_xlim(), canvas.axes.get_ylim()])
     outside = (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1)

@@ -21,7 +21,7 @@ from crane.view.sketch.sketch_elements import (
     joint_axes,
 )
 
-COINCIDENCE_TOLERANCE = 1e-9  # share of the drawing's size that is none
+COINCIDENCE_TOLERANCE = 1e-9  # share of the drawing's size between coincident points
 _COLLAR_DISTANCE_SHARE = (
     0.04  # share of the drawing's size within which a collar would hide beside a pin
 )
@@ -177,7 +177,7 @@ class _MechanismProjection:
         value = float(self.q[column])
         chains = (self.chains[parent], self.chains[joint])
         carries_tip, name = joint in self.tip_supports, self.model.names[joint]
-        if self.axis_cosines[joint] > _MIN_PIN_COSINE:  # it moves towards whoever looks
+        if self.axis_cosines[joint] > _MIN_PIN_COSINE:  # it moves towards the viewer
             self.points[parent].append(position)
             self.points[joint].append(position)
             return SketchSlide(

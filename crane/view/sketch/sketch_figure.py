@@ -55,7 +55,7 @@ REGION_COLOURS = (
 GROUND_COLOUR, GHOST_COLOUR = "#777777", "#9a4d6f"
 _GHOST_DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 4)))
 _MIN_POLYGON_WIDTH = 7.0  # width below which a polygon is drawn as a line [points]
-_NUMBER_CLEARANCE = 9.0  # what the number of a loop needs around it [points]
+_NUMBER_CLEARANCE = 9.0  # clearance around the number of a loop [points]
 
 
 def sketch(
@@ -279,7 +279,7 @@ def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
         CHAIN_COLOURS[i % len(CHAIN_COLOURS)] for i in (slide.barrel_chain, slide.rod_chain)
     )
     point, barrel = canvas.point_size, slide.mouth - slide.start
-    if not barrel.any():  # seen along its axis
+    if not barrel.any():  # the axis points towards the viewer
         half_width = np.array([5.0, 0.0]) * point
         canvas.draw_box(slide.start - half_width, slide.start + half_width, 10.0, rod_colour, 3)
         return

@@ -25,7 +25,7 @@ from crane.view.sketch.circuit.supply_items import SupplyItem, create_supply_ite
 from crane.view.sketch.circuit.valve_symbols import SPOOL_HEIGHT
 
 _FUNCTIONS_PER_ROW = 4  # functions beside each other
-_RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest to what hangs on it
+_RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest rail to items
 _MARGIN, _HEADING_HEIGHT = 10.0, 26.0  # around all of it
 _MIN_WIRE_DISTANCE = 3.0  # least distance of wires
 _MAX_LABEL_LENGTH = 24  # letters of a rail's name

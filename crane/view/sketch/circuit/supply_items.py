@@ -54,7 +54,7 @@ def create_supply_items(
         senses = (
             any(x.has_load_sensing for x in fed_functions) and supply.control == "load-sensing"
         )
-        # back to the pump before, to the engine, or to nothing that is told
+        # to the previous pump, to the engine, or to an unknown drive
         shaft = 116.0 if i else 64.0 if hydraulics.engine is not None else 24.0
         items.append(_create_pump(name, supply, senses, shaft))
     items += [_create_accumulator(name, x) for name, x in hydraulics.accumulators.items()]
@@ -212,7 +212,7 @@ class _PumpItem(SupplyItem):
 def _create_pump(
     name: str, supply: Supply, has_load_sensing: bool, shaft_length: float
 ) -> _PumpItem:
-    texts = [f"{format_flow(supply.flow)} l/min"] if supply.flow else ["as much as asked for"]
+    texts = [f"{format_flow(supply.flow)} l/min"] if supply.flow else ["unlimited flow"]
     if supply.control != "fixed":
         texts.append(f"max. {format_pressure(supply.pressure)}" if supply.control != "pressure"
                      else format_pressure(supply.pressure))  # fmt: skip
