@@ -90,18 +90,15 @@ def design(
     objectives = [("minimise", x) for x in minimise] + [("maximise", x) for x in maximise]
     if not objectives:
         raise InputError("nothing is sought, name what to minimise or to maximise")
-    names, lower, upper = _parameter_ranges(base_machine, vary)
-    rating_rule = find_rule(rule)
+    names, lower, upper = ranges = _parameter_ranges(base_machine, vary)
     chosen_tasks = tuple(base_machine.tasks if tasks is None else tasks)
     for task in chosen_tasks:
         if task not in base_machine.tasks:
             raise InputError(
                 f"task '{task}' is unknown, {suggest_names(base_machine.tasks, task)}"
             )
-    options = MeasureOptions(frame, rating_rule, chosen_tasks, load_user_measures(measures))
-    base_job = _base_job(
-        base_machine, name, (names, lower, upper), objectives, require, options, measures
-    )
+    options = MeasureOptions(frame, find_rule(rule), chosen_tasks, load_user_measures(measures))
+    base_job = _base_job(base_machine, name, ranges, objectives, require, options, measures)
     initial_values = np.array([MachineVariants(base_machine).values[x] for x in names])
     initial_solution = DesignProblem(base_job).solution(initial_values, initial_values, "as it is")
     random = qmc.LatinHypercube(len(names), rng=as_seed(seed)).random(starts)

@@ -107,9 +107,9 @@ def _parameter_table(calibration: Calibration) -> str:
         )
         classes.append("weak" if parameter.at_bound or parameter.is_unidentifiable else "")
     explanation = (
-        "<p>Confidence intervals of 95 %, computed without bounds; correlated residuals reduce the "
-        "number of independent samples. Grey rows are parameters on a bound and parameters that "
-        "the recordings do not determine: they are no result. Intervals hold for a correct model. "
+        "<p>Confidence intervals of 95 %, computed without bounds; correlated residuals reduce "
+        "the number of independent samples. Grey rows are parameters on a bound and parameters "
+        "that the recordings do not determine: they are no result. Intervals hold for a correct model. "
         "A parameter that compensates an effect which is missing in the machine file may be far "
         "off with a narrow interval.</p>"
     )
@@ -171,10 +171,10 @@ def _dependence_section(dependences: list[ResidualDependence]) -> str:
         for dependence in dependences
     ]  # fmt: skip
     explanation = (
-        "<p>Correlation ratios: shares of the variance of the residual (of training data) that "
-        "depend on speed, pressure and direction of a drive. Dependence on the direction points to "
-        "friction or one orifice of a valve; on the speed, to viscous friction or orifices; on the "
-        "pressure, to areas, moduli, leakage or the scale of a sensor. With few strokes, some "
+        "<p>Correlation ratios: shares of the variance of the residual (of training data) "
+        "that depend on speed, pressure and direction of a drive. Dependence on the direction "
+        "points to friction or one orifice of a valve; on the speed, to viscous friction or orifices; on "
+        "the pressure, to areas, moduli, leakage or the scale of a sensor. With few strokes, some "
         "tens of percent may be random.</p>"
     )
     heading = ["channel*", "against*", "speed", "pressure", "direction"]
