@@ -30,7 +30,7 @@ def cells(chart, count, seed=0):
 def strength(machine, chart, joint, slope):
     """What a cylinder exerts at most against a load that asks for more with this sign."""
     cylinder, supply = machine.hydraulics.cylinders[joint], machine.hydraulics.supply
-    pressure = supply.pressure if joint in chart.raising else cylinder.relief
+    pressure = supply.pressure if joint in chart.raising_joints else cylinder.relief
     a, b, tank = cylinder.area_a, cylinder.area_b, supply.tank
     return pressure * a - tank * b if slope > 0 else tank * a - pressure * b
 
@@ -51,7 +51,9 @@ def by_hand(machine, chart, q):
         one, two = (at[name][:3, 3] for name in cause.element.split(" to "))
         held, pulled = (moment(machine, q, G, m, chart.frame, one, two) for m in (0.0, 1000.0))
         slope = (pulled - held) / 1000.0
-        found[cause.element] = chart.rule.tipping * (max(-held / slope, 0.0) if slope > 0 else np.inf)
+        found[cause.element] = chart.rule.tipping * (
+            max(-held / slope, 0.0) if slope > 0 else np.inf
+        )
     return found
 
 

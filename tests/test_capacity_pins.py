@@ -38,7 +38,11 @@ def force(machine, q, load, name):
 
 
 def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
-    ends = {chart.limiting_factors[k].element for k in chart.active_factors if chart.limiting_factors[k].reason == "pin force"}
+    ends = {
+        chart.limiting_factors[k].element
+        for k in chart.active_factors
+        if chart.limiting_factors[k].reason == "pin force"
+    }
     assert ends == set(PINS)
     for cell in map(tuple, cells(chart, 25)):
         q = excavator.closure.solve(chart.q_a[cell])

@@ -99,7 +99,7 @@ def test_the_table_has_the_cells_of_the_chart(chart):
         assert float(row[-1]) == pytest.approx(far, abs=0.005)
     text = chart.to_markdown()
     assert all(f" {cell} |" in text for row in rows for cell in row if cell)
-    assert chart.rule.says in text and "X_boom 350 bar (working pressure)" in text
+    assert chart.rule.description in text and "X_boom 350 bar (working pressure)" in text
 
 
 def test_where_nothing_tips_nothing_is_marked():
@@ -329,6 +329,8 @@ def test_the_page_shows_the_cell_under_the_cursor(chart, tmp_path, size):
                 page.mouse.move(x, y)
             load = float(page.inner_text("#load").split()[0])
             assert load <= chart.loads[s, b, a] < load + max(1.0, 1e-3 * load)
-            assert page.inner_text("#why") == str(chart.limiting_factors[chart.limiting_factor_index[s, b, a]])
+            assert page.inner_text("#why") == str(
+                chart.limiting_factors[chart.limiting_factor_index[s, b, a]]
+            )
         browser.close()
     assert not errors

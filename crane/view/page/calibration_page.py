@@ -109,9 +109,9 @@ def _parameter_table(calibration: Calibration) -> str:
     explanation = (
         "<p>Confidence intervals of 95 %, computed without bounds; correlated residuals reduce "
         "the number of independent samples. Grey rows are parameters on a bound and parameters "
-        "that the recordings do not determine: they are no result. Intervals hold for a correct model. "
-        "A parameter that compensates an effect which is missing in the machine file may be far "
-        "off with a narrow interval.</p>"
+        "that the recordings do not determine: they are no result. Intervals hold for a correct "
+        "model. A parameter that compensates an effect which is missing in the machine file may "
+        "be far off with a narrow interval.</p>"
     )
     heading = ["parameter*", "unit*", "start", "fitted", "95 %", "in the file", "remark*"]
     if not any(row[5] for row in rows):
@@ -171,11 +171,11 @@ def _dependence_section(dependences: list[ResidualDependence]) -> str:
         for dependence in dependences
     ]  # fmt: skip
     explanation = (
-        "<p>Correlation ratios: shares of the variance of the residual (of training data) "
-        "that depend on speed, pressure and direction of a drive. Dependence on the direction "
-        "points to friction or one orifice of a valve; on the speed, to viscous friction or orifices; on "
-        "the pressure, to areas, moduli, leakage or the scale of a sensor. With few strokes, some "
-        "tens of percent may be random.</p>"
+        "<p>Correlation ratios: shares of the variance of the residual (of training data) that "
+        "depend on speed, pressure and direction of a drive. Dependence on the direction points "
+        "to friction or one orifice of a valve; on the speed, to viscous friction or orifices; "
+        "on the pressure, to areas, moduli, leakage or the scale of a sensor. With few strokes, "
+        "some tens of percent may be random.</p>"
     )
     heading = ["channel*", "against*", "speed", "pressure", "direction"]
     images = "".join(
