@@ -438,6 +438,5 @@ def _minimum_norm_solution(matrix: Array, right_side: Array) -> Array:
 
 
 def _largest_per_position(position_index: NDArray[np.intp], values: Array) -> NDArray[np.intp]:
-    """Return the index of the largest value of each position, by position."""
     order = np.lexsort((-values, position_index))
     return np.asarray(order[np.unique(position_index[order], return_index=True)[1]])

@@ -97,7 +97,6 @@ def open_in_browser(path: str | Path) -> bool:
 
 
 def _machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
-    """Return the data of the machine."""
     return {
         "machine": machine.name,
         "task": "home posture" if recording is None else label(recording),

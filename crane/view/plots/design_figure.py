@@ -63,9 +63,9 @@ def design_figure(result: Design) -> Figure:
         label="before",
     )
     parameter_axes.set_yticks(rows, [escape_label(name) for name in result.parameter_names])
-    parameter_axes.set_ylim(len(rows) - 0.5, -0.5)
-    parameter_axes.set_xlim(-0.03, 1.03)
-    parameter_axes.set_xlabel("share of the range")
+    parameter_axes.set(
+        ylim=(len(rows) - 0.5, -0.5), xlim=(-0.03, 1.03), xlabel="share of the range"
+    )
     parameter_axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, frameon=False)
     if is_multi_objective:
         front = np.array([x.objectives[:2] for x in result.solutions])
@@ -78,8 +78,9 @@ def design_figure(result: Design) -> Figure:
             linewidth=1.0,
         )
         axes[0].plot(*result.initial.objectives[:2], "D", color="#c2452d", markersize=6)
-        axes[0].set_xlabel(escape_label(result.objectives[0]))
-        axes[0].set_ylabel(escape_label(result.objectives[1]))
+        axes[0].set(
+            xlabel=escape_label(result.objectives[0]), ylabel=escape_label(result.objectives[1])
+        )
     goal = "; ".join(result.objectives)
     figure.suptitle(
         escape_label(f"{result.machine.name}: {goal}"),

@@ -51,8 +51,7 @@ def force_time_figure(
         color=INK_COLOUR,
         linewidth=0.7,
     )
-    lower.set_ylabel(f"residual [{unit}]")
-    lower.set_xlabel("time [s]")
+    lower.set(ylabel=f"residual [{unit}]", xlabel="time [s]")
     upper.margins(x=0.0)
     for axes in (upper, lower):
         axes.yaxis.set_label_coords(-0.125, 0.5)
@@ -87,8 +86,7 @@ def residual_spectrum_figure(
             moving_residuals, rate, nperseg=-(-len(moving_residuals) // _SEGMENT_COUNT)
         )
         axes.loglog(frequency[1:], np.sqrt(power[1:]), color=color, linewidth=1.1, label=name)
-    axes.set_xlabel("frequency [Hz]")
-    axes.set_ylabel(f"residual [{unit}/√Hz]")
+    axes.set(xlabel="frequency [Hz]", ylabel=f"residual [{unit}/√Hz]")
     axes.set_title("spectrum of the residuals", loc="left", fontsize=8.5)
     axes.margins(x=0.0)
     if len(fits) > 1:
@@ -202,8 +200,7 @@ def draw_valve_curve(axes: Axes, curve: ValveCurve, unit: str = "m") -> None:
     lower, upper = sorted(curve.values[:2])
     axes.axvspan(lower, upper, color="#eeeeee", zorder=0, label="dead band")
     axes.axvline(curve.neutral, color="#999999", linewidth=0.7)
-    axes.set_xlabel("signal [V]")
-    axes.set_ylabel(f"speed [{text}]")
+    axes.set(xlabel="signal [V]", ylabel=f"speed [{text}]")
     axes.legend(markerscale=2)
 
 
@@ -230,6 +227,5 @@ def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> No
         )
         label = "fit" if direction > 0 else None
         axes.plot(scale * v, friction.predict(v), label=label, **DASHED_STYLE)
-    axes.set_xlabel(f"speed [{text}]")
-    axes.set_ylabel(f"friction [{force}]")
+    axes.set(xlabel=f"speed [{text}]", ylabel=f"friction [{force}]")
     axes.legend(loc="upper left", markerscale=2)

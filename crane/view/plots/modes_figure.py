@@ -106,8 +106,7 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
             label = escape_label(label_text) if label_text and not k else "_"
             upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
             lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
-    upper.set_yscale("log")
-    upper.set_ylabel("frequency [Hz]")
+    upper.set(yscale="log", ylabel="frequency [Hz]")
     lower.set_ylabel("damping [%]")
     machine = models[0][1].machine
     unit = machine.unit(names[0]) if names[0] in machine.active else ""
@@ -201,8 +200,7 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
     powers = np.log10([mode.frequency for mode in drawn_modes] or [1.0])
     axes.set_xlim(10 ** np.floor(powers.min()), 10 ** (np.floor(powers.max()) + 1))
     axes.set_yscale("symlog", linthresh=1.0)
-    axes.set_xlabel("frequency [Hz]")
-    axes.set_ylabel("damping [%]")
+    axes.set(xlabel="frequency [Hz]", ylabel="damping [%]")
     lowest = min((100 * mode.damping for mode in drawn_modes), default=0.0)
     axes.set_ylim(min(0.0, 1.5 * lowest), 200.0)
     zero_count = sum(mode.frequency == 0 for mode in model.modes)
@@ -224,8 +222,7 @@ def _draw_response(
         if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():
             label = escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]")
             axes.loglog(frequencies, factor * response[:, i], color=color, lw=1.1, label=label)
-    axes.set_title(escape_label(f"per {model.inputs[input_index]}"))
-    axes.set_xlabel("frequency [Hz]")
+    axes.set(title=escape_label(f"per {model.inputs[input_index]}"), xlabel="frequency [Hz]")
     axes.legend(fontsize=6.5)
 
 

@@ -179,8 +179,7 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
         time_axes.plot(
             time, power_scale * power, color=color, linewidth=1.1, label=escape_label(label)
         )
-    time_axes.set_xlabel("time [s]")
-    time_axes.set_ylabel(f"power of the shafts [{power_unit}]")
+    time_axes.set(xlabel="time [s]", ylabel=f"power of the shafts [{power_unit}]")
     time_axes.margins(x=0.0)
     time_axes.set_ylim(bottom=min(0.0, time_axes.get_ylim()[0]))
     figure.legend(loc="outside upper left", ncols=2)

@@ -366,8 +366,15 @@ def _draw_space_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
             label=name,
         )
         axes.text(*end_point, f" {name}", fontsize=7.5, va="bottom")
-    axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="path of the tip")
+    axes.set(
+        xlim=(lower[0], upper[0]),
+        ylim=(lower[1], upper[1]),
+        zlim=(lower[2], upper[2]),
+        xlabel="x [m]",
+        ylabel="y [m]",
+        zlabel="z [m]",
+        title="path of the tip",
+    )
     axes.set_box_aspect(span, zoom=0.88)
     axes.view_init(elev=24, azim=-60)
     for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):

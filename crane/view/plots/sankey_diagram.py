@@ -194,8 +194,7 @@ class _SankeyDiagram:
         figure_height = self._place_groups(groups, scale)
         figure = Figure(figsize=(_FIGURE_WIDTH, figure_height))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        axes.set_xlim(0.0, _FIGURE_WIDTH)
-        axes.set_ylim(-figure_height, 0.0)
+        axes.set(xlim=(0.0, _FIGURE_WIDTH), ylim=(-figure_height, 0.0))
         axes.axis("off")
         self._axes, self._scale = axes, scale
         heading = result_title(
@@ -247,7 +246,6 @@ class _SankeyDiagram:
         return top
 
     def _draw_sources(self, bar_top: float) -> None:
-        """Draw the sources on the left of the bar with top `bar_top`."""
         scale, (x, bar_x, group_x, _) = self._scale, _COLUMN_POSITIONS
         target_top, loss_top = bar_top, self._pump_group.top
         sources = {f"{escape_label(pump)}\nshaft": (energy, self._pump_losses[pump])

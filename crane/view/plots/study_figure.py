@@ -84,8 +84,9 @@ def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
             _draw_curves(axes, study, name)
         else:
             _draw_map(figure, axes, study, name)
-        axes.set_title(_column_label(study, name))
-        axes.set_xlabel(_column_label(study, study.parameters[0]))
+        axes.set(
+            title=_column_label(study, name), xlabel=_column_label(study, study.parameters[0])
+        )
     lines = {
         line.get_label(): line
         for axes in figure.axes

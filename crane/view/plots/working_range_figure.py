@@ -156,7 +156,6 @@ def _draw_dimension_line(
     end: tuple[float, float],
     measured_point: Array,
 ) -> None:
-    """Draw a dimension line with its letter, and a thin line to the measured point."""
     axes.plot(
         [measured_point[0], end[0]],
         [measured_point[1], end[1]],

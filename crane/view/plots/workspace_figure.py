@@ -143,9 +143,11 @@ def _draw_section(
     axes.plot(*home_position, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3, zorder=6)
     axes.set_aspect("equal")
     margin = 0.05 * float((limits[1] - limits[0]).max())
-    axes.set_xlim(limits[0][0] - margin, limits[1][0] + margin)
-    axes.set_ylim(limits[0][1] - margin, limits[1][1] + margin)
-    axes.set_anchor("N")
+    axes.set(
+        xlim=(limits[0][0] - margin, limits[1][0] + margin),
+        ylim=(limits[0][1] - margin, limits[1][1] + margin),
+        anchor="N",
+    )
     u, w = reachable_space.section.coordinate_names
     axes.set(
         xlabel=f"{u} [m]",
@@ -227,8 +229,7 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
     labels = [f"{joint_symbol(n)} [{u}]" for n, (u, _) in zip(names, units, strict=True)]
     home = machine.home[machine.closure.active][list(patch.stroke_pair)] * factors
     x = patch.axes[0] * factors[0]
-    axes.set_xlabel(labels[0])
-    axes.set_anchor("N")
+    axes.set(xlabel=labels[0], anchor="N")
     if patch.stroke_pair[0] == patch.stroke_pair[1]:
         axes.plot(x, values[:, 0], color=RECORDED_COLOUR)
         for curve in stroke_map.curves:

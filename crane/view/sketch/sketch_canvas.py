@@ -264,8 +264,13 @@ def create_sketch_layout(
         (_LEFT_MARGIN / width, _BOTTOM_MARGIN / height, axes_width / width, axes_height / height)
     )
     (x, y), centre = np.array([axes_width, axes_height]) / 2 * point_size, (lower + upper) / 2
-    axes.set(xlim=(centre[0] - x, centre[0] + x), ylim=(centre[1] - y, centre[1] + y))
-    axes.set(xlabel=f"{plane.labels[0]} [m]", ylabel=f"{plane.labels[1]} [m]", aspect="equal")
+    axes.set(
+        xlim=(centre[0] - x, centre[0] + x),
+        ylim=(centre[1] - y, centre[1] + y),
+        xlabel=f"{plane.labels[0]} [m]",
+        ylabel=f"{plane.labels[1]} [m]",
+        aspect="equal",
+    )
     axes.grid(visible=False)
     for axis, length in ((axes.xaxis, axes_width), (axes.yaxis, axes_height)):
         axis.set_major_locator(MaxNLocator(max(int(length / 55), 2), steps=[1, 2, 5, 10]))

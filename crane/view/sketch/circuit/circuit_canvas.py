@@ -22,7 +22,6 @@ SMALL_TEXT_SIZE, NAME_TEXT_SIZE, MIN_TEXT_SIZE = 6.3, 8.0, 5.2  # sizes of words
 
 
 def _fit_text(text: str, size: float, available_width: float, weight: str) -> tuple[str, float]:
-    """Return a text and its size that fit a width."""
     font = FontProperties(family="DejaVu Sans", weight=weight)
 
     def measure_width(text: str) -> float:

@@ -298,7 +298,6 @@ def _rail_nets(
 
 
 def _rail_label(hydraulics: Hydraulics, net: str) -> str:
-    """Return the label of a rail."""
     kind, _, name = net.partition(" ")
     is_single_pump = len(hydraulics.pumps) == 1
     label = net

@@ -390,7 +390,6 @@ class CircuitSection:
             current_nets[side] = chamber_net
 
     def _draw_actuator(self) -> None:
-        """Draw the actuator with its labels."""
         canvas, function, position = self._canvas, self._function, (self._x, self._actuator_middle)
         cylinder, nets = function.cylinder, (self._chamber_nets["a"], self._chamber_nets["b"])
         if cylinder.motor:
