@@ -215,7 +215,7 @@ def test_cones_end_where_they_say():
         ({"step": 1e-4}, "more than 400 cells"),
         ({"slews": [9.0]}, "'slew' turns from"),
         ({"radii": [3.0, 2.0]}, "radii must be numbers that rise"),
-        ({"radii": [30.0]}, "reaches none of these places"),
+        ({"radii": [30.0]}, "reaches none of these positions"),
         ({"frame": "upper"}, "what moves .upper. in its section is nothing"),
     ],
 )

@@ -218,7 +218,7 @@ def compute_chart(
     slew_coordinates = _slew_coordinates(machine, search, slews, can_tip)
     configurations = search.find_all(axes)
     if not len(configurations.position_index):
-        raise InputError(f"'{conditions.frame}' reaches none of these places, give others")
+        raise InputError(f"'{conditions.frame}' reaches none of these positions, give others")
     shape = (len(slew_coordinates), len(axes[1]) * len(axes[0]))
     values_by_factor = np.full((*shape, len(limits.factors)), np.nan)
     q_a = np.full((*shape, len(machine.active)), np.nan)

@@ -85,7 +85,7 @@ def rating_derivatives(
         parameter_names, lambda variant: _drive_force_values(variant, conditions)
     )
     if np.any(constants.jacobian(parameter_names, _tipping_line_values)):
-        raise InputError("a number that moves the supports cannot be varied here, leave it out")
+        raise InputError("a parameter that moves the supports cannot be varied here, leave it out")
     out = np.full((len(rated.q_a), len(parameter_names)), np.nan)
     if not len(rated.q_a) or not parameter_names:
         return out

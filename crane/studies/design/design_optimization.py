@@ -89,7 +89,7 @@ def design(
     starts = as_count(starts, "the number of starts", 1, 10_000)
     objectives = [("minimise", x) for x in minimise] + [("maximise", x) for x in maximise]
     if not objectives:
-        raise InputError("nothing is sought, name what to minimise or to maximise")
+        raise InputError("no objective is given, name what to minimise or to maximise")
     names, lower, upper = ranges = _parameter_ranges(base_machine, vary)
     chosen_tasks = tuple(base_machine.tasks if tasks is None else tasks)
     for task in chosen_tasks:
@@ -186,7 +186,7 @@ def _check_feasible(solutions: Sequence[DesignSolution], require: Sequence[str])
         if np.isfinite(first.slacks[worst]):
             message = f"'{require[worst]}' lacks {-first.slacks[worst]:.4g}"
     raise InputError(
-        f"no start of {len(solutions)} leads to what is required, the first: {message}"
+        f"no start of {len(solutions)} satisfies the requirements, the first: {message}"
     )
 
 
@@ -212,11 +212,11 @@ def _parameter_ranges(
 ) -> tuple[tuple[str, ...], Array, Array]:
     """Return the names, the lower and the upper bounds."""
     if not vary:
-        raise InputError("nothing varies, name numbers and their ranges")
+        raise InputError("nothing varies, name parameters and their ranges")
     values = MachineVariants(machine).values
     for name, interval in vary.items():
         if name not in values:
-            raise InputError(f"number '{name}' is unknown, {suggest_names(values, name)}")
+            raise InputError(f"parameter '{name}' is unknown, {suggest_names(values, name)}")
         try:
             bounds = np.array(interval, dtype=float).ravel()
         except (TypeError, ValueError):
@@ -251,7 +251,7 @@ def _pareto_front_jobs(
     for i in range(len(base_job.objectives)):
         feasible = [x for x in solutions[i * count : (i + 1) * count] if x.is_feasible]
         if not feasible:
-            raise InputError(f"goal {i + 1} alone leads to nothing that fits what is required")
+            raise InputError(f"objective {i + 1} alone has no solution that satisfies the requirements")
         optima.append(problem.with_all_objectives(min(feasible, key=lambda x: x.objectives[0])))
     objectives = np.array([x.objectives for x in optima])
     ideal = objectives.min(axis=0)

@@ -115,7 +115,7 @@ class DesignProblem:
                     ]
                 for text, x in zip((*self.objectives, *self.requirements), duals, strict=True):
                     if not (np.isfinite(x.value) and np.isfinite(x.derivatives).all()):
-                        raise InputError(f"'{text.text}' is no finite number there")
+                        raise InputError(f"'{text.text}' is not finite there")
                 self._last_evaluation = evaluation  # keeps its machine code for the next variant
                 self._last_outcome = values.tobytes(), duals
             except CraneError as error:

@@ -386,7 +386,7 @@ def check_unique_names(
     """
     for name in user_measures:
         if name in {*known_measures, *PLAIN_MEASURES, *_ARGUMENT_COUNTS, *DUAL_FUNCTIONS}:
-            raise InputError(f"a measure '{name}' is there already, call your own otherwise")
+            raise InputError(f"a measure '{name}' exists already, give yours another name")
 
 
 def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float, ...]]:
