@@ -251,7 +251,7 @@ def _pareto_front_jobs(
     for i in range(len(base_job.objectives)):
         feasible = [x for x in solutions[i * count : (i + 1) * count] if x.is_feasible]
         if not feasible:
-            raise InputError(f"objective {i + 1} alone has no solution that satisfies the requirements")
+            raise InputError(f"objective {i + 1} alone has no feasible solution")
         optima.append(problem.with_all_objectives(min(feasible, key=lambda x: x.objectives[0])))
     objectives = np.array([x.objectives for x in optima])
     ideal = objectives.min(axis=0)
