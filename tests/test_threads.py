@@ -125,7 +125,7 @@ def stacked(dynamics, q_a, v_a, x):
     slopes = dynamics.derivatives if dynamics.backend == "compiled" else lambda *_: {}
     tip = {dynamics.machine.tip: np.arange(6.0)}
     parts = [np.ravel(part) for part in out]
-    return [*parts, *slopes("inverse", q_a, v_a, x).values(), dynamics.applied(q_a, tip)]
+    return [*parts, *slopes("inverse", q_a, v_a, x).values(), dynamics.project_wrenches(q_a, tip)]
 
 
 def held(machine):
@@ -149,7 +149,7 @@ def posed(kinematics, q_a, v_a, x):
         out += [kinematics.position(a), kinematics.rotation(a), kinematics.jacobian(a)]
         out += [kinematics.bias(a, v)]
     out += [kinematics.position(q_a), kinematics.jacobian(q_a), kinematics.bias(q_a, v_a)]
-    return [*out, kinematics.inverse(kinematics.position(q_a[:3]), guess=q_a[0])]
+    return [*out, kinematics.inverse(kinematics.position(q_a[:3]), initial_guess=q_a[0])]
 
 
 def test_kinematics(mini):
@@ -163,14 +163,14 @@ def closed(closure, q_a, v_a, x):
         q = closure.solve(a)
         gamma = closure.gamma(q)
         out += [q, gamma, closure.drift(q, gamma @ v), closure.residual(q)]
-        out += closure.motion(q, v)
+        out += closure.gamma_velocity_drift(q, v)
     q = closure.solve(q_a)
     return [
         *out,
         q,
         closure.gamma(q),
-        closure.condition(q),
-        closure.follow(np.linspace(*q_a[:2], 9)),
+        closure.condition_number(q),
+        closure.follow_motion(np.linspace(*q_a[:2], 9)),
     ]
 
 
@@ -183,7 +183,11 @@ def balanced(stability, q_a, v_a, x):
     out = []
     for a in q_a[:5]:
         q = stability.machine.closure.solve(a[None])
-        out += [*stability.static(a), stability.ground(q, q, q), stability.tip_over_load(a)[0]]
+        out += [
+            *stability.static_margins(a),
+            stability.ground_wrench(q, q, q),
+            stability.tipping_load(a)[0],
+        ]
     return out
 
 
@@ -194,7 +198,7 @@ def test_stability():
 
 def swayed(sway, q_a, v_a, x):
     """Where what is free hangs, and how it sways."""
-    q_a = sway.hanging(q_a[:6])
+    q_a = sway.hanging_equilibrium(q_a[:6])
     return [q_a, sway.stiffness(q_a), *(x for a in q_a for x in sway.modes(a))]
 
 
