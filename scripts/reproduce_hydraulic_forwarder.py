@@ -17,7 +17,7 @@ from hydraulic_forwarder.results import Results, compute
 
 import crane
 from crane.common.atomic_output import replace_file
-from crane.view.plots.hydraulics_figures import equation_sides_figure
+from crane.view.plots.identification_figures import equation_sides_figure
 
 
 def draw(found: Results, folder: Path) -> None:

@@ -9,8 +9,8 @@ import crane
 from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
 from crane.ratings.configuration_search import ConfigurationSearch
-from crane.ratings.conic_limits import largest_feasible_magnitude
-from crane.ratings.lifting_torques import torques
+from crane.ratings.lifting_capacity import torques
+from crane.ratings.limiting_factors import largest_feasible_magnitude
 
 G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
@@ -215,7 +215,7 @@ def test_cones_end_where_they_say():
         ({"step": 1e-4}, "more than 400 cells"),
         ({"slews": [9.0]}, "'slew' turns from"),
         ({"radii": [3.0, 2.0]}, "radii must be numbers that rise"),
-        ({"radii": [30.0]}, "reaches none of these places"),
+        ({"radii": [30.0]}, "reaches none of these positions"),
         ({"frame": "upper"}, "what moves .upper. in its section is nothing"),
     ],
 )
@@ -378,11 +378,11 @@ def test_causes_that_end_a_load_together_are_all_told(excavator):
         gaps = np.sort(
             np.nan_to_num(chart.values_by_factor / chart.loads[..., None] - 1, nan=np.inf)
         )[..., 1]
-    both = chart.together.sum(axis=-1) > 1
+    both = chart.simultaneous_factors.sum(axis=-1) > 1
     assert both.sum() > 150 and np.array_equal(both[reached], gaps[reached] < 1e-6)
     assert not np.any((gaps[reached] > 1e-6) & (gaps[reached] < 1e-5))  # nothing in between
     assert np.array_equal(
-        chart.limiting_factor_index[reached], chart.together[reached].argmax(axis=-1)
+        chart.limiting_factor_index[reached], chart.simultaneous_factors[reached].argmax(axis=-1)
     )
 
 

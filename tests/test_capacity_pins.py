@@ -107,7 +107,7 @@ def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
                 least[joint] = min(least[joint], load / pressed)
     for joint, margin in least.items():
         assert margins[joint][cell] == pytest.approx(margin, rel=1e-4)
-    with pytest.raises(crane.CraneError, match="leans by 5.73 degrees: rate without slope"):
+    with pytest.raises(crane.CraneError, match="slopes by 5.73 degrees: rate without slope"):
         chart.pin_forces()
     assert "in a pin" not in chart.to_markdown() and "first to buckle" in chart.to_markdown()
 
@@ -148,8 +148,8 @@ def test_pins_that_are_not_there_are_named(excavator):
     [
         ({"pins.boom": 0.0}, {}, "'pins.boom' is 0 N, give a force above 0"),
         ({"pins.bom": 1.0}, {}, "'pins.bom' is unknown, did you mean 'pins.boom'"),
-        ({}, {"slope": 0.1}, "rated on level ground, and this leans by 5.73 degrees"),
-        ({}, {"rule": "sfs4677"}, "rated on level ground, and this leans by 5 degrees"),
+        ({}, {"slope": 0.1}, "rated on level ground, but the ground slopes by 5.73 degrees"),
+        ({}, {"rule": "sfs4677"}, "rated on level ground, but the ground slopes by 5 degrees"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(excavator, change, given, said):

@@ -14,7 +14,7 @@ import crane
 from crane.common.errors import InputError
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.view.sketch.circuit import circuit_figure
-from crane.view.sketch.circuit.format_quantities import (
+from crane.view.sketch.circuit.valve_symbols import (
     format_displacement,
     format_flow,
     format_number,

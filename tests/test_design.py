@@ -6,8 +6,12 @@ from typed import typed
 
 import crane
 from crane.formats.machine_loading import MachineVariants
-from crane.studies.design.dual_numbers import DUAL_FUNCTIONS, DualNumber
-from crane.studies.design.measure_expressions import MeasureExpression, parse_requirement
+from crane.studies.design.measure_expressions import (
+    DUAL_FUNCTIONS,
+    DualNumber,
+    MeasureExpression,
+    parse_requirement,
+)
 from crane.studies.design.variant_measures import MeasureOptions, VariantEvaluation
 
 pytestmark = pytest.mark.slow
@@ -216,7 +220,7 @@ def test_dual_numbers_are_exact():
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({}, "nothing is sought"),
+        ({}, "no objective is given"),
         ({"minimise": ["mass +"]}, "is no expression"),
         ({"minimise": ["__import__('os')"]}, "function '__import__' is unknown"),
         ({"minimise": ["mass.real.imag"]}, "measure 'mass.real.imag' is unknown"),
@@ -347,7 +351,7 @@ def test_expressions_end_in_one_line(text, told):
 
 def test_own_measures_have_names_of_their_own_and_stay_here_if_they_must():
     vary, own = {"link7.mass": (0.1, 0.2)}, {"mass": lambda machine: 1.0}
-    with pytest.raises(crane.CraneError, match="a measure 'mass' is there already"):
+    with pytest.raises(crane.CraneError, match="a measure 'mass' exists already"):
         crane.design("mini_forwarder", vary, minimise=["mass"], measures=own)
     with pytest.raises(crane.CraneError, match="stay in one process"):
         crane.design(

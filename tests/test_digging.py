@@ -239,7 +239,7 @@ def test_what_digs_not_is_said_in_one_line(name, given, said):
         ({"direction": "up", "joint": "X_arm"}, "'X_arm' is named, but only tangent"),
         ({"joint": "boom"}, "'boom' does not turn"),
         ({"working": ["boom"]}, "'boom' drives nothing"),
-        ({"radii": [30.0]}, "reaches none of these places"),
+        ({"radii": [30.0]}, "reaches none of these positions"),
     ],
 )
 def test_forces_that_cannot_be_are_said_in_one_line(excavator, given, said):

@@ -279,7 +279,8 @@ def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
     assert shown == set(found.names)
     assert f"{100 * found.training.relative[1]:.3g} %" in bare
     assert "essential" in bare and "zero in interval" in bare
-    unobservable = " ".join(tree.xpath("//h2[.='Not told']/following-sibling::p")[0].itertext())
+    section = tree.xpath("//h2[.='Unobservable parameters']/following-sibling::p")[0]
+    unobservable = " ".join(section.itertext())
     assert all(name in unobservable for name in found.base.unobservable)
     with pytest.raises(OutputError):
         crane.identification_report(found, tmp_path / "report.pdf")

@@ -18,9 +18,8 @@ from work import at_most
 import crane
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.recordings.recording import Recording
-from crane.view.live.live_session import Session, round_up_to_nice
-from crane.view.live.playback import Playback
-from crane.view.live.readout_panel import readout_html, warning_html
+from crane.view.live.live_page import readout_html, warning_html
+from crane.view.live.live_session import Playback, Session, round_up_to_nice
 
 MAIN = "from crane.cli import main; main()"
 
@@ -216,9 +215,8 @@ def group_is_empty(group):
 def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
     """Projected corners of all shapes: within the window, and of one upright in its upper part."""
     pytest.importorskip("viser")
-    from crane.view.live.access_control import AccessGuard
     from crane.view.live.live_scene import LiveScene, _shape_corners
-    from crane.view.live.live_server import start_server, stop_server
+    from crane.view.live.live_server import AccessGuard, start_server, stop_server
     from crane.view.page.machine_visuals import read_visuals
 
     session = Session(patu)
@@ -263,9 +261,8 @@ def test_a_slider_moves_the_picture_with_little_work(patu):
     pytest.importorskip("viser")
     from queue import SimpleQueue
 
-    from crane.view.live.access_control import AccessGuard
     from crane.view.live.live_page import LivePage
-    from crane.view.live.live_server import start_server, stop_server
+    from crane.view.live.live_server import AccessGuard, start_server, stop_server
 
     session = Session(patu)
     server = start_server(AccessGuard("127.0.0.1"), 0)

@@ -14,7 +14,7 @@ import pytest
 from conftest import DATA
 
 import crane
-from crane.view.live.access_control import AccessGuard
+from crane.view.live.live_server import AccessGuard
 from crane.view.live.live_session import Session
 
 pytest.importorskip("viser")

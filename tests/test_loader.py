@@ -9,8 +9,7 @@ from scipy.optimize import brentq
 
 import crane
 from crane.dynamics.statics import StaticsEvaluator
-from crane.ratings.pivot_joints import toggle
-from crane.ratings.strokes import Strokes
+from crane.ratings.strokes import Strokes, find_toggle
 
 
 def turned(arm, angle):
@@ -208,11 +207,11 @@ def test_a_toggle_is_beside_it_alone(with_toggle):
     exact = brentq(in_line, 0.02, 0.12, xtol=1e-12)
     for away in (-0.9, -0.3, 0.0, 0.3, 0.9):
         q = closure.solve(np.array([lift, exact + 0.01 * away * strokes.span[1]]))
-        found = toggle(strokes, 1, q)
+        found = find_toggle(strokes, 1, q)
         assert found[closure.active][1] == pytest.approx(exact, abs=1e-7)
     for tilt in (exact + 0.012 * strokes.span[1], 0.2, 0.4, 0.6):
         q = closure.solve(np.array([lift, tilt]))
-        assert toggle(strokes, 1, q) is None and toggle(strokes, 0, q) is None
+        assert find_toggle(strokes, 1, q) is None and find_toggle(strokes, 0, q) is None
 
 
 def test_vertical_break_out_of_loaders(loader):

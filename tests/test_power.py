@@ -12,9 +12,8 @@ from work import at_most
 
 import crane
 from crane.recordings import Recording
-from crane.studies.power_comparison import PowerComparison
-from crane.view.plots.power_comparison_figure import power_comparison_figure
-from crane.view.plots.power_figure import power_figure
+from crane.studies.power_balance_result import PowerComparison
+from crane.view.plots.power_figure import power_comparison_figure, power_figure
 from crane.view.plots.sankey_diagram import sankey_figure
 
 G, SUPPLY, TANK, SPEED = 9.81, 9.25e6, 1e5, 0.05
@@ -448,7 +447,7 @@ def test_the_command_compares(patu, tmp_path):
         (("--beside", tmp_path / "no"), "no"),
         (
             ("--beside", tmp_path / "two", "--moved", "0"),
-            "the mass that is moved is 0.0 kg, give a number above 0",
+            "the moved mass is 0.0 kg, give a number above 0",
         ),
     ):
         done = typed("power", "patu655", tmp_path / "one", *options, "--out", tmp_path / "bad")

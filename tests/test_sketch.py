@@ -14,9 +14,9 @@ from typed import typed
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
 from crane.description import bundled_machines
-from crane.view.sketch.drawing_plane import find_plane
+from crane.view.sketch.sketch_canvas import format_joint_symbol
+from crane.view.sketch.sketch_elements import find_plane
 from crane.view.sketch.sketch_figure import sketch_figure
-from crane.view.sketch.sketch_layout import format_joint_symbol
 
 PLANAR = ["four_bar.yaml", "slider_crank.yaml", "five_bar.urdf"]
 

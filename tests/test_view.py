@@ -17,13 +17,13 @@ from crane.formats.visuals.urdf_shapes import BoxShape, CylinderShape, MeshShape
 from crane.recordings.recording import Recording
 from crane.view.page import build_scene, report
 from crane.view.page.machine_visuals import read_visuals, skeleton_visuals
-from crane.view.page.packed_arrays import quantise
 from crane.view.page.page_motion import (
     frame_rows,
     joint_tree,
     motion_data,
     nearest_frame_rows,
     payload_frame_data,
+    quantise,
 )
 from crane.view.page.scene import link_poses
 

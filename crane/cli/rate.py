@@ -294,7 +294,7 @@ def power(
     from crane.control.valve_commands import require_circuit
     from crane.recordings.run_folder import recorded_machine
     from crane.studies.hydraulic_power_balance import power_balance
-    from crane.studies.power_comparison import PowerComparison
+    from crane.studies.power_balance_result import PowerComparison
 
     if not beside:
         refuse_options(

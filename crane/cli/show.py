@@ -172,8 +172,7 @@ def live(
     The loops are closed at every move; a run is played.
     """
     from crane.view.live.live_server import serve_live_view
-    from crane.view.live.live_session import Session
-    from crane.view.live.playback import Playback
+    from crane.view.live.live_session import Playback, Session
 
     if _is_run(what):
         if run is not None:

@@ -1,8 +1,7 @@
-"""What a machine lifts, how hard it digs, and how far it works."""
+"""Ratings of machines: lifting capacity, tool and break-out forces, working range."""
 
 from crane.ratings.breakout_forces import Breakout, breakout
-from crane.ratings.lifting_capacity import Capacity, capacity
-from crane.ratings.lifting_torques import Torques, torques
+from crane.ratings.lifting_capacity import Capacity, Torques, capacity, torques
 from crane.ratings.rating_rules import RULES, Rule
 from crane.ratings.tool_forces import ToolForce, tool_force
 from crane.ratings.working_ranges import WorkingRange, working_range

@@ -1,56 +1,63 @@
-"""Break-out forces of bucket and arm, as ISO 6015 and SAE J1179 define them."""
+"""Break-out forces of bucket and arm (ISO 6015, SAE J1179)."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from crane.common.errors import InputError
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_quantity
-from crane.dynamics.statics import StaticsEvaluator
+from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.machine import Machine
-from crane.motion.workspaces.workspace_patch import fill_patch
+from crane.motion.workspaces.workspace_patch import fill_patch, last_closed_configuration
 from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.ratings.drive_force_limits import drive_force_limits
-from crane.ratings.force_optimizer import maximize_force
 from crane.ratings.limiting_factors import LimitingFactor, LoadLimits
-from crane.ratings.pivot_joints import NEAR, Turn, bucket_and_arm_strokes, find_pivot, toggle, turn
 from crane.ratings.rating_rules import find_rule
-from crane.ratings.strokes import Strokes, check_drives
+from crane.ratings.strokes import (
+    TOGGLE_DISTANCE,
+    InstantaneousRotation,
+    Strokes,
+    bucket_and_arm_strokes,
+    check_drives,
+    find_pivot,
+    find_toggle,
+    instantaneous_rotation,
+)
 from crane.ratings.tool_forces import tangent_action
 
-_DIGGING_STROKE_VALUES, _OTHER_STROKE_VALUES = (
-    81,
-    9,
-)  # values of the stroke that digs, and of another, to start from
-_START_COUNT = 3  # of the best of them
-_ON_PIN = 1e-6  # of the machine's size, from a pin to the centre of rotation
-_MIN_RELATIVE_IMPROVEMENT = 1e-9  # share by which a posture farther from home has to be better
+_DIGGING_STROKE_VALUES = 81  # values of the stroke that digs in the grid of starts
+_OTHER_STROKE_VALUES = 9  # values of another stroke in this grid
+_START_COUNT = 3  # best configurations of the grid that are improved
+_PIVOT_TOLERANCE = 1e-6  # share of the characteristic length
+_MIN_RELATIVE_IMPROVEMENT = 1e-9  # of a configuration that is farther from home
 
 
 class BreakoutForce(NamedTuple):
-    """The largest force of one drive along the frame's path, the way the drive is stronger.
+    """Largest force of one drive along the path of the frame, in the drive's stronger direction.
 
     Attributes:
-        joint: Whose drive works.
-        pivot: The pin that it turns most of those that carry the frame.
-        turn: How it turns the frame at the posture of `force`: about that pin, or about an
+        joint: Joint of the drive that works.
+        pivot: Joint that the drive turns most, of those that carry the frame.
+        turn: Rotation of the frame in the configuration of `force`: about the pivot, or about an
             instantaneous centre elsewhere.
-        isolated_force: With the best lever, if everything else held; infinite at a toggle [N].
-        stroke: Of the drive there [m], [rad].
-        lever: (n,) active coordinates there.
-        home: In the same way at home, whatever the lever is there [N].
-        force: With everything else at its limits; infinite where nothing ends it [N].
-        limiting_factor: What ends it; None where nothing does.
-        forces_by_factor: By cause, at its posture [N].
-        q_a: (n,) active coordinates there.
+        isolated_force: Force with the best lever if everything else held; infinite at a
+            toggle [N].
+        stroke: Stroke of the drive at this force [m], [rad].
+        lever: (n,) active coordinates at this force.
+        home: The same force with the lever of the home configuration [N].
+        force: Force with all other parts at their limits; infinite if nothing limits it [N].
+        limiting_factor: Limiting factor of `force`; None if nothing limits it.
+        forces_by_factor: Force by limiting factor in the configuration of `force` [N].
+        q_a: (n,) active coordinates of this configuration.
     """
 
     joint: str
     pivot: str
-    turn: Turn
+    turn: InstantaneousRotation
     isolated_force: float
     stroke: float
     lever: Array
@@ -62,7 +69,7 @@ class BreakoutForce(NamedTuple):
 
     @property
     def radius(self) -> float:
-        """From the centre of rotation to the frame [m]."""
+        """Distance from the centre of rotation to the frame [m]."""
         return self.turn.radius
 
 
@@ -72,11 +79,11 @@ class Breakout(Result):
 
     Attributes:
         machine: The machine.
-        frame: Where it digs.
-        section: The plane in which it does.
-        with_weight: Whether weights and tipping count.
-        bucket: Of the bucket's drive.
-        arm: Of the arm's; None where there is none.
+        frame: Link that digs.
+        section: Section in which it digs.
+        with_weight: Whether weight and tipping are included.
+        bucket: Force of the bucket's drive.
+        arm: Force of the arm's drive; None if there is no arm.
     """
 
     machine: Machine
@@ -86,66 +93,64 @@ class Breakout(Result):
     bucket: BreakoutForce
     arm: BreakoutForce | None
 
+    def _named_forces(self) -> list[tuple[str, BreakoutForce]]:
+        return [("bucket", self.bucket), *([] if self.arm is None else [("arm", self.arm)])]
+
     def _one_line(self) -> str:
-        """Both forces."""
-        named_forces = (("bucket", self.bucket), ("arm", self.arm))
-        force_texts = [
-            f"{name} {format_quantity(x.force, 'N', 4)}"
-            for name, x in named_forces
-            if x is not None
-        ]
-        return f"Breakout of '{self.machine.name}' at '{self.frame}': {', '.join(force_texts)}"
+        texts = [f"{name} {format_quantity(x.force, 'N', 4)}" for name, x in self._named_forces()]
+        return f"Breakout of '{self.machine.name}' at '{self.frame}': {', '.join(texts)}"
 
     def to_markdown(self) -> str:
-        """A table: forces, levers, postures, what ends them."""
-        weight_text = "weights and tipping count" if self.with_weight else "weights left out"
+        """Return a table of forces, levers, configurations and limiting factors."""
+        weight_text = f"weight and tipping {'included' if self.with_weight else 'left out'}"
         lines = [
             f"# Break-out forces of {self.machine.name}\n",
-            f"At `{self.frame}`, along its path as the drive moves alone, with friction left out. "
+            f"At `{self.frame}`, along its path when the drive moves alone, without friction. "
             "Alone: with the drive's best lever, if everything else held. At home: with the lever "
-            f"there. Force: {weight_text}, other circuits hold at their relief valves.\n",
+            f"at home. Force: {weight_text}, other circuits hold at their relief valves.\n",
             "| | drive | turns about | radius [m] | alone [kN] | at | at home [kN] | force [kN] | "
-            "ends by | at |",
+            "limited by | at |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            *(self._row(name, force) for name, force in self._named_forces()),
         ]
-        found = [("bucket", self.bucket)] + ([] if self.arm is None else [("arm", self.arm)])
-        lines += [self._row(name, breakout_force) for name, breakout_force in found]
         lines += [
             f"\nThe {name} has no largest force alone: it goes through a toggle, where the lip "
-            f"stands still as the drive moves, or within {100 * NEAR:g} % of its stroke of one."
-            for name, one in found
-            if np.isinf(one.isolated_force)
+            f"stands still while the drive moves, or within {100 * TOGGLE_DISTANCE:g} % of its "
+            "stroke of one."
+            for name, force in self._named_forces()
+            if np.isinf(force.isolated_force)
         ]
         return "\n".join([*lines, ""])
 
-    def _row(self, name: str, one: BreakoutForce) -> str:
+    def _row(self, name: str, force: BreakoutForce) -> str:
         machine = self.machine
-        at = ", ".join(
+        coordinates = ", ".join(
             f"{joint} = {x:.4g} {machine.unit(joint)}"
-            for joint, x in zip(machine.active, one.q_a, strict=True)
+            for joint, x in zip(machine.active, force.q_a, strict=True)
         )
-        return (
-            f"| {name} | {one.joint} | {self._about(one)} | {one.radius:.4f} | "
-            f"{_kn(one.isolated_force)} | "
-            f"{one.stroke:.4g} {machine.unit(one.joint)} | {_kn(one.home)} | {_kn(one.force)} | "
-            f"{one.limiting_factor or 'nothing'} | {at} |"
-        )
+        cells = (
+            name, force.joint, self._centre_text(force), f"{force.radius:.4f}",
+            _format_kn(force.isolated_force), f"{force.stroke:.4g} {machine.unit(force.joint)}",
+            _format_kn(force.home), _format_kn(force.force), force.limiting_factor or "nothing",
+            coordinates,
+        )  # fmt: skip
+        return f"| {' | '.join(map(str, cells))} |"
 
-    def _about(self, one: BreakoutForce) -> str:
-        """The pin that the frame turns about, or where its instantaneous centre is."""
-        if np.isinf(one.radius):
-            return f"nothing: {one.joint} shifts it"
-        if one.turn.offset <= _ON_PIN * self.machine.closure.characteristic_length:
-            return one.pivot
-        u, w = self.section.coordinates(one.turn.centre[None])[0]
+    def _centre_text(self, force: BreakoutForce) -> str:
+        """Return the pin about which the frame turns, or the position of the centre."""
+        if np.isinf(force.radius):
+            return f"nothing: {force.joint} shifts it"
+        if force.turn.offset <= _PIVOT_TOLERANCE * self.machine.closure.characteristic_length:
+            return force.pivot
+        u, w = self.section.coordinates(force.turn.centre[None])[0]
         first, second = self.section.coordinate_names
         return (
-            f"instantaneous centre, {first} {u:.3f}, {second} {w:.3f} m, {one.turn.offset:.3f} m "
-            f"off {one.pivot}"
+            f"instantaneous centre, {first} {u:.3f}, {second} {w:.3f} m, "
+            f"{force.turn.offset:.3f} m off {force.pivot}"
         )
 
 
-def _kn(force: float) -> str:
+def _format_kn(force: float) -> str:
     return f"{force / 1e3:.2f}" if np.isfinite(force) else "unbounded"
 
 
@@ -157,38 +162,40 @@ def breakout(
     arm: str | None = None,
     weights: bool = False,
 ) -> Breakout:
-    """The largest forces of bucket and arm at the lip, tangent to its path.
+    """Compute the largest forces of bucket and arm at the lip, tangent to its path.
 
-    By ISO 6015 and SAE J1179 one drive works at its pump's pressure, and pushes
+    By ISO 6015 and SAE J1179 one drive works at its pump's pressure and pushes with
 
         F = tau / |dp/dX|
 
-    at a frame p, with tau the force of the drive and X its stroke. That with the best lever is
-    what the drive gives alone. All others hold behind closed valves, at not more than the pressure
-    of their relief valves: where one of them yields before, the force is the largest with which
-    none does, over all strokes. Weights and friction are left out. The arm's is with the bucket's
-    stroke where its drive alone gives most. All are optima within the limits of the strokes. ISO
-    takes the lip, SAE the tip of the teeth: that is the choice of the frame.
+    at the frame position p, with the force tau of the drive and its stroke X. The value for the
+    best lever is the force of the drive alone. All other drives hold behind closed valves, at no
+    more than the pressure of their relief valves. If one of them yields earlier, the force is the
+    largest one at which none yields, over all strokes. Weight and friction are left out. The arm's
+    force is computed with the bucket at the stroke of its own best lever. All forces are optima
+    within the limits of the strokes. ISO measures at the lip, SAE at the tip of the teeth; choose
+    the frame accordingly.
 
-    The path is a circle about the pivot where the stroke turns one pin alone. Where it turns more,
-    as the boom of a loader does whose tilt cylinder stands on the frame, it is one about the
-    instantaneous centre, see `Turn`.
+    The path is a circle about the pivot if the stroke turns one pin only. If it turns several, as
+    for the boom of a loader whose tilt cylinder stands on the frame, it is a circle about the
+    instantaneous centre, see `InstantaneousRotation`.
 
-    At a toggle, dp/dX = 0, statics sets no limit to what the drive gives alone, which is infinite
-    then; so it is within 1 % of the stroke from one, where the give of the oil, not the lever of
-    rigid links decides. The arm's is with the bucket at home then.
+    At a toggle, dp/dX = 0, statics does not limit the force of the drive alone: it is infinite.
+    It is reported as infinite also within 1 % of the stroke from a toggle, where the compliance
+    of the oil decides, not the lever of rigid links. The arm's force then has the bucket at home.
 
     Args:
-        machine: With hydraulics, or limits of `effort` in its URDFs.
-        frame: The lip; the tip if not given.
-        bucket: The joint whose drive turns the bucket; that nearest to the lip of three that turn
-            it if not given.
-        arm: Likewise the arm; the one before it if not given.
-        weights: Whether the machine has its weight, which its drives hold and which keeps it from
-            tipping: all limits of the posture, with the slewing joint at home.
+        machine: A machine with hydraulics, or with `effort` limits in its URDFs.
+        frame: The lip; the tip by default.
+        bucket: Joint whose drive turns the bucket; by default the one nearest to the lip of three
+            that turn it.
+        arm: Joint whose drive turns the arm; by default the one before the bucket's.
+        weights: Whether the machine has weight, which its drives hold and which keeps it from
+            tipping: all limits of the configuration, with the slewing joint at home.
 
     Raises:
-        InputError: Nothing is a bucket, an unknown frame or joint, or nothing that limits a force.
+        InputError: No joint moves a bucket, a frame or joint is unknown, or nothing limits a
+            force.
     """
     strokes = Strokes(StaticsEvaluator(check_drives(machine), frame))
     bucket_stroke, arm_stroke = bucket_and_arm_strokes(strokes, bucket, arm)
@@ -198,12 +205,12 @@ def breakout(
     )
     arm_force = None
     if arm_stroke is not None:
-        begun = machine.home
+        start = machine.home
         if np.isfinite(bucket_force.isolated_force):
-            held_coordinates[bucket_stroke], begun = bucket_force.stroke, lever
+            held_coordinates[bucket_stroke], start = bucket_force.stroke, lever
         others = [i for i in strokes.moving if i != bucket_stroke]
         arm_force, _ = _largest_breakout_force(
-            strokes, arm_stroke, (held_coordinates, begun), others, weights
+            strokes, arm_stroke, (held_coordinates, start), others, weights
         )
     return Breakout(
         machine, strokes.statics.frame, strokes.section, weights, bucket_force, arm_force
@@ -213,108 +220,193 @@ def breakout(
 def _largest_breakout_force(
     strokes: Strokes,
     stroke_index: int,
-    near: tuple[Array, Array],
+    held: tuple[Array, Array],
     moved: list[int],
     with_weight: bool,
 ) -> tuple[BreakoutForce, Array]:
-    """Of the drive of stroke i, over some strokes, the others held; and the posture of its lever.
+    """Return the force of the drive of one stroke, and the configuration (nq,) of its best lever.
 
     Args:
-        strokes: Of the frame.
-        stroke_index: Among the active joints.
-        near: (n,) where the others are held, and a closed posture (nq,) to come from.
-        moved: The strokes.
-        with_weight: Whether weights count.
+        strokes: Strokes of the frame.
+        stroke_index: Index of the stroke among the active joints.
+        held: Active coordinates (n,) of the strokes that are held, and a closed configuration
+            (nq,) to start from.
+        moved: Indices of the strokes that move.
+        with_weight: Whether weight is included.
     """
     machine, frame, active = strokes.machine, strokes.statics.frame, strokes.machine.closure.active
-    joint, action, rule = (
-        machine.active[stroke_index],
-        tangent_action(strokes, stroke_index),
-        find_rule("none"),
-    )
-    drives = drive_force_limits(machine, [joint])
-    own_limits = LoadLimits(
-        strokes.statics, [x for x in drives if x.joint == joint], rule, action, with_weight=False
-    )
-    grid = _grid(strokes, stroke_index, near, moved)
-    isolated_force, best_lever_configuration, tried = _maximize_over_starts(
-        strokes, own_limits, grid, moved
-    )
+    joint, action = machine.active[stroke_index], tangent_action(strokes, stroke_index)
+    rule, drives = find_rule("none"), drive_force_limits(machine, [joint])
+    own_drive = [x for x in drives if x.joint == joint]
+    own_limits = LoadLimits(strokes.statics, own_drive, rule, action, with_weight=False)
+    grid = _start_configurations(strokes, stroke_index, held, moved)
+    isolated_force, lever, tried = _maximize_over_starts(strokes, own_limits, grid, moved)
     for q in tried:
-        if (found := toggle(strokes, stroke_index, q)) is not None:
-            isolated_force, best_lever_configuration = np.inf, found
+        if (toggle := find_toggle(strokes, stroke_index, q)) is not None:
+            isolated_force, lever = np.inf, toggle
             break
-    load_limits = LoadLimits(strokes.statics, drives, rule, action, with_weight=with_weight)
-    force, best_configuration, _ = _maximize_over_starts(strokes, load_limits, grid, moved)
+    limits = LoadLimits(strokes.statics, drives, rule, action, with_weight=with_weight)
+    force, best, _ = _maximize_over_starts(strokes, limits, grid, moved)
     if not (force > 0 and isolated_force > 0):
         raise InputError(f"'{joint}' exerts no force at '{frame}'")
-    forces = load_limits.max_magnitudes(strokes.statics.evaluate(best_configuration[None]))[0]
-    least = int(np.nan_to_num(forces, nan=np.inf).argmin())
+    forces = limits.max_magnitudes(strokes.statics.evaluate(best[None]))[0]
+    smallest = int(np.nan_to_num(forces, nan=np.inf).argmin())
     home = own_limits.max_magnitudes(strokes.statics.evaluate(machine.home[None]))[0].min()
-    digs = BreakoutForce(
+    breakout_force = BreakoutForce(
         joint=joint,
         pivot=find_pivot(machine, frame, stroke_index),
-        turn=turn(machine, frame, stroke_index, best_configuration),
+        turn=instantaneous_rotation(machine, frame, stroke_index, best),
         isolated_force=isolated_force,
-        stroke=float(best_lever_configuration[active][stroke_index]),
-        lever=best_lever_configuration[active].copy(),
+        stroke=float(lever[active][stroke_index]),
+        lever=lever[active].copy(),
         home=float(np.nan_to_num(home, nan=np.inf)),
         force=force,
-        limiting_factor=load_limits.factors[least] if np.isfinite(force) else None,
-        forces_by_factor={
-            cause: float(x) for cause, x in zip(load_limits.factors, forces, strict=True)
-        },
-        q_a=best_configuration[active].copy(),
+        limiting_factor=limits.factors[smallest] if np.isfinite(force) else None,
+        forces_by_factor=dict(zip(limits.factors, forces.tolist(), strict=True)),
+        q_a=best[active].copy(),
     )
-    return digs, best_lever_configuration
+    return breakout_force, lever
 
 
 def _maximize_over_starts(
-    strokes: Strokes, load_limits: LoadLimits, grid: tuple[Array, Array], moved: list[int]
+    strokes: Strokes, limits: LoadLimits, grids: tuple[Array, Array], moved: list[int]
 ) -> tuple[float, Array, list[Array]]:
-    """The largest force of all causes, its posture (nq,), and all postures that were tried.
+    """Maximize the force from the best start of the first grid, then from those of the second.
 
-    From the best posture of those near home first, then from the best of all.
+    Returns:
+        The largest force, its configuration (nq,), and all configurations that were tried.
     """
 
     def largest_forces(q: Array) -> Array:
-        forces_by_factor = load_limits.max_magnitudes(strokes.statics.evaluate(q))
-        return np.where(np.isnan(forces_by_factor), np.inf, forces_by_factor).min(axis=1)
+        forces = limits.max_magnitudes(strokes.statics.evaluate(q))
+        return np.where(np.isnan(forces), np.inf, forces).min(axis=1)
 
-    value, best_configuration = -np.inf, strokes.machine.home
+    value, best = -np.inf, strokes.machine.home
     tried: list[Array] = []
-    for some, count in zip(grid, (1, _START_COUNT), strict=True):
-        for q in some[np.argsort(-largest_forces(some), kind="stable")[:count]]:
-            configuration = maximize_force(strokes, load_limits, q, moved)
+    for grid, count in zip(grids, (1, _START_COUNT), strict=True):
+        for q in grid[np.argsort(-largest_forces(grid), kind="stable")[:count]]:
+            configuration = maximize_force(strokes, limits, q, moved)
             force = float(largest_forces(configuration[None])[0])
             tried += [q, configuration]
             if force > value * (1 + _MIN_RELATIVE_IMPROVEMENT) or value == -np.inf:
-                value, best_configuration = force, configuration
-    return value, best_configuration, tried
+                value, best = force, configuration
+    return value, best, tried
 
 
-def _grid(
-    strokes: Strokes, i: int, near: tuple[Array, Array], moved: list[int]
+def _start_configurations(
+    strokes: Strokes, i: int, held: tuple[Array, Array], moved: list[int]
 ) -> tuple[Array, Array]:
-    """Postures (N, nq) over stroke i alone, and over it and each of the others in turn."""
-    machine, (base, begun) = strokes.machine, near
+    """Return closed configurations (N, nq) over stroke i alone, and over it and each other one."""
+    machine, (base, start) = strokes.machine, held
     low, high = strokes.low, strokes.high
-    own = np.linspace(low[i], high[i], _DIGGING_STROKE_VALUES)
-    found, beside = [], []
+    values = np.linspace(low[i], high[i], _DIGGING_STROKE_VALUES)
+    own, pairs = [], []
     others = [k for k in moved if k != i]
-    if not others:  # the one stroke, along a line
-        patch = fill_patch(machine, base, (i, i), (own, base[[i]]), begun)
+    if not others:
+        patch = fill_patch(machine, base, (i, i), (values, base[[i]]), start)
         if patch is not None:
-            found = beside = [patch.configurations[patch.is_closed]]
+            own = pairs = [patch.configurations[patch.is_closed]]
     for k in others:
-        here = np.r_[base[k], np.linspace(low[k], high[k], _OTHER_STROKE_VALUES)]
-        order = np.argsort(here)
-        patch = fill_patch(machine, base, (i, k), (own, here[order]), begun)
+        other_values = np.r_[base[k], np.linspace(low[k], high[k], _OTHER_STROKE_VALUES)]
+        order = np.argsort(other_values)
+        patch = fill_patch(machine, base, (i, k), (values, other_values[order]), start)
         if patch is None:
             continue
-        found.append(patch.configurations[patch.is_closed])
+        pairs.append(patch.configurations[patch.is_closed])
         row = int(np.flatnonzero(order == 0)[0])
-        beside.append(patch.configurations[patch.is_closed[:, row], row])
-    if not found:
+        own.append(patch.configurations[patch.is_closed[:, row], row])
+    if not pairs:
         raise InputError(f"no posture of '{machine.name}' closes on the way from home")
-    return np.concatenate(beside), np.concatenate(found)
+    return np.concatenate(own), np.concatenate(pairs)
+
+
+def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[int]) -> Array:
+    """Find the configuration of the largest force near a configuration.
+
+    The smallest force over all limiting factors is largest at the solution of
+
+        max x   with   a_k(q_A) + b_k(q_A) x <= 0,   lower <= q_A <= upper,
+
+    over the bounds k of `LoadLimits`. This problem is smooth, although the smallest force is not.
+    It is solved by sequential quadratic programming (SLSQP) with exact derivatives.
+
+    Args:
+        strokes: Strokes of the frame.
+        limits: Load limits on level ground.
+        q: (nq,) closed start configuration.
+        moved: Indices of the active joints that move.
+
+    Returns:
+        (nq,) closed configuration; the start if no larger force is found.
+    """
+    start = strokes.statics.evaluate(q[None])
+    force = float(limits.max_magnitudes(start)[0].min())
+    if not 0 < force < np.inf:
+        return q
+    problem = _ForceProblem(strokes, limits, q, moved, force)
+    constraints: Any = {
+        "type": "ineq", "fun": problem.constraint_values, "jac": problem.constraint_jacobian,
+    }  # fmt: skip
+    bounds: Any = [*[(0.0, 1.0)] * len(moved), (0.0, None)]
+    result = minimize(
+        problem.cost, problem.start, jac=True, bounds=bounds,
+        constraints=[constraints], method="SLSQP", options={"ftol": 1e-14, "maxiter": 200},
+    )  # fmt: skip
+    configuration, statics, _ = problem.evaluate(np.asarray(result.x))
+    return configuration if float(limits.max_magnitudes(statics)[0].min()) > force else q
+
+
+class _ForceProblem:
+    """Constraints of `maximize_force` in y: shares of the moved strokes, and the scaled force."""
+
+    def __init__(
+        self, strokes: Strokes, limits: LoadLimits, q: Array, moved: list[int], force: float
+    ):
+        self._strokes, self._limits, self._q, self._moved = strokes, limits, q, moved
+        self._force, self._lower = force, strokes.low[moved]
+        self._lengths = (strokes.high - strokes.low)[moved]
+        q_a = q[strokes.machine.closure.active]
+        self.start = np.r_[(q_a[moved] - self._lower) / self._lengths, 1.0]
+        self._cache: dict[bytes, tuple[Array, StaticQuantities, StaticQuantities]] = {}
+        coefficients = self._coefficients(strokes.statics.evaluate(q[None]))
+        self._scales = np.array([abs(a[0]) + abs(b[0]) * force for a, b, *_ in coefficients])
+
+    def evaluate(self, y: Array) -> tuple[Array, StaticQuantities, StaticQuantities]:
+        """Return the configuration (nq,), its statics, and their derivatives by coordinates."""
+        key = y[:-1].tobytes()
+        if key not in self._cache:
+            self._cache.clear()
+            machine, statics = self._strokes.machine, self._strokes.statics
+            target = self._q[machine.closure.active].copy()
+            target[self._moved] = self._lower + np.clip(y[:-1], 0, 1) * self._lengths
+            q = last_closed_configuration(machine, self._q, target)[0]
+            derivatives = statics.coordinate_derivatives(q[None])
+            self._cache[key] = q, statics.evaluate(q[None]), derivatives
+        return self._cache[key]
+
+    def cost(self, y: Any) -> tuple[float, Any]:
+        """Return the negative force and its gradient."""
+        return -float(y[-1]), -np.eye(len(y))[-1]
+
+    def constraint_values(self, y: Any) -> Any:
+        """Return the slack of each bound over its scale."""
+        coefficients = self._coefficients(self.evaluate(y)[1])
+        return -np.array([a[0] + b[0] * self._force * y[-1] for a, b, *_ in coefficients]) / (
+            self._scales
+        )
+
+    def constraint_jacobian(self, y: Any) -> Any:
+        """Return the derivatives of `constraint_values` by y."""
+        _, statics, derivatives = self.evaluate(y)
+        jacobian = np.empty((len(self._limits.bounds), len(y)))
+        for k, i in enumerate(self._moved):
+            by_stroke = StaticQuantities(*(part[..., i] for part in derivatives))
+            for row, bound in zip(jacobian, self._limits.bounds, strict=True):
+                a, b, *_ = self._limits.coefficient_derivatives(bound, statics, by_stroke)
+                row[k] = (a[0] + b[0] * self._force * y[-1]) * self._lengths[k]
+        jacobian[:, -1] = [b[0] * self._force for _, b, *_ in self._coefficients(statics)]
+        return -jacobian / self._scales[:, None]
+
+    def _coefficients(self, statics: StaticQuantities) -> list[tuple[Array, ...]]:
+        unit = self._limits.action.unit_vectors(statics, np.zeros(1))
+        return [self._limits.bound_coefficients(x, statics, unit) for x in self._limits.bounds]

@@ -1,75 +1,223 @@
-"""Rated loads in words: what they hold for, by what they end, and their table as Markdown."""
+"""Rated loads as a table and as text: conditions, limits, limiting factors."""
 
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crane.common.errors import SingularConfigurationError
+from crane.common.samples import Array
 from crane.common.units import format_quantity
-from crane.ratings.drive_force_limits import drive_force_limits
-from crane.ratings.limiting_factors import PIN_FORCE
-from crane.ratings.load_tables import LoadTable
+from crane.ratings.limiting_factors import PIN_FORCE, TIPPING
+from crane.ratings.load_effects import buckling_margins, pin_forces
+from crane.ratings.rating_chart import RatingChart
 
-if TYPE_CHECKING:
-    from crane.ratings.lifting_capacity import Capacity
+_ROUND_STEPS = (1.0, 1.5, 2.0, 2.5, 5.0)
+_MAX_ROWS, _MAX_COLUMNS = 12, 18  # columns over all slews
+_RADIUS_SUBDIVISIONS = 25  # of a step, for the largest radius
+_SIGNIFICANT_DIGITS = 3  # of the largest load
+_STEP_TOLERANCE = 1e-6  # of a step
+
+
+class LoadTable(NamedTuple):
+    """Loads at some heights and radii of a chart, and at the largest radius of each height.
+
+    Attributes:
+        heights: (h,) heights, descending [m].
+        radii: (r,) radii [m].
+        loads: (s, h, r) loads [kg]; NaN out of reach, infinite where there is no limit.
+        limited_by_drives: (s, h, r) whether a drive limits the load.
+        max_radii: (h,) largest radius, rounded down to a 25th of the chart's step [m].
+        max_radius_loads: (s, h) loads at the largest radius [kg].
+        max_radius_limited_by_drives: (s, h) whether a drive limits that load.
+        can_tip: Whether tipping is among the limiting factors.
+    """
+
+    heights: Array
+    radii: Array
+    loads: Array
+    limited_by_drives: NDArray[np.bool_]
+    max_radii: Array
+    max_radius_loads: Array
+    max_radius_limited_by_drives: NDArray[np.bool_]
+    can_tip: bool
+
+    def format_load(self, load: float, limited_by_drive: bool) -> str:
+        """Return a load as text: rounded down, with an asterisk if a drive limits it.
+
+        There is no asterisk if the machine cannot tip.
+        """
+        if math.isnan(load):
+            return ""
+        if math.isinf(load):
+            return "∞"
+        largest_load = max(self.loads[np.isfinite(self.loads)].max(initial=0.0), 1e-9)
+        digits = max(_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest_load)), 0)
+        rounded_down = math.floor(load * 10**digits * (1 + 1e-12)) / 10**digits
+        return f"{rounded_down:.{digits}f}{'*' if limited_by_drive and self.can_tip else ''}"
+
+    def format_rows(self) -> list[list[str]]:
+        """Return h rows of s * (r + 1) + 1 cells: loads by radius and slew, largest radius.
+
+        The loads at the largest radius precede that radius.
+        """
+        loads = np.concatenate([self.loads, self.max_radius_loads[:, :, None]], axis=2)
+        limited = np.concatenate(
+            [self.limited_by_drives, self.max_radius_limited_by_drives[:, :, None]], axis=2
+        )
+        decimals = _decimal_places(self.max_radii)
+        return [
+            [
+                *(
+                    self.format_load(loads[k, i, j], limited[k, i, j])
+                    for j in range(loads.shape[2])
+                    for k in range(len(loads))
+                ),
+                f"{self.max_radii[i]:.{decimals}f}",
+            ]
+            for i in range(len(self.heights))
+        ]
+
+
+def load_table(chart: RatingChart) -> LoadTable:
+    """Return the loads of a chart at round steps and at the largest radius of each height.
+
+    For a machine that slews, only radii in front of the axis are listed, if it reaches any.
+    """
+    columns = max(_MAX_COLUMNS // len(chart.slews), 4)
+    is_reached: NDArray[np.bool_] = np.any(~np.isnan(chart.values), axis=0)
+    if chart.section.slewing_joint is not None and np.any(is_reached & (chart.radii > 0)):
+        is_reached = is_reached & (chart.radii > 0)
+    a, b = np.flatnonzero(is_reached.any(axis=0)), np.flatnonzero(is_reached.any(axis=1))
+    step = _round_step(chart.radii[a], chart.heights[b], columns)
+    a = a[_select_indices(chart.radii[a], step, columns)]
+    b = b[_select_indices(chart.heights[b], step, _MAX_ROWS)][::-1]
+    limited_by_drives = _is_drive_limited(chart)
+    largest = [_at_largest_radius(chart, int(i), np.flatnonzero(is_reached[i])) for i in b]
+    max_radii, loads, limited = (list(column) for column in zip(*largest, strict=True))
+    return LoadTable(
+        chart.heights[b],
+        chart.radii[a],
+        chart.values[:, b][:, :, a],
+        limited_by_drives[:, b][:, :, a],
+        np.array(max_radii),
+        np.array(loads).T,
+        np.array(limited).T,
+        any(factor.reason == TIPPING for factor in chart.limiting_factors),
+    )
+
+
+def _is_drive_limited(chart: RatingChart) -> NDArray[np.bool_]:
+    """Return whether a drive limits the load (s, b, a)."""
+    is_drive = [x.reason not in (TIPPING, PIN_FORCE) for x in chart.limiting_factors]
+    return np.array([*is_drive, False])[chart.limiting_factor_index]  # index -1: no limit
+
+
+def _round_step(radii: Array, heights: Array, columns: int) -> float:
+    """Return the smallest round step with no more than so many columns and rows."""
+    min_step = max(np.ptp(radii) / columns, np.ptp(heights) / _MAX_ROWS)
+    if not min_step:
+        return 0.0
+    smallest_spacing = np.concatenate([np.diff(radii), np.diff(heights)]).min()
+    power = 10.0 ** np.floor(np.log10(min_step))
+    round_steps = [x * power * ten for ten in (1.0, 10.0) for x in _ROUND_STEPS]
+    fitting_steps = [
+        x
+        for x in round_steps
+        if x >= min_step
+        and abs(x / smallest_spacing - round(x / smallest_spacing)) < _STEP_TOLERANCE
+    ]
+    return float(
+        fitting_steps[0]
+        if fitting_steps
+        else smallest_spacing * np.ceil(min_step / smallest_spacing)
+    )
+
+
+def _select_indices(values: Array, step: float, count: int) -> NDArray[np.intp]:
+    """Return indices of at most `count` values: all, multiples of the step, or evenly spaced."""
+    if len(values) > count and step:
+        multiples = np.flatnonzero(
+            np.abs(values / step - np.round(values / step)) < _STEP_TOLERANCE
+        )
+        if len(multiples):
+            return multiples
+    return np.arange(0, len(values), -(-len(values) // count))
+
+
+def _at_largest_radius(
+    chart: RatingChart, height_index: int, reached: NDArray[np.intp]
+) -> tuple[float, Array, NDArray[np.bool_]]:
+    """Return the largest radius at a height, and its loads (s,) and whether drives limit them.
+
+    Args:
+        chart: The chart.
+        height_index: Index of the height.
+        reached: Indices of the radii that are reached at this height.
+    """
+    last = int(reached[-1])
+    if len(chart.radii) > 1:
+        neighbours = slice(last, last + 2) if last + 1 < len(chart.radii) else slice(-2, None)
+        shares = np.linspace(0.0, 1.0, _RADIUS_SUBDIVISIONS + 1)
+        radii = chart.radii[last] + shares * np.diff(chart.radii[neighbours])
+        height = chart.heights[height_index]
+        found = chart.places.find_all((radii, np.array([height])))
+        chart = chart.at_positions([radii[found.position_index.max()]], [height])
+        height_index = last = 0
+    is_limited = _is_drive_limited(chart)[:, height_index, last]
+    return float(chart.radii[last]), chart.values[:, height_index, last], is_limited
+
+
+def _decimal_places(values: Array) -> int:
+    """Return the number of decimal places for lengths: two, or more for small machines."""
+    return max(2 - math.floor(math.log10(max(np.abs(values).max(), 1e-9))), 2)
+
 
 _SIDE_NAMES = {0: "front", 90: "side", -90: "side", 180: "rear", -180: "rear"}  # [deg]
-ASTERISK_NOTE = "* ended by drives, all others by tipping"
+ASTERISK_NOTE = "* limited by drives, all others by tipping"
 
 
-def capacity_facts(chart: "Capacity") -> list[tuple[str, str]]:
-    """What the loads hold for: names, and what is said of each."""
-    holding_joints = [
-        joint for joint in chart.machine.driven_joints if joint not in chart.raising_joints
-    ]
-    raising_text = (", ".join(chart.raising_joints) or "nothing") + (
-        f" ({', '.join(holding_joints)} held)" if holding_joints else ""
-    )
+def capacity_facts(chart: RatingChart) -> list[tuple[str, str]]:
+    """Return the conditions of a load chart: names and texts."""
+    holding = [x for x in chart.machine.driven_joints if x not in chart.working_joints]
+    raising_text = ", ".join(chart.working_joints) or "nothing"
+    if holding:
+        raising_text += f" ({', '.join(holding)} held)"
+    slope = np.rad2deg(chart.ground_slope)
     rows = [
-        ("load", f"at '{chart.frame}', in kg; what is there already is no part of it"),
+        ("load", f"at '{chart.frame}', in kg, in addition to what the machine carries already"),
         ("rule", chart.rule.description),
         ("raised by", raising_text),
-        (
-            "ground",
-            f"leans by {np.rad2deg(chart.ground_slope):.3g} degrees"
-            if chart.ground_slope
-            else "level",
-        ),
+        ("ground", f"slope of {slope:.3g} degrees" if slope else "level"),
     ]
     if chart.with_friction:
-        rows.append(("friction", "overcome from rest by what raises"))
+        rows.append(("friction", "overcome from rest by the drives that raise"))
     return [*rows, ("limits", "; ".join(limit_texts(chart)))]
 
 
-def limit_texts(chart: "Capacity") -> list[str]:
-    """Of each drive its pressure or torque: "X_boom 350 bar (working pressure)"; of pins too."""
+def limit_texts(chart: RatingChart) -> list[str]:
+    """Return the limits of drives and pins as texts: "X_boom 350 bar (working pressure)"."""
     out = []
-    for drive in drive_force_limits(chart.machine, chart.raising_joints, chart.with_friction):
+    for drive in chart.drive_limits():
         if drive.chamber_pressures:
-            pressure_texts = [
-                format_quantity(pressure, "Pa", 4) for pressure in drive.chamber_pressures
-            ]
-            value = (
-                pressure_texts[0]
-                if pressure_texts[0] == pressure_texts[1]
-                else f"A {pressure_texts[0]}, B {pressure_texts[1]}"
-            )
+            a, b = (format_quantity(pressure, "Pa", 4) for pressure in drive.chamber_pressures)
+            value = a if a == b else f"A {a}, B {b}"
         else:
             unit = "N" if chart.machine.unit(drive.joint) == "m" else "N m"
             value = format_quantity(drive.max_force, unit, 4)
         out.append(f"{drive.joint} {value} ({drive.limit_kind})")
-    limited_pins = {cause.element for cause in chart.limiting_factors if cause.reason == PIN_FORCE}
-    pins = {
-        name: force for name, force in chart.machine.pin_capacities.items() if name in limited_pins
-    }
+    limited_pins = {x.element for x in chart.limiting_factors if x.reason == PIN_FORCE}
     return out + [
-        f"{name} {format_quantity(force, 'N', 4)} ({PIN_FORCE})" for name, force in pins.items()
+        f"{name} {format_quantity(force, 'N', 4)} ({PIN_FORCE})"
+        for name, force in chart.machine.pin_capacities.items()
+        if name in limited_pins
     ]
 
 
-def slew_labels(chart: "Capacity") -> list[str]:
-    """What slew angles are called: front, side, rear or degrees; nothing of home alone."""
+def slew_labels(chart: RatingChart) -> list[str]:
+    """Return a label for each slew angle: front, side, rear or degrees; empty for home alone."""
     slewing_joint = chart.section.slewing_joint
     if slewing_joint is None:
         return [""]
@@ -84,70 +232,61 @@ def slew_labels(chart: "Capacity") -> list[str]:
     ]
 
 
-def factor_shares(chart: "Capacity") -> list[tuple[str, float, float]]:
-    """Causes that end loads, the share of all places where each does, and with another one."""
-    all_places = max(int((~np.isnan(chart.loads)).sum()), 1)
-    several = chart.together.sum(axis=-1) > 1
-    share_rows = []
+def factor_shares(chart: RatingChart) -> list[tuple[str, float, float]]:
+    """Return limiting factors with the shares of positions that each limits, alone or not.
+
+    Returns:
+        Rows, largest share first: the limiting factor, the share of all positions that it limits,
+        and the share that it limits simultaneously with another factor.
+    """
+    count = max(int((~np.isnan(chart.values)).sum()), 1)
+    has_several = chart.simultaneous_factors.sum(axis=-1) > 1
+    rows = []
     for k in chart.active_factors:
-        ends = chart.together[..., k]
-        each, both = (float(x.sum()) / all_places for x in (ends, ends & several))
-        share_rows.append((str(chart.limiting_factors[k]), each, both))
-    return sorted(share_rows, key=lambda one: -one[1])
+        limits = chart.simultaneous_factors[..., k]
+        share, both = (float(x.sum()) / count for x in (limits, limits & has_several))
+        rows.append((str(chart.limiting_factors[k]), share, both))
+    return sorted(rows, key=lambda row: -row[1])
 
 
-def table_headings(chart: "Capacity", table: LoadTable) -> list[str]:
-    """Of the table's columns."""
-    slew_names = slew_labels(chart)
-    radius_labels = [f"{radius:g} m" for radius in table.radii] + ["farthest"]
-    return [
-        f"{chart.section.coordinate_names[1]} [m]",
-        *(
-            f"{radius_label} {slew_label}".strip()
-            for radius_label in radius_labels
-            for slew_label in slew_names
-        ),
-        "at [m]",
-    ]
+def table_headings(chart: RatingChart, table: LoadTable) -> list[str]:
+    """Return the headings of the columns of a load table."""
+    names, labels = slew_labels(chart), [f"{radius:g} m" for radius in table.radii]
+    columns = [f"{label} {name}".strip() for label in [*labels, "farthest"] for name in names]
+    return [f"{chart.section.coordinate_names[1]} [m]", *columns, "at [m]"]
 
 
-def to_markdown(chart: "Capacity") -> str:
-    """What the loads hold for, their table, and what ends them."""
-    table = chart.table
-    rows = [
-        [f"{height:g}", *row]
-        for height, row in zip(table.heights, table.format_rows(), strict=True)
-    ]
-    lines = [f"# Lifting capacity of {chart.machine.name}\n"]
-    lines += [f"- {name}: {text}" for name, text in capacity_facts(chart)]
-    lines += [
+def to_markdown(chart: RatingChart, table: LoadTable) -> str:
+    """Return the conditions of a load chart, its table and its limiting factors as Markdown."""
+    cells = zip(table.heights, table.format_rows(), strict=True)
+    rows = [[f"{height:g}", *row] for height, row in cells]
+    lines = [
+        f"# Lifting capacity of {chart.machine.name}\n",
+        *(f"- {name}: {text}" for name, text in capacity_facts(chart)),
         "",
         *_markdown_table(table_headings(chart, table), rows),
         "",
         table_note(chart, table),
-    ]
-    lines += ["\n| ended by | of all places | of all, with another |", "| --- | ---: | ---: |"]
-    lines += [
-        f"| {cause} | {100 * share:.3g} % | {100 * both:.3g} % |"
-        for cause, share, both in factor_shares(chart)
+        "\n| limited by | of all positions | of all, with another |",
+        "| --- | ---: | ---: |",
+        *(
+            f"| {factor} | {100 * share:.3g} % | {100 * both:.3g} % |"
+            for factor, share, both in factor_shares(chart)
+        ),
     ]
     if rows := structural_rows(chart):
-        lines += [
-            "",
-            *_markdown_table(
-                ["under these loads", "", *chart.section.coordinate_names, "slew"], rows
-            ),
-        ]
+        heading = ["under these loads", "", *chart.section.coordinate_names, "slew"]
+        lines += ["", *_markdown_table(heading, rows)]
     return "\n".join(lines) + "\n"
 
 
-def structural_rows(chart: "Capacity") -> list[list[str]]:
-    """What its parts bear, and where: the largest force in a pin, the least margin to buckling.
+def structural_rows(chart: RatingChart) -> list[list[str]]:
+    """Return the largest force in a pin and the smallest margin to buckling, with positions.
 
-    Pins are left out on ground that leans, and where the passive joints are not determined.
+    Pins are left out on sloping ground, and if the passive joints are not determined.
     """
     machine, rows = chart.machine, []
-    if not np.isfinite(chart.loads).any():
+    if not np.isfinite(chart.values).any():
         return []
     prismatic_joints = [
         joint.name for joint in machine.tree.moving_joints if joint.kind == "prismatic"
@@ -156,7 +295,7 @@ def structural_rows(chart: "Capacity") -> list[list[str]]:
         loop.name for loop in machine.closure.equations.loops if loop.type == "prismatic"
     ]
     try:
-        forces = {} if chart.ground_slope else chart.pin_forces()
+        forces = {} if chart.ground_slope else pin_forces(chart)
     except SingularConfigurationError:
         forces = {}
     pins = {name: x for name, x in forces.items() if name not in prismatic_joints}
@@ -165,7 +304,7 @@ def structural_rows(chart: "Capacity") -> list[list[str]]:
         index = int(np.nanargmax(pins[name]))
         force = format_quantity(float(pins[name].flat[index]), "N", 4)
         rows.append([f"largest force in a pin: {name}", force, *_position_cells(chart, index)])
-    margins = {name: x for name, x in chart.buckling().items() if np.isfinite(x).any()}
+    margins = {name: x for name, x in buckling_margins(chart).items() if np.isfinite(x).any()}
     if margins:
         name = min(margins, key=lambda joint: np.nanmin(margins[joint]))
         index = int(np.nanargmin(margins[name]))
@@ -174,23 +313,23 @@ def structural_rows(chart: "Capacity") -> list[list[str]]:
     return rows
 
 
-def _position_cells(chart: "Capacity", index: int) -> list[str]:
-    """First and second coordinate and slew angle of a place of the chart."""
-    s, b, a = np.unravel_index(index, chart.loads.shape)
+def _position_cells(chart: RatingChart, index: int) -> list[str]:
+    """Return radius, height and slew angle of a position of the chart as texts."""
+    s, b, a = np.unravel_index(index, chart.values.shape)
     slew_text = f"{np.rad2deg(chart.slews[s]):.4g}°"
     return [f"{chart.radii[a]:.4g} m", f"{chart.heights[b]:.4g} m", slew_text]
 
 
-def table_note(chart: "Capacity", table: LoadTable) -> str:
-    """What the table's marks and columns say."""
+def table_note(chart: RatingChart, table: LoadTable) -> str:
+    """Return the explanation of the marks and columns of a load table."""
     radius_note = (
-        f"Loads in kg by {chart.section.coordinate_names[0]}; 'farthest' at the largest one of "
-        f"each row."
+        f"Loads in kg by {chart.section.coordinate_names[0]}; 'farthest' is at the largest one "
+        f"of each row."
     )
     if table.can_tip:
         pins = (
             " or by pins"
-            if any(cause.reason == PIN_FORCE for cause in chart.limiting_factors)
+            if any(factor.reason == PIN_FORCE for factor in chart.limiting_factors)
             else ""
         )
         return f"{radius_note} {ASTERISK_NOTE[0]}: {ASTERISK_NOTE[2:]}{pins}."
@@ -198,7 +337,7 @@ def table_note(chart: "Capacity", table: LoadTable) -> str:
 
 
 def _markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A Markdown table whose columns are aligned."""
+    """Return the lines of a Markdown table with aligned columns."""
     width = [max(map(len, column)) for column in zip(heading, *rows, strict=True)]
     separator = ["-" * (w - 1) + ":" for w in width]
     cells = [

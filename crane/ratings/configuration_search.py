@@ -1,4 +1,4 @@
-"""The postures that put a frame at given places of its section, and the best of them."""
+"""Search for configurations that put a frame at positions of its section."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -16,34 +16,33 @@ from crane.motion.workspaces.workspace_patch import WorkspacePatch, fill_patch
 from crane.ratings.grid_points import grid_points_in_patch
 from crane.ratings.strokes import Strokes
 
-_PATCH_VALUES = 33  # values of both strokes of a patch
+_PATCH_VALUES = 33  # values of each of the two strokes of a patch
 _LEVELS_BY_COUNT = (1, 17, 7)  # values of each further stroke, by how many there are
 _NEWTON_ITERATIONS = 12
-_MAX_STEP_SHARE = 0.2  # of a stroke, the farthest that one iteration moves
-_POSITION_TOLERANCE = 1e-11  # of the machine's size
-_LIMIT_TOLERANCE = 1e-9  # of a stroke, beyond its limits
-_DUPLICATE_TOLERANCE = 1e-6  # of a stroke: postures that are one
-_STEP_TOLERANCE = 1e-8  # of a stroke, to which the best is sought
-_MAXIMA_COUNT, _MIN_LEVEL_DISTANCE = (
-    3,
-    1.5,
-)  # how many of the best levels are improved, and steps between two of them
+_MAX_STEP_SHARE = 0.2  # largest step of an iteration, as a share of the stroke
+_POSITION_TOLERANCE = 1e-11  # share of the characteristic length
+_LIMIT_TOLERANCE = 1e-9  # share of a stroke, beyond its limits
+_DUPLICATE_TOLERANCE = 1e-6  # share of a stroke between equal configurations
+_STEP_TOLERANCE = 1e-8  # share of a stroke at which the search ends
+_MAXIMA_COUNT = 3  # best levels that are improved
+_MIN_LEVEL_DISTANCE = 1.5  # steps between two of these levels
 _MAX_ROUNDS = 200
-_NEAR = 5  # postures from which one place is sought
-_FEW, _FINER = 100, 3  # places of which more levels are tried, and how often these are halved
-_BETTER = 1e-6  # share by which a posture from beside has to be better
+_NEAREST_COUNT = 5  # known configurations from which one position is searched
+_MAX_FEW_POSITIONS = 100  # number of positions up to which levels are refined
+_REFINEMENTS = 3  # of the levels, each halves their distance
+_MIN_RELATIVE_IMPROVEMENT = 1e-6  # of a configuration from a neighbouring position
 
 ValueFunction = Callable[[Array, StaticQuantities], Array]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ConfigurationSet(OneLineRepr):
-    """Postures with the frame at places.
+    """Configurations with the frame at positions.
 
     Attributes:
-        position_index: (M,) index of the place.
-        q: (M, nq) closed postures.
-        statics: What they are at rest.
+        position_index: (M,) index of the position.
+        q: (M, nq) closed configurations.
+        statics: Statics at these configurations.
     """
 
     position_index: NDArray[np.intp]
@@ -51,37 +50,37 @@ class ConfigurationSet(OneLineRepr):
     statics: StaticQuantities
 
     def select(self, index: NDArray[Any]) -> "ConfigurationSet":
-        """Some of them, by index or mask."""
+        """Return some of the configurations, by index or mask."""
         return ConfigurationSet(
             self.position_index[index], self.q[index], self.statics.select(index)
         )
 
-    def and_those(self, others: "ConfigurationSet") -> "ConfigurationSet":
-        """These and others."""
-        at = StaticQuantities(
-            *(np.concatenate(both) for both in zip(self.statics, others.statics, strict=True))
-        )
-        return ConfigurationSet(
-            np.concatenate([self.position_index, others.position_index]),
-            np.concatenate([self.q, others.q]),
-            at,
+    @classmethod
+    def concatenate(cls, sets: Sequence["ConfigurationSet"]) -> "ConfigurationSet":
+        """Return the configurations of several sets, in order."""
+        statics = zip(*(x.statics for x in sets), strict=True)
+        return cls(
+            np.concatenate([x.position_index for x in sets]),
+            np.concatenate([x.q for x in sets]),
+            StaticQuantities(*(np.concatenate(parts) for parts in statics)),
         )
 
 
 class ConfigurationSearch(Strokes):
-    """All ways in which a machine puts a frame at places of its section, within its limits.
+    """Search for configurations that put a frame at positions of its section, within limits.
 
-    Two strokes, those that move the frame most, follow from the place by Newton's method; further
-    ones are free to choose: of a place, the posture of the largest value is sought over them.
+    The two strokes that move the frame most follow from the position by Newton's method. Further
+    strokes are free: at each position the configuration of the largest value is searched over
+    them.
 
     Args:
-        statics: The machine and the frame.
+        statics: Evaluates the machine and the frame.
 
     Attributes:
-        position_strokes: The two strokes, among the active joints.
-        free_strokes: Further strokes that move it.
-        configurations: (N, nq) closed ones all over the strokes.
-        section_positions: (N, 2) their places.
+        position_strokes: Indices of the two strokes among the active joints.
+        free_strokes: Indices of further strokes that move the frame.
+        configurations: (N, nq) closed configurations over the ranges of all strokes.
+        section_positions: (N, 2) positions of the frame in these configurations [m].
 
     Raises:
         InputError: Fewer than two strokes move the frame in its section, or more than four.
@@ -110,7 +109,7 @@ class ConfigurationSearch(Strokes):
         )
 
     def _fill_patches(self) -> list[WorkspacePatch]:
-        """Patches over the pair, at levels of the other strokes."""
+        """Return patches over the two strokes, at levels of the free strokes."""
         home = self.machine.home[self.machine.closure.active]
         count = _LEVELS_BY_COUNT[len(self.free_strokes)]
         levels = [np.linspace(self.low[i], self.high[i], count) for i in self.free_strokes]
@@ -129,11 +128,14 @@ class ConfigurationSearch(Strokes):
         return out
 
     def find_all(self, axes: tuple[Array, Array]) -> ConfigurationSet:
-        """Postures at all places of a grid, one and more each, by levels of the other strokes.
+        """Find configurations at all positions of a grid, at levels of the free strokes.
 
         Args:
-            axes: Coordinates (a,), (b,) of the section; place k is (axes[0][k % a],
+            axes: Coordinates (a,), (b,) of the section [m]; position k is (axes[0][k % a],
                 axes[1][k // a]).
+
+        Returns:
+            No, one or several configurations per position.
         """
         start_sets, position_sets = [], []
         for patch in self._patches:
@@ -146,138 +148,127 @@ class ConfigurationSearch(Strokes):
             position_sets.append(position_index)
             start_sets.append(q)
         count = len(axes[0]) * len(axes[1])
-        if self.free_strokes and count <= _FEW:  # from the nearest known ones, too: at the border
-            for k in range(count):
-                statics_values = np.array([axes[0][k % len(axes[0])], axes[1][k // len(axes[0])]])
-                near = np.argsort(np.linalg.norm(self.section_positions - statics_values, axis=1))[
-                    :_NEAR
-                ]
-                position_sets.append(np.full(len(near), k))
-                start_sets.append(self.configurations[near])
+        if self.free_strokes and count <= _MAX_FEW_POSITIONS:  # grids miss the border of the reach
+            for k, target in enumerate(_grid_positions(axes, np.arange(count))):
+                distances = np.linalg.norm(self.section_positions - target, axis=1)
+                nearest = np.argsort(distances)[:_NEAREST_COUNT]
+                position_sets.append(np.full(len(nearest), k))
+                start_sets.append(self.configurations[nearest])
         position_index, q = np.concatenate(position_sets), np.concatenate(start_sets)
-        targets = np.column_stack(
-            [axes[0][position_index % len(axes[0])], axes[1][position_index // len(axes[0])]]
-        )
+        targets = _grid_positions(axes, position_index)
         moved, rest, is_valid = self.move_to_targets(q, targets, self.position_strokes)
         configurations = ConfigurationSet(position_index, moved, rest).select(is_valid)
-        if self.free_strokes:  # where the pair leaves its limits, the others may help
+        if self.free_strokes:  # if the two strokes leave their limits, the others may help
             lost = np.logical_not(is_valid)
             moved, rest, is_valid = self.move_to_targets(q[lost], targets[lost], self.moving)
-            configurations = configurations.and_those(
-                ConfigurationSet(position_index[lost], moved, rest).select(is_valid)
-            )
+            further = ConfigurationSet(position_index[lost], moved, rest).select(is_valid)
+            configurations = ConfigurationSet.concatenate([configurations, further])
         return configurations.select(self._unique_indices(configurations))
 
     def select_best(
         self, configurations: ConfigurationSet, axes: tuple[Array, Array], evaluate: ValueFunction
     ) -> tuple[ConfigurationSet, Array]:
-        """Of each place the posture of the largest value.
+        """Find the configuration of the largest value at each position.
 
-        Among the levels first; from the best of them all strokes are moved, the frame held, by
-        steps that are halved where none helps.
+        The best levels of the free strokes are improved by moving all strokes, with the frame
+        held, in steps that are halved if no direction gives a larger value.
 
         Args:
-            configurations: See `find_all`.
-            axes: Likewise.
-            evaluate: (q, at rest) -> (M,).
+            configurations: Result of `find_all`.
+            axes: See `find_all`.
+            evaluate: Function of q (M, nq) and its statics that returns values (M,).
 
         Returns:
-            One posture per place that has any, and its value.
+            One configuration per position that has any, and its value.
         """
         values = evaluate(configurations.q, configurations.statics)
         if not self.free_strokes:
             indices = _largest_per_position(configurations.position_index, values)
             return configurations.select(indices), values[indices]
-        if (
-            len(np.unique(configurations.position_index)) <= _FEW
-        ):  # none beside them to learn from, see below
-            for k in range(_FINER):
-                configurations = self._halved(configurations, axes, 0.5**k)
+        if len(np.unique(configurations.position_index)) <= _MAX_FEW_POSITIONS:
+            # few positions have no neighbours that would improve them
+            for k in range(_REFINEMENTS):
+                configurations = self._refine_levels(configurations, axes, 0.5**k)
             values = evaluate(configurations.q, configurations.statics)
         indices = self._separated_maxima(configurations, values)
         configurations, values = configurations.select(indices), values[indices]
-        targets = np.column_stack(
-            [
-                axes[0][configurations.position_index % len(axes[0])],
-                axes[1][configurations.position_index // len(axes[0])],
-            ]
-        )
+        targets = _grid_positions(axes, configurations.position_index)
         configurations, values = self._improve(configurations, values, targets, evaluate)
         indices = _largest_per_position(configurations.position_index, values)
-        return self._from_beside(configurations.select(indices), values[indices], axes, evaluate)
+        return self._improve_from_neighbours(
+            configurations.select(indices), values[indices], axes, evaluate
+        )
 
-    def _from_beside(
+    def _improve_from_neighbours(
         self,
-        found: ConfigurationSet,
+        configurations: ConfigurationSet,
         values: Array,
         axes: tuple[Array, Array],
-        value: ValueFunction,
+        evaluate: ValueFunction,
     ) -> tuple[ConfigurationSet, Array]:
-        """Improve places from the best postures of those beside them, until none gets better.
+        """Improve each position from the best configurations of its neighbours, until none helps.
 
-        Levels may miss the largest of several peaks, or a place at the border, where another one
-        has it.
+        Levels may miss the largest of several peaks, or a position at the border of the reach,
+        which a neighbour has found.
 
         Args:
-            found: One posture per place.
-            values: Of these.
+            configurations: One configuration per position.
+            values: Their values.
             axes: See `find_all`.
-            value: See `select_best`.
+            evaluate: See `select_best`.
         """
-        wide, upper = len(axes[0]), len(axes[1])
-        fresh: NDArray[np.intp] = np.arange(len(values))
-        while len(fresh):
-            column, row = found.position_index[fresh] % wide, found.position_index[fresh] // wide
-            source, place = [], []
-            for i, j in itertools.product((-1, 0, 1), repeat=2):
-                a, b = column + i, row + j
-                inside = (a >= 0) & (a < wide) & (b >= 0) & (b < upper)
-                source.append(fresh[inside])
-                place.append(b[inside] * wide + a[inside])
-            beside = np.concatenate(place)
-            targets = np.column_stack([axes[0][beside % wide], axes[1][beside // wide]])
-            q, at, good = self.move_to_targets(
-                found.q[np.concatenate(source)], targets, self.moving
+        shape = np.array([len(axes[0]), len(axes[1])])
+        offsets = np.array(list(itertools.product((-1, 0, 1), repeat=2)))
+        improved: NDArray[np.intp] = np.arange(len(values))
+        while len(improved):
+            index = configurations.position_index[improved]
+            cells = np.column_stack([index % shape[0], index // shape[0]])
+            neighbours = cells + offsets[:, None]
+            offset, source = np.nonzero(((neighbours >= 0) & (neighbours < shape)).all(axis=2))
+            first, second = neighbours[offset, source].T
+            position = second * shape[0] + first
+            targets = _grid_positions(axes, position)
+            q, statics, is_valid = self.move_to_targets(
+                configurations.q[improved[source]], targets, self.moving
             )
-            new = ConfigurationSet(beside, q, at).select(good)
-            tried = value(new.q, new.statics)
-            known = np.full(wide * upper, -np.inf)
-            known[found.position_index] = values
-            better = tried > known[new.position_index] * (1 + _BETTER)
-            new, tried, targets = new.select(better), tried[better], targets[good][better]
-            kept = _largest_per_position(new.position_index, tried)
-            new, tried = self._improve(new.select(kept), tried[kept], targets[kept], value)
-            old = np.isin(found.position_index, new.position_index, invert=True)
-            found, values = found.select(old).and_those(new), np.concatenate([values[old], tried])
-            fresh = np.arange(len(values) - len(tried), len(values))
-        return found, values
+            new = ConfigurationSet(position, q, statics).select(is_valid)
+            new_values = evaluate(new.q, new.statics)
+            known = np.full(int(shape.prod()), -np.inf)
+            known[configurations.position_index] = values
+            is_better = new_values > known[new.position_index] * (1 + _MIN_RELATIVE_IMPROVEMENT)
+            new, new_values, targets = (
+                new.select(is_better), new_values[is_better], targets[is_valid][is_better],
+            )  # fmt: skip
+            best = _largest_per_position(new.position_index, new_values)
+            new, new_values = self._improve(
+                new.select(best), new_values[best], targets[best], evaluate
+            )
+            is_kept = np.isin(configurations.position_index, new.position_index, invert=True)
+            configurations = ConfigurationSet.concatenate([configurations.select(is_kept), new])
+            values = np.concatenate([values[is_kept], new_values])
+            improved = np.arange(len(values) - len(new_values), len(values))
+        return configurations, values
 
-    def _halved(
-        self, found: ConfigurationSet, axes: tuple[Array, Array], step: float
+    def _refine_levels(
+        self, configurations: ConfigurationSet, axes: tuple[Array, Array], step: float
     ) -> ConfigurationSet:
-        """Postures half a step beside those found, too, in each of the other strokes."""
-        every = [found]
-        targets = np.column_stack(
-            [
-                axes[0][found.position_index % len(axes[0])],
-                axes[1][found.position_index // len(axes[0])],
-            ]
-        )
-        half = 0.5 * step / (_LEVELS_BY_COUNT[len(self.free_strokes)] - 1)
-        for i, way in itertools.product(self.free_strokes, (-half, half)):
-            q = found.q.copy()
-            q[:, self.machine.closure.active[i]] += way * self.span[i]
-            moved, at, good = self.move_to_targets(q, targets, self.position_strokes)
-            every.append(ConfigurationSet(found.position_index, moved, at).select(good))
-        found = every[0]
-        for one in every[1:]:
-            found = found.and_those(one)
-        return found.select(self._unique_indices(found))
+        """Add configurations half a step away from each in each free stroke."""
+        sets = [configurations]
+        targets = _grid_positions(axes, configurations.position_index)
+        half_step = 0.5 * step / (_LEVELS_BY_COUNT[len(self.free_strokes)] - 1)
+        for i, change in itertools.product(self.free_strokes, (-half_step, half_step)):
+            q = configurations.q.copy()
+            q[:, self.machine.closure.active[i]] += change * self.span[i]
+            moved, statics, is_valid = self.move_to_targets(q, targets, self.position_strokes)
+            found = ConfigurationSet(configurations.position_index, moved, statics)
+            sets.append(found.select(is_valid))
+        refined = ConfigurationSet.concatenate(sets)
+        return refined.select(self._unique_indices(refined))
 
     def _separated_maxima(
         self, configurations: ConfigurationSet, values: Array
     ) -> NDArray[np.intp]:
-        """Indices of the largest values of each place that are not beside each other."""
+        """Return indices of the largest values at each position, at levels that are apart."""
         columns = self.machine.closure.active[self.free_strokes]
         level_steps = self.span[self.free_strokes] / (_LEVELS_BY_COUNT[len(self.free_strokes)] - 1)
         levels = configurations.q[:, columns] / level_steps
@@ -304,7 +295,7 @@ class ConfigurationSearch(Strokes):
         targets: Array,
         evaluate: ValueFunction,
     ) -> tuple[ConfigurationSet, Array]:
-        """Move all strokes to larger values along the null space of the frame's motion."""
+        """Move all strokes to larger values, along the null space of the frame's Jacobian."""
         strokes = self.moving
         columns, stroke_lengths = self.machine.closure.active[strokes], self.span[strokes]
         count = len(self.free_strokes)
@@ -347,13 +338,13 @@ class ConfigurationSearch(Strokes):
     def move_to_targets(
         self, q: Array, targets: Array, strokes: Sequence[int]
     ) -> tuple[Array, StaticQuantities, NDArray[np.bool_]]:
-        """Put the frame at targets (M, 2) by some strokes, from postures (M, nq) nearby.
+        """Put the frame at targets (M, 2) by some strokes, from nearby configurations (M, nq).
 
-        Newton's method by the shortest steps; where there are more than two, those that would
-        leave their limits stay there.
+        Newton's method with minimum-norm steps. With more than two strokes, those that would
+        leave their limits stay at them.
 
         Returns:
-            Postures, what they are at rest, and whether each is there and within its limits.
+            Configurations, their statics, and whether each reaches its target within its limits.
         """
         closure, strokes = self.machine.closure, list(strokes)
         columns, stroke_lengths = closure.active[strokes], self.span[strokes]
@@ -376,7 +367,7 @@ class ConfigurationSearch(Strokes):
             else:
                 q_a = q[active][:, columns]
                 lower, high = ((x[strokes] - q_a) / stroke_lengths for x in (self.low, self.high))
-                step = _shortest_inside(scaled_jacobian, position_error[active], lower, high)
+                step = _bounded_solution(scaled_jacobian, position_error[active], lower, high)
             step /= np.maximum(1.0, np.abs(step).max(axis=1) / _MAX_STEP_SHARE)[:, None]
             start = q[active]
             start[:, columns] += step * stroke_lengths
@@ -399,23 +390,29 @@ class ConfigurationSearch(Strokes):
         return q, statics_values, is_valid & is_within_limits
 
     def _unique_indices(self, configurations: ConfigurationSet) -> NDArray[np.intp]:
-        """Of postures that are the same at one place, one each."""
+        """Return the indices of distinct configurations at each position."""
         q_a = configurations.q[:, self.machine.closure.active] / (_DUPLICATE_TOLERANCE * self.span)
         keys = np.column_stack([configurations.position_index, np.round(q_a[:, self.moving])])
         return np.asarray(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
 
 
-def _shortest_inside(matrix: Array, right: Array, low: Array, high: Array) -> Array:
-    """The shortest x (M, k) with matrix (M, 2, k) x = right (M, 2) and low <= x <= high (M, k).
+def _grid_positions(axes: tuple[Array, Array], index: NDArray[np.intp]) -> Array:
+    """Return the positions (M, 2) with indices (M,) of a grid."""
+    return np.column_stack([axes[0][index % len(axes[0])], axes[1][index // len(axes[0])]])
 
-    As near as it is found by holding what leaves its limits there, one round after the other.
+
+def _bounded_solution(matrix: Array, right_side: Array, low: Array, high: Array) -> Array:
+    """Return short x (M, k) with matrix (M, 2, k) x = right_side (M, 2) and low <= x <= high.
+
+    Components that leave their bounds are held there, in one round after the other; x is exact
+    unless too many are held.
     """
     x = np.zeros(low.shape)
     free = np.ones(low.shape, dtype=bool)
     for _ in range(low.shape[1] - 1):
         held = np.where(free, 0.0, x)
-        left = right - np.einsum("mik,mk->mi", matrix, held)
-        x = held + _minimum_norm_solution(matrix * free[:, None], left)
+        remaining = right_side - np.einsum("mik,mk->mi", matrix, held)
+        x = held + _minimum_norm_solution(matrix * free[:, None], remaining)
         leaves = free & ((x < low) | (x > high))
         if not leaves.any():
             break
@@ -425,7 +422,7 @@ def _shortest_inside(matrix: Array, right: Array, low: Array, high: Array) -> Ar
 
 
 def _minimum_norm_solution(matrix: Array, right_side: Array) -> Array:
-    """The shortest x (M, k) with matrix (M, 2, k) x = right (M, 2); 0 where there is none."""
+    """Return the shortest x (M, k) with matrix (M, 2, k) x = right_side (M, 2); 0 if none."""
     gram_matrix = matrix @ np.swapaxes(matrix, 1, 2)
     a, b, c = gram_matrix[:, 0, 0], gram_matrix[:, 0, 1], gram_matrix[:, 1, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -441,6 +438,5 @@ def _minimum_norm_solution(matrix: Array, right_side: Array) -> Array:
 
 
 def _largest_per_position(position_index: NDArray[np.intp], values: Array) -> NDArray[np.intp]:
-    """Index of the largest value of each place, by place."""
     order = np.lexsort((-values, position_index))
     return np.asarray(order[np.unique(position_index[order], return_index=True)[1]])

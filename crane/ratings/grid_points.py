@@ -1,4 +1,4 @@
-"""Points of a grid that lie within a patch of postures."""
+"""Points of a grid that lie within a patch of a workspace."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,25 +6,26 @@ from numpy.typing import NDArray
 from crane.common.samples import Array
 from crane.motion.workspaces.workspace_patch import WorkspacePatch
 
-_EXTRAPOLATION_SHARE = 0.5  # of a triangle at a patch's border, that a posture is sought beyond it
-_TRIANGLE_TOLERANCE = 1e-9  # of a triangle
+_EXTRAPOLATION_SHARE = 0.5  # of a triangle, by which triangles at a patch's border are extended
+_TRIANGLE_TOLERANCE = 1e-9  # share of a triangle
 
 
 def grid_points_in_patch(
     patch: WorkspacePatch, node_positions: Array, axes: tuple[Array, Array]
 ) -> tuple[NDArray[np.intp], Array]:
-    """Points of a grid within a patch, and postures close to them.
+    """Find the points of a grid within a patch, and configurations close to them.
 
-    A cell is two triangles, between whose corners postures are interpolated. Those of cells at the
-    border, and at folds, reach beyond it, where the patch ends or turns back in a curve.
+    Each cell of the patch is split into two triangles, within which configurations are
+    interpolated. Triangles at the border of the patch and at folds are extended, because there
+    the patch ends, or turns back, in a curve.
 
     Args:
         patch: The patch.
-        node_positions: (a, b, 2) where its nodes are in the section, NaN where open.
-        axes: Coordinates of the grid.
+        node_positions: (a, b, 2) positions of its nodes in the section [m]; NaN where open.
+        axes: Coordinates of the grid [m].
 
     Returns:
-        (M,) indices of points, the first coordinate fastest, and (M, nq) postures.
+        (M,) indices of points, the first coordinate fastest, and (M, nq) configurations.
     """
     corner_slices = ((slice(-1), slice(-1)), (slice(1, None), slice(-1)),
               (slice(1, None), slice(1, None)), (slice(-1), slice(1, None)))  # fmt: skip
@@ -49,27 +50,19 @@ def grid_points_in_patch(
 
 
 def _is_unfolded_cell(node_positions: Array) -> NDArray[np.bool_]:
-    """Which cells (a - 1, b - 1) are turned the same way as those beside them: not at a fold."""
-    first_edges, second_edges = (
-        node_positions[1:] - node_positions[:-1],
-        node_positions[:, 1:] - node_positions[:, :-1],
-    )
-    first, second = first_edges[:, :-1], second_edges[:-1]
+    """Return which cells (a - 1, b - 1) have the orientation of their neighbours: no fold."""
+    first = (node_positions[1:] - node_positions[:-1])[:, :-1]
+    second = (node_positions[:, 1:] - node_positions[:, :-1])[:-1]
     orientations = np.sign(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
-    padded_orientations = np.pad(orientations, 1, mode="edge")
-    neighbour_orientations = (
-        padded_orientations[:-2, 1:-1],
-        padded_orientations[2:, 1:-1],
-        padded_orientations[1:-1, :-2],
-        padded_orientations[1:-1, 2:],
-    )
-    return np.all([orientations == x for x in neighbour_orientations], axis=0)
+    padded = np.pad(orientations, 1, mode="edge")
+    neighbours = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
+    return np.all([orientations == x for x in neighbours], axis=0)
 
 
 def _grid_points_in_triangles(
     corners: Array, configurations: Array, extrapolation_shares: Array, axes: tuple[Array, Array]
 ) -> tuple[NDArray[np.intp], Array]:
-    """Points of a grid within triangles (T, 3, 2), and postures between those of the corners."""
+    """Return the points of a grid within triangles (T, 3, 2), and interpolated configurations."""
     lower, upper = corners.min(axis=1), corners.max(axis=1)
     margin = extrapolation_shares[:, None] * (upper - lower)
     first_indices = [np.searchsorted(x, lower[:, k] - margin[:, k]) for k, x in enumerate(axes)]

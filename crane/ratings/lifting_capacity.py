@@ -1,35 +1,44 @@
-"""Lifting capacity: the largest load at every place, and what ends it."""
+"""Lifting capacity over radius and height, and lifting and slewing torque."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
+from crane.common import one_line_repr
+from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
+from crane.common.units import format_quantity
+from crane.dynamics.statics import StaticsEvaluator
 from crane.machine import Machine
-from crane.ratings.capacity_report import to_markdown
-from crane.ratings.chamber_pressures import chamber_pressures
+from crane.motion.workspaces.workspace_section import find_slewing_joint
+from crane.ratings.capacity_report import LoadTable, load_table, to_markdown
 from crane.ratings.configuration_search import ConfigurationSearch
-from crane.ratings.holding_forces import buckling_margins
-from crane.ratings.load_tables import LoadTable, load_table
-from crane.ratings.pin_forces import pin_forces
-from crane.ratings.rating_chart import RatingChart, compute_chart, configuration_search
-from crane.ratings.rating_rules import Rule, find_rule
-from crane.ratings.unit_actions import gravity_action
+from crane.ratings.drive_force_limits import DriveForceLimits, drive_force_limits
+from crane.ratings.load_effects import buckling_margins, chamber_pressures, pin_forces
+from crane.ratings.rating_chart import (
+    RatingChart,
+    compute_chart,
+    configuration_search,
+    rating_conditions,
+)
+from crane.ratings.rating_rules import MAX_GROUND_SLOPE, Rule, find_rule, gravity_action
+from crane.ratings.strokes import find_pivot
 
-_MAX_GROUND_SLOPE = np.deg2rad(45.0)
+_STROKE_STEPS = 200  # steps of the stroke over which the gross torque is sampled
+_HEIGHT_TOLERANCE = 1e-3  # share of the reach
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Capacity(RatingChart):
-    """Rated loads over reach and height [kg], see `RatingChart`."""
+    """Rated loads over radius and height [kg], see `RatingChart`."""
 
     quantity: ClassVar[tuple[str, str]] = ("load", "kg")
 
     def _one_line(self) -> str:
-        """The range of its loads and places."""
         loads = self.loads[np.isfinite(self.loads)]
         range_text = f"{loads.min():.4g} to {loads.max():.4g} kg" if len(loads) else "no load"
         return (
@@ -39,70 +48,55 @@ class Capacity(RatingChart):
 
     @property
     def loads(self) -> Array:
-        """(s, b, a) rated loads [kg]: its values."""
+        """(s, b, a) rated loads [kg], the same as `values`."""
         return self.values
 
     @property
     def raising_joints(self) -> tuple[str, ...]:
-        """Joints whose drives raise the load; others hold."""
+        """Joints whose drives raise the load; all others hold."""
         return self.working_joints
 
     def file_notes(self) -> dict[str, str]:
-        """Its rule."""
+        """Return the rule for the head of a file."""
         return {"rule": self.rule.description}
 
     def pressures(self) -> dict[str, Array]:
-        """Pressures that hold the rated loads, see `crane.ratings.chamber_pressures`.
+        """Compute the pressures that hold the rated loads.
 
         Returns:
-            By joint (s, b, a, 2) of its chambers A and B [Pa].
+            By joint (s, b, a, 2) for chambers A and B [Pa], see
+            `crane.ratings.load_effects.chamber_pressures`.
         """
         return chamber_pressures(self)
 
     def pin_forces(self) -> dict[str, Array]:
-        """Forces in the pins under the rated loads, see `crane.ratings.pin_forces`.
+        """Compute the forces in the pins under the rated loads.
 
         Returns:
-            By joint and loop (s, b, a) [N].
+            By joint and loop (s, b, a) [N], see `crane.ratings.load_effects.pin_forces`.
 
         Raises:
-            InputError: The ground leans.
+            InputError: The ground slopes.
         """
         return pin_forces(self)
 
     def buckling(self) -> dict[str, Array]:
-        """Loads that buckle the cylinders over the forces that press them under the rated loads.
+        """Compute the margins to buckling of the cylinders under the rated loads.
 
         Returns:
-            By cylinder (s, b, a), infinite where it is pulled, see `crane.ratings.holding_forces`.
+            By cylinder (s, b, a), the buckling force over the pressing force; infinite where the
+            cylinder is pulled, see `crane.ratings.load_effects.buckling_margins`.
         """
         return buckling_margins(self)
 
     @cached_property
     def table(self) -> LoadTable:
-        """Its table at round steps, as manuals print it."""
+        """Load table at round steps, as in manuals."""
         return load_table(self)
 
-    def at_positions(self, radii: Sequence[float], heights: Sequence[float]) -> "Capacity":
-        """The same at other places, see `capacity`."""
-        slews = None if self.section.slewing_joint is None else self.slews.tolist()
-        return compute_chart(
-            Capacity,
-            self.machine,
-            self.places,
-            self.action,
-            self.rule,
-            self.raising_joints,
-            ground_slope=self.ground_slope,
-            with_friction=self.with_friction,
-            slews=slews,
-            radii=radii,
-            heights=heights,
-        )
-
     def to_markdown(self) -> str:
-        """What the loads hold for, their table as manuals print it, and what ends them."""
-        return to_markdown(self)
+        """Return the conditions, the load table and the limiting factors as Markdown."""
+        return to_markdown(self, self.table)
 
 
 def capacity(
@@ -118,36 +112,37 @@ def capacity(
     radii: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
 ) -> Capacity:
-    """The largest load that a machine holds at rest, all over its reach.
+    """Compute the largest load that a machine holds at rest, over its whole reach.
 
-    Of each place the least over all causes: the pressure of each cylinder, its own or that which
-    its closed valve holds, or a motor's torque; tipping over each line between its supports; the
-    limits of its pins, on level ground. What the machine carries already belongs to it. Where
-    several postures reach a place it is the one that carries most.
+    At each position the load is the smallest over all limiting factors: the pressure of each
+    cylinder, given by its pump or held by its closed valve, or the torque of a motor; tipping
+    over each line between supports; and the capacities of pins, on level ground. What the machine
+    already carries is part of the machine. If several configurations reach a position, the one
+    with the largest load counts.
 
     Args:
-        machine: With hydraulics, or limits of `effort` in its URDFs.
-        frame: Where the load hangs; the tip if not given.
-        rule: One of `RULES`, or shares of your own.
-        raising: Joints whose drives raise the load, at the pressure of their pump, while others
-            hold it behind closed valves. All if not given, or by the rule the one that moves
-            most.
-        slews: Angles of the slewing joint [rad]; home and a quarter turn from it if not given
-            where the machine can tip, else home.
-        slope: Of the ground, towards whichever side is worst [rad].
-        friction: Whether drives that raise have to overcome their joints' friction.
-        step: Between places [m].
-        radii: First coordinates of the places [m], in place of steps.
-        heights: Second coordinates [m].
+        machine: A machine with hydraulics, or with `effort` limits in its URDFs.
+        frame: Link at which the load hangs; the tip by default.
+        rule: A name in `RULES`, or a `Rule`.
+        raising: Joints whose drives raise the load at the pressure of their pump, while all
+            others hold it behind closed valves. By default all, or, if the rule says so, the one
+            that moves the load most.
+        slews: Angles of the slewing joint [rad]. By default home and a quarter turn from home if
+            the machine can tip, else home.
+        slope: Slope of the ground, in the worst direction [rad].
+        friction: Whether drives that raise have to overcome the friction of their joints.
+        step: Distance between positions [m].
+        radii: First coordinates of the positions, in place of a step [m].
+        heights: Second coordinates of the positions, in place of a step [m].
 
     Raises:
-        InputError: An unknown rule, frame or joint, nothing that limits a load, limits of pins on
-            ground that leans, or a frame that two to four strokes do not move in a plane through
-            the slewing axis.
+        InputError: A rule, frame or joint is unknown, nothing limits the load, pins have limits
+            and the ground slopes, or the frame is not moved by two to four strokes in a plane
+            through the slewing axis.
     """
     rule = find_rule(rule)
     slope = max(
-        abs(as_number(slope, "the slope", "rad", max_magnitude=_MAX_GROUND_SLOPE)),
+        abs(as_number(slope, "the slope", "rad", max_magnitude=MAX_GROUND_SLOPE)),
         rule.min_ground_slope,
     )
     search = configuration_search(machine, frame)
@@ -155,17 +150,176 @@ def capacity(
         raising = (
             [find_raising_joint(search)] if rule.only_raising_drive else machine.driven_joints
         )
+    conditions = rating_conditions(
+        search, gravity_action(machine), rule, raising, ground_slope=slope, with_friction=friction
+    )
     return compute_chart(
-        Capacity, machine, search, gravity_action(machine), rule, raising, ground_slope=slope,
-        with_friction=friction, slews=slews, step=step, radii=radii, heights=heights,
-    )  # fmt: skip
+        Capacity, conditions, slews=slews, step=step, radii=radii, heights=heights
+    )
 
 
 def find_raising_joint(search: ConfigurationSearch) -> str:
-    """The drive that carries most: whose stroke moves the machine's first moment farthest."""
-    machine, strokes = search.machine, search.moving
+    """Return the joint whose stroke changes the machine's first moment most."""
+    machine = search.machine
     statics = search.statics.evaluate(machine.home[None])
-    moment_changes = np.linalg.norm(statics.moment_jacobian[0], axis=0) * (
-        search.high - search.low
+    changes = np.linalg.norm(statics.moment_jacobian[0], axis=0) * (search.high - search.low)
+    return machine.active[max(search.moving, key=lambda i: changes[i])]
+
+
+class Torques(NamedTuple):
+    """Torques of a crane's drives about its axes.
+
+    Attributes:
+        raising_joint: Joint whose drive raises the boom.
+        pivot_joint: Joint that this drive turns.
+        gross_torque: Largest torque of the drive about the pivot, own weight included [N m].
+        gross_stroke: Stroke at which the gross torque is reached [m].
+        radius: Distance from the slewing axis for the net torque [m].
+        load: Largest load at this distance, over all heights [kg].
+        height: Height of this load [m].
+        net_torque: Torque of this load about the slewing axis, load * g * radius [N m].
+        slewing_torque: Torque of the slewing drive [N m]; NaN if nothing slews.
+    """
+
+    raising_joint: str
+    pivot_joint: str
+    gross_torque: float
+    gross_stroke: float
+    radius: float
+    load: float
+    height: float
+    net_torque: float
+    slewing_torque: float
+
+    def __repr__(self) -> str:
+        """Return the torques in one line."""
+        texts = [f"gross {format_quantity(self.gross_torque, 'N m', 4)} of '{self.raising_joint}'"]
+        texts.append(f"net {format_quantity(self.net_torque, 'N m', 4)} at {self.radius:g} m")
+        if np.isfinite(self.slewing_torque):
+            texts.append(f"slewing {format_quantity(self.slewing_torque, 'N m', 4)}")
+        return f"Torques({', '.join(texts)})"
+
+    def _repr_html_(self) -> str | None:
+        return one_line_repr.to_html(self)
+
+    def to_markdown(self) -> str:
+        """Return a table of the torques with their definitions."""
+        gross = (f"of {self.raising_joint} about {self.pivot_joint}, at its best stroke of "
+                 f"{self.gross_stroke:.4g}")  # fmt: skip
+        net = f"of {self.load:.0f} kg, the most there, {self.height:.2f} m high"
+        rows = [
+            ("lifting torque, gross", self.gross_torque, gross),
+            (f"lifting torque, net at {self.radius:g} m", self.net_torque, net),
+        ]
+        if np.isfinite(self.slewing_torque):
+            rows.append(("slewing torque", self.slewing_torque, "of its drive"))
+        lines = [f"| {name} | {torque / 1e3:.1f} | {text} |" for name, torque, text in rows]
+        return "\n".join(["", "| | kN m | |", "| --- | ---: | --- |", *lines, ""])
+
+
+def torques(
+    machine: Machine,
+    frame: str | None = None,
+    *,
+    radius: float = 4.0,
+    rule: str | Rule = "none",
+    raising: Collection[str] | None = None,
+    slews: Sequence[float] | None = None,
+    slope: float = 0.0,
+    friction: bool = False,
+) -> Torques:
+    """Compute gross and net lifting torque, and slewing torque.
+
+    With the force F of the drive that raises and the angle phi of its pivot, virtual work gives
+    the gross torque F dX/dphi; the result is its largest value over the stroke. The net torque is
+    that of the largest load at a radius, whatever limits the load.
+
+    Args:
+        machine: The machine.
+        frame: Link at which the load hangs; the tip by default.
+        radius: Radius of the net torque [m].
+        rule: Rating rule of the load, see `capacity`.
+        raising: Joints whose drives raise the load, see `capacity`.
+        slews: Angles of the slewing joint, see `capacity` [rad].
+        slope: Slope of the ground, see `capacity` [rad].
+        friction: Whether drives that raise overcome friction.
+
+    Raises:
+        InputError: No drive raises a load, or the frame does not reach the radius.
+    """
+    radius = as_number(radius, "the radius", "m", greater_than=0.0)
+    statics = StaticsEvaluator(machine, frame)
+    search = ConfigurationSearch(statics)
+    joint = find_raising_joint(search)
+    limits = {
+        x.joint: x
+        for x in drive_force_limits(
+            machine, machine.driven_joints if raising is None else raising, friction
+        )
+    }
+    if joint not in limits:
+        raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
+    pivot_joint = find_pivot(machine, statics.frame, machine.active.index(joint))
+    gross_torque, stroke = _gross_torque(search, limits[joint], pivot_joint)
+    slewing, slewing_torque = find_slewing_joint(machine, statics.frame), np.nan
+    if slewing is not None and machine.active[slewing[0]] in limits:
+        drive = limits[machine.active[slewing[0]]]
+        slewing_torque = min(drive.max_force, -drive.min_force)
+    options = {
+        "rule": rule, "raising": raising, "slews": slews, "slope": slope, "friction": friction,
+    }  # fmt: skip
+    load, height = _largest_load_at_radius(
+        machine, statics.frame, radius, options, search.section_positions
     )
-    return machine.active[max(strokes, key=lambda i: moment_changes[i])]
+    weight = float(np.linalg.norm(machine.model.gravity.linear))
+    return Torques(
+        joint, pivot_joint, gross_torque, stroke, radius, load, height, load * weight * radius,
+        slewing_torque,
+    )  # fmt: skip
+
+
+def _gross_torque(
+    search: ConfigurationSearch, drive: DriveForceLimits, pivot_joint: str
+) -> tuple[float, float]:
+    """Return the largest torque of a drive about a pivot [N m], and its stroke [m]."""
+    machine, i = search.machine, drive.active_index
+    column = machine.column(pivot_joint)
+
+    def torque(stroke: float) -> float:
+        q_a = machine.home[machine.closure.active].copy()
+        q_a[i] = stroke
+        rate = float(machine.closure.gamma(machine.closure.solve(q_a))[column, i])
+        statics = search.statics.evaluate(machine.closure.solve(q_a)[None])
+        load_forces = statics.tip_load_forces(machine.model.gravity.linear)
+        return abs((drive.max_force if load_forces[0, i] > 0 else drive.min_force) / rate)
+
+    strokes = np.linspace(search.low[i], search.high[i], _STROKE_STEPS + 1)
+    values = np.array([torque(x) for x in strokes])
+    best = int(values.argmax())
+    interval = strokes[max(best - 1, 0)], strokes[min(best + 1, _STROKE_STEPS)]
+    optimum = minimize_scalar(lambda x: -torque(x), bounds=interval, method="bounded",
+                              options={"xatol": 1e-9})  # fmt: skip
+    grid_optimum = float(values[best]), float(strokes[best])
+    return max(grid_optimum, (-float(optimum.fun), float(optimum.x)))
+
+
+def _largest_load_at_radius(
+    machine: Machine, frame: str, radius: float, options: dict[str, Any], reach: Array
+) -> tuple[float, float]:
+    """Return the largest load at a radius [kg], and its height [m]."""
+    lower, upper = reach.min(axis=0), reach.max(axis=0)
+    if not lower[0] <= radius <= upper[0]:
+        raise InputError(
+            f"'{frame}' reaches from {lower[0]:.3g} to {upper[0]:.3g} m, not {radius:g} m"
+        )
+    heights = np.linspace(lower[1], upper[1], 61)
+    for _ in range(3):  # refine around the best height
+        chart = capacity(machine, frame, radii=[radius], heights=heights.tolist(), **options)
+        loads = np.where(np.isnan(chart.loads), np.inf, chart.loads)
+        smallest = np.nanmin(loads, axis=0)[:, 0]
+        loads = np.where(np.isfinite(smallest), smallest, -np.inf)
+        best, step = int(loads.argmax()), heights[1] - heights[0]
+        if step < _HEIGHT_TOLERANCE * (upper[1] - lower[1]):
+            break
+        heights = np.linspace(heights[best] - step, heights[best] + step, 21)
+    return float(loads[best]), float(heights[best])

@@ -1,32 +1,32 @@
-"""What ends a load or a force: drives, tipping lines, and pins."""
+"""Limits of a load or force at a frame: drives, tipping lines and pins."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from crane.common.errors import InputError
+from crane.common.result import Result
 from crane.common.samples import Array
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.dynamics.tipping_stability import TippingStability, has_supports
 from crane.machine import Machine
-from crane.motion.workspaces.workspace_section import up_direction
-from crane.ratings.conic_limits import largest_feasible_magnitude
-from crane.ratings.drive_force_limits import DriveForceLimits
-from crane.ratings.pin_forces import PinForces
-from crane.ratings.rating_rules import Rule
-from crane.ratings.unit_actions import UnitAction
+from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
+from crane.ratings.configuration_search import ConfigurationSearch
+from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits
+from crane.ratings.rating_rules import Rule, UnitAction
 
 TIPPING, PIN_FORCE = "tips", "pin force"
 
 
 class LimitingFactor(NamedTuple):
-    """What may end a load.
+    """One limit of a load.
 
     Attributes:
-        element: Joint or loop, or tipping line "A to B".
+        element: Name of a joint or loop, or of a tipping line, "A to B".
         reason: Such as "working pressure", "tips" or "pin force".
-        rated_share: Of the load at its end that counts.
+        rated_share: Share of the limit that counts as rated load.
     """
 
     element: str
@@ -34,23 +34,21 @@ class LimitingFactor(NamedTuple):
     rated_share: float
 
     def __str__(self) -> str:
-        """In words."""
-        return (
-            f"{self.reason} over {self.element}"
-            if self.reason == TIPPING
-            else f"{self.element}: {self.reason}"
-        )
+        """Description for reports."""
+        if self.reason == TIPPING:
+            return f"{self.reason} over {self.element}"
+        return f"{self.element}: {self.reason}"
 
 
 class LimitBound(NamedTuple):
-    """One end of what a cause lets: a + b m + |c + d m| <= 0.
+    """One bound of a limiting factor: a + b x + |c + d x| <= 0 with the load or force x.
 
     Attributes:
-        factor_index: Its index.
-        drive: Whose force it is, None for a line or a pin.
-        tipping_line: About which, None for a drive or a pin.
-        sign: 1 of the most that a drive pushes, -1 of the most that it pulls, and of lines.
-        pin_index: Its index among those with a limit, None for a drive or a line.
+        factor_index: Index of the limiting factor.
+        drive: Drive whose force is bounded; None for a tipping line or a pin.
+        tipping_line: Tipping line; None for a drive or a pin.
+        sign: 1 for the pushing force of a drive, -1 for its pulling force and for tipping lines.
+        pin_index: Index among the pins with a limit; None for a drive or a tipping line.
     """
 
     factor_index: int
@@ -61,39 +59,39 @@ class LimitBound(NamedTuple):
 
 
 class LoadLimits:
-    """The load or force at a frame that a machine holds, cause by cause, at rest.
+    """Largest load or force at a frame of a machine at rest, by limiting factor.
 
-    With x its magnitude and e what acts on the frame per magnitude (gravity g of a load in kg, a
-    unit vector of a force in N), drives have to hold it and the machine's weight, tipping lines
-    have to keep their moment,
+    With the load or force x and its unit action e (gravity g for a load in kg, a unit vector for
+    a force in N), the drives have to hold the load and the weight of the machine, and the moment
+    about each tipping line has to keep its sign,
 
-        least <= tau(x) <= most,   tau(x) = -(ds/dq)^T g - x (dp/dq)^T e - gamma^T f,
+        tau_min <= tau(x) <= tau_max,   tau(x) = -(ds/dq)^T g - x (dp/dq)^T e - gamma^T f,
         w . [(s - M p_1) x -g + x (p - p_1) x -e] >= 0,
 
-    with the first moment s and the mass M of the machine, the frame's place p, and w the direction
-    of a line through p_1, as in `TippingStability`. On a slope g leans by its angle to any side:
-    what is least over all sides is a cone in x, see `crane.ratings.conic_limits`. So is a pin's
-    limit,
+    with the first moment s and the mass M of the machine, the position p of the frame, and the
+    direction w of a tipping line through p_1, as in `TippingStability`. On sloping ground g leans
+    by the slope to any side; the smallest value over all sides is a cone in x, see
+    `largest_feasible_magnitude`. The limit of a pin is a cone, too,
 
         |R_0 + x R_1| <= R_max,
 
-    with its force R_0 without load and what a load adds per kg; of loads on level ground alone.
+    with its force R_0 without load and the increase R_1 per kg; for loads on level ground only.
 
     Args:
-        statics: The machine and the frame.
-        drive_limits: Of its drives.
-        rule: What share counts.
-        action: What acts on the frame.
-        ground_slope: Of the ground [rad].
-        with_weight: Whether the machine has its weight; without, nothing tips.
+        statics: Evaluates the machine and the frame.
+        drive_limits: Force limits of the drives.
+        rule: Rule of the shares that count.
+        action: Unit action at the frame.
+        ground_slope: Slope of the ground [rad].
+        with_weight: Whether the machine has weight; without weight it does not tip.
 
     Attributes:
-        factors: The causes.
-        bounds: Their ends.
+        factors: Limiting factors.
+        bounds: Bounds of the limiting factors.
 
     Raises:
-        InputError: Pins have limits and the ground leans, or statics does not determine their
-            forces.
+        InputError: Pins have limits and the ground slopes, or statics does not determine the
+            force of a pin that has a limit.
     """
 
     def __init__(
@@ -109,49 +107,42 @@ class LoadLimits:
         self.action, self._up_direction = action, up_direction(machine)
         weight = with_weight * float(np.linalg.norm(machine.model.gravity.linear))
         self._slope_tangent = np.tan(ground_slope)
-        self._vertical_gravity, self._lateral_gravity = (
-            weight * np.cos(ground_slope),
-            weight * np.sin(ground_slope),
-        )
-        drives, line_list = list(drive_limits), list(tipping_lines(machine)) if with_weight else []
-        pin_capacities = machine.pin_capacities if action.is_weight else {}
-        if pin_capacities and ground_slope:
+        self._vertical_gravity = weight * np.cos(ground_slope)
+        self._lateral_gravity = weight * np.sin(ground_slope)
+        drives, lines = list(drive_limits), list(tipping_lines(machine)) if with_weight else []
+        capacities = machine.pin_capacities if action.is_weight else {}
+        if capacities and ground_slope:
             raise InputError(
-                f"pins of '{machine.name}' are rated on level ground, and this leans by "
+                f"pins of '{machine.name}' are rated on level ground, but the ground slopes by "
                 f"{np.rad2deg(ground_slope):.3g} degrees: rate without slope, or leave 'pins' out"
             )
-        self._pin_forces = (
-            PinForces(machine, statics.frame, pin_capacities) if pin_capacities else None
-        )
-        self._pin_capacities = list(pin_capacities.values())
+        self._pin_forces = PinForces(machine, statics.frame, capacities) if capacities else None
+        self._pin_capacities = list(capacities.values())
         self.factors = tuple(
             [LimitingFactor(x.joint, x.limit_kind, rule.hydraulic) for x in drives]
-            + [LimitingFactor(x.name, TIPPING, rule.tipping) for x in line_list]
-            + [LimitingFactor(name, PIN_FORCE, rule.structural) for name in pin_capacities]
+            + [LimitingFactor(x.name, TIPPING, rule.tipping) for x in lines]
+            + [LimitingFactor(name, PIN_FORCE, rule.structural) for name in capacities]
         )
+        pin_offset = len(drives) + len(lines)
         self.bounds = [
-            LimitBound(k, drive, None, sign)
-            for k, drive in enumerate(drives)
-            for sign in (1.0, -1.0)
+            *(LimitBound(k, x, None, sign) for k, x in enumerate(drives) for sign in (1.0, -1.0)),
+            *(LimitBound(k, None, x, -1.0) for k, x in enumerate(lines, start=len(drives))),
+            *(LimitBound(pin_offset + k, None, None, 1.0, k) for k in range(len(capacities))),
         ]
-        self.bounds += [
-            LimitBound(k, None, x, -1.0) for k, x in enumerate(line_list, start=len(drives))
-        ]
-        pin_offset = len(drives) + len(line_list)
-        self.bounds += [
-            LimitBound(pin_offset + k, None, None, 1.0, k) for k in range(len(pin_capacities))
-        ]
-        self.rated_shares = np.array([cause.rated_share for cause in self.factors])
+        self.rated_shares = np.array([factor.rated_share for factor in self.factors])
 
     def max_magnitudes(
         self, statics: StaticQuantities, angles: Array | None = None, q: Array | None = None
     ) -> Array:
-        """The magnitude (N, K) [kg], [N] of each cause, times its share; infinite without end.
+        """Return the rated load or force (N, K) by limiting factor [kg], [N].
 
         Args:
             statics: The machine at rest.
-            angles: (N,) by which it is slewed from home; 0 if not given.
-            q: (N, nq) its postures, which pins need.
+            angles: (N,) slew angles from home [rad]; 0 by default.
+            q: (N, nq) configurations; required if pins have limits.
+
+        Returns:
+            Largest load or force times the rated share; infinite where it has no limit.
         """
         pin_forces = self.pin_loads(statics, angles, q)
         out = np.full((len(statics.total_mass), len(self.factors)), np.inf)
@@ -159,16 +150,15 @@ class LoadLimits:
             statics, np.zeros(len(statics.total_mass)) if angles is None else angles
         )
         for bound in self.bounds:
-            magnitude = self.bound_magnitude(
-                bound, self.bound_coefficients(bound, statics, unit, pin_forces)
-            )
+            coefficients = self.bound_coefficients(bound, statics, unit, pin_forces)
+            magnitude = self.bound_magnitude(bound, coefficients)
             out[:, bound.factor_index] = np.minimum(out[:, bound.factor_index], magnitude)
         return np.asarray(out * self.rated_shares)
 
     def pin_loads(
         self, statics: StaticQuantities, angles: Array | None = None, q: Array | None = None
     ) -> tuple[Array, Array] | None:
-        """Forces (N, p, 3) of pins with limits, without load and per kg; None without limits."""
+        """Return forces (N, p, 3) of pins with limits, without load and per kg; None if none."""
         if self._pin_forces is None:
             return None
         assert q is not None
@@ -176,12 +166,9 @@ class LoadLimits:
         return self._pin_forces.load_forces(q, self.action.unit_vectors(statics, angles))
 
     def bound_magnitude(self, bound: LimitBound, coefficients: tuple[Array, ...]) -> Array:
-        """The magnitude (N,) at which a bound of these terms ends."""
-        a, b, c, d = coefficients
+        """Return the load or force (N,) at which a bound with these coefficients is reached."""
         is_cone = self._lateral_gravity or bound.pin_index is not None
-        return (
-            largest_feasible_magnitude(a, b, c, d) if is_cone else largest_feasible_magnitude(a, b)
-        )
+        return largest_feasible_magnitude(*(coefficients if is_cone else coefficients[:2]))
 
     def bound_coefficients(
         self,
@@ -190,22 +177,19 @@ class LoadLimits:
         unit: Array,
         pin_forces: tuple[Array, Array] | None = None,
     ) -> tuple[Array, ...]:
-        """What a bound's a, b (N,), c and d (N, 3) are: a + b x + |c + d x| <= 0.
+        """Return a, b (N,), c and d (N, 3) of a bound a + b x + |c + d x| <= 0.
 
         Args:
             bound: One of `bounds`.
             statics: The machine at rest.
-            unit: (N, 3) of what acts, see `UnitAction`.
-            pin_forces: See `pin_loads`.
+            unit: (N, 3) unit action e.
+            pin_forces: Result of `pin_loads`.
         """
         if bound.pin_index is not None:
             assert pin_forces is not None
             zeros = np.zeros(len(statics.total_mass))
-            return (
-                zeros - self._pin_capacities[bound.pin_index],
-                zeros,
-                *(x[:, bound.pin_index] for x in pin_forces),
-            )
+            capacity = self._pin_capacities[bound.pin_index]
+            return zeros - capacity, zeros, *(x[:, bound.pin_index] for x in pin_forces)
         weight_lever, action_lever, constant_part = self._lever_arms(bound, statics, 1.0)
         return self._sum_coefficients(bound, weight_lever, constant_part, [(action_lever, unit)])
 
@@ -216,12 +200,10 @@ class LoadLimits:
         derivatives: StaticQuantities,
         angles: Array | None = None,
     ) -> tuple[Array, ...]:
-        """Derivatives of `bound_coefficients`, pins left out, by one parameter."""
+        """Return the derivatives of `bound_coefficients` by one parameter; not for pins."""
         angles = np.zeros(len(statics.total_mass)) if angles is None else angles
-        unit, unit_derivatives = (
-            self.action.unit_vectors(statics, angles),
-            self.action.unit_derivatives(statics, derivatives, angles),
-        )
+        unit = self.action.unit_vectors(statics, angles)
+        unit_derivatives = self.action.unit_derivatives(statics, derivatives, angles)
         weight_lever, action_lever, constant_part = self._lever_arms(bound, derivatives, 0.0)
         pairs = [
             (action_lever, unit),
@@ -236,53 +218,95 @@ class LoadLimits:
         constant_part: Array,
         pairs: list[tuple[Array, Array]],
     ) -> tuple[Array, ...]:
-        """With pairs of levers and units whose products are summed."""
+        """Return a, b, c, d with the products of pairs (lever, unit action) summed."""
         vertical_levers = weight_lever @ self._up_direction
-        a, c = (
-            self._vertical_gravity * vertical_levers,
-            self._lateral_gravity * (weight_lever - vertical_levers[:, None] * self._up_direction),
-        )
+        a = self._vertical_gravity * vertical_levers
+        c = self._lateral_gravity * (weight_lever - vertical_levers[:, None] * self._up_direction)
         b, d = np.zeros(len(vertical_levers)), np.zeros_like(c)
         for action_lever, unit in pairs:
-            if self.action.is_weight:  # of a load, which leans with the ground
-                downward_parts = -(unit @ self._up_direction) / np.hypot(1.0, self._slope_tangent)
-                vertical_levers = action_lever @ self._up_direction
-                b = b + downward_parts * vertical_levers
-                d = d + self._slope_tangent * downward_parts[:, None] * (
-                    action_lever - vertical_levers[:, None] * self._up_direction
-                )
-            else:
+            if not self.action.is_weight:
                 b = b - (action_lever * unit).sum(axis=1)
+                continue
+            # the weight of a load leans with the ground
+            downward_parts = -(unit @ self._up_direction) / np.hypot(1.0, self._slope_tangent)
+            vertical_levers = action_lever @ self._up_direction
+            b = b + downward_parts * vertical_levers
+            d = d + self._slope_tangent * downward_parts[:, None] * (
+                action_lever - vertical_levers[:, None] * self._up_direction
+            )
         return bound.sign * (a + constant_part), bound.sign * b, c, d
 
     def _lever_arms(
         self, bound: LimitBound, statics: StaticQuantities, constant_factor: float
     ) -> tuple[Array, Array, Array]:
-        """Of the weight (N, 3), of what acts (N, 3), and the rest (N,).
+        """Return the levers of the weight and of the action (N, 3), and the constant part (N,).
 
-        Linear in `statics` but for what stands still, which is left out of derivatives.
+        All are linear in `statics` except for constants, which `constant_factor` 0 leaves out of
+        derivatives.
         """
         if bound.drive is not None:
             i = bound.drive.active_index
-            constant_part = -statics.passive_forces[:, i]
-            constant_part = constant_part - constant_factor * (
-                bound.drive.max_force if bound.sign > 0 else bound.drive.min_force
-            )
+            limit = bound.drive.max_force if bound.sign > 0 else bound.drive.min_force
+            constant_part = -statics.passive_forces[:, i] - constant_factor * limit
             return statics.moment_jacobian[:, :, i], statics.tip_jacobian[:, :, i], constant_part
         assert bound.tipping_line is not None
-        line_point, direction = bound.tipping_line.point, bound.tipping_line.direction
-        weight_lever = np.cross(
-            direction, statics.first_moment - statics.total_mass[:, None] * line_point
-        )
+        point, direction = bound.tipping_line.point, bound.tipping_line.direction
         return (
-            weight_lever,
-            np.cross(direction, statics.tip_positions - constant_factor * line_point),
+            np.cross(direction, statics.first_moment - statics.total_mass[:, None] * point),
+            np.cross(direction, statics.tip_positions - constant_factor * point),
             np.zeros(len(statics.total_mass)),
         )
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class RatingConditions(Result):
+    """Conditions of a rating: all that its load limits depend on.
+
+    Attributes:
+        machine: The machine.
+        places: Search for configurations that put the frame at positions of its section.
+        action: Unit action at the frame.
+        rule: Rating rule.
+        working_joints: Joints whose drives work; all others hold.
+        ground_slope: Slope of the ground [rad].
+        with_friction: Whether drives that work overcome friction.
+        with_weight: Whether the machine has weight.
+    """
+
+    machine: Machine
+    places: ConfigurationSearch
+    action: UnitAction
+    rule: Rule
+    working_joints: tuple[str, ...]
+    ground_slope: float
+    with_friction: bool
+    with_weight: bool
+
+    @property
+    def frame(self) -> str:
+        """Frame at which the load or force acts."""
+        return self.places.statics.frame
+
+    @property
+    def section(self) -> WorkspaceSection:
+        """Section in which the frame moves."""
+        return self.places.section
+
+    def drive_limits(self, machine: Machine | None = None) -> list[DriveForceLimits]:
+        """Return the force limits of the drives, also for a variant of the machine."""
+        machine = self.machine if machine is None else machine
+        return drive_force_limits(machine, self.working_joints, self.with_friction)
+
+    def load_limits(self) -> LoadLimits:
+        """Return the limits of the load or force."""
+        return LoadLimits(
+            self.places.statics, self.drive_limits(), self.rule, self.action, self.ground_slope,
+            self.with_weight,
+        )  # fmt: skip
+
+
 class TippingLine(NamedTuple):
-    """A tipping line: its name, a point on it, and its direction."""
+    """A tipping line: its name, a point on it (3,) [m], and its direction (3,)."""
 
     name: str
     point: Array
@@ -290,17 +314,53 @@ class TippingLine(NamedTuple):
 
 
 def tipping_lines(machine: Machine) -> Iterable[TippingLine]:
-    """The tipping lines of a machine whose supports stand still; none of others."""
+    """Yield the tipping lines of a machine whose supports are stationary; none for others."""
     if not has_supports(machine):
         return
     stability = TippingStability(machine)
     if not stability.is_stationary:
         return
     (points,) = stability.support_positions(machine.home[None])
-    for (first_point, second_point), names in zip(
-        stability.line_indices, stability.line_names, strict=True
-    ):
-        direction = points[second_point] - points[first_point]
-        yield TippingLine(
-            " to ".join(names), points[first_point], direction / np.linalg.norm(direction)
-        )
+    for (first, second), names in zip(stability.line_indices, stability.line_names, strict=True):
+        direction = points[second] - points[first]
+        yield TippingLine(" to ".join(names), points[first], direction / np.linalg.norm(direction))
+
+
+def largest_feasible_magnitude(
+    a: Array, b: Array, c: Array | None = None, d: Array | None = None
+) -> Array:
+    """Return the largest x >= 0 such that a + b y + |c + d y| <= 0 for all y in [0, x].
+
+    If the inequality holds at 0, x is the smallest positive root of
+
+        (b^2 - |d|^2) x^2 + 2 (a b - c.d) x + a^2 - |c|^2 = 0
+
+    at which a + b x is not positive. The two roots and the discriminant,
+    |a d - b c|^2 - |c x d|^2, are computed without cancellation.
+
+    Args:
+        a: Any shape; negative where the bound is not reached without load.
+        b: The shape of a.
+        c: The shape of a with one more axis (3,); 0 by default.
+        d: Like c.
+
+    Returns:
+        The shape of a; 0 where the inequality fails at x = 0, infinite where x has no limit.
+    """
+    if c is None or d is None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = np.where(b > 0, -a / b, np.inf)
+        return np.where(a >= 0, 0.0, out)
+    quadratic = b * b - (d * d).sum(axis=-1)
+    half_linear = a * b - (c * d).sum(axis=-1)
+    constant = a * a - (c * c).sum(axis=-1)
+    cross_terms = a[..., None] * d - b[..., None] * c  # by Lagrange's identity
+    discriminant = (cross_terms * cross_terms).sum(axis=-1) - (np.cross(c, d) ** 2).sum(axis=-1)
+    root, is_real = np.sqrt(np.maximum(discriminant, 0.0)), discriminant >= 0
+    stable_sum = -(half_linear + np.copysign(root, half_linear))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        roots = np.stack([constant / stable_sum, stable_sum / quadratic])
+        is_valid = is_real & (roots > 0) & np.isfinite(roots)
+        is_valid &= a + b * roots <= 1e-9 * np.abs(a)
+        smallest = np.where(is_valid, roots, np.inf).min(axis=0)
+    return np.asarray(np.where(a + np.sqrt((c * c).sum(axis=-1)) >= 0, 0.0, smallest))

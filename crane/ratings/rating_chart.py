@@ -1,74 +1,62 @@
-"""The largest load or force at every place, and what ends it."""
+"""Rating charts: the largest load or force over radius and height, and its limiting factors."""
 
+import dataclasses
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import InputError
-from crane.common.result import Result
 from crane.common.samples import Array, as_number, as_sample
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.machine import Machine
-from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.ratings.configuration_search import ConfigurationSearch
-from crane.ratings.drive_force_limits import drive_force_limits
-from crane.ratings.limiting_factors import TIPPING, LimitingFactor, LoadLimits
-from crane.ratings.rating_derivatives import EQUAL, chart_derivatives
-from crane.ratings.rating_rules import Rule
+from crane.ratings.limiting_factors import (
+    TIPPING,
+    LimitingFactor,
+    LoadLimits,
+    RatingConditions,
+)
+from crane.ratings.rating_derivatives import (
+    SIMULTANEOUS_TOLERANCE,
+    RatedConfigurations,
+    rating_derivatives,
+)
+from crane.ratings.rating_rules import Rule, UnitAction, slew_angles
 from crane.ratings.strokes import check_drives
-from crane.ratings.unit_actions import UnitAction, slew_angles
 from crane.recordings.timeseries import Table, write_table
 
-_DEFAULT_CELLS = {
-    0: 100,
-    1: 75,
-    2: 40,
-}  # of the larger extent at most, by how many strokes are free
+# largest number of cells along the larger extent, by the number of free strokes
+_DEFAULT_CELLS = {0: 100, 1: 75, 2: 40}
 _ROUND_STEPS = (1.0, 2.5, 5.0, 10.0)  # multiples of a quarter, for tables by 0.5, 1, 1.5 ... m
-_DIGITS = 12  # behind the point of places
+_DIGITS = 12  # decimal places of positions
 _MAX_CELLS = 400  # cells along one axis
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RatingChart(Result):
-    """What is largest over reach and height.
+class RatingChart(RatingConditions):
+    """The largest load or force over radius and height.
 
     Attributes:
-        machine: The machine.
-        places: What is acted on, and how it gets anywhere.
-        action: What acts on it, per magnitude.
-        rule: By which it is rated.
-        working_joints: Joints whose drives work; others hold.
-        ground_slope: Of the ground [rad].
-        with_friction: Whether drives that work overcome friction.
-        with_weight: Whether the machine has its weight.
-        radii: (a,) first coordinate of the section, as a rule the distance from the slewing axis
-            [m].
+        radii: (a,) first coordinate of the section [m], usually the distance from the slewing
+            axis.
         heights: (b,) second coordinate [m].
-        slews: (s,) angles of the slewing joint [rad]; one, at home, where nothing slews.
-        limiting_factors: What may end it.
-        values: (s, b, a) magnitudes; NaN where the frame does not reach, infinite where nothing
-            ends them.
-        limiting_factor_index: (s, b, a) index of what ends it, the first of those that do
-            together;
-            -1 where nothing does.
-        values_by_factor: (s, b, a, K) magnitudes by cause.
-        q_a: (s, b, a, n) active coordinates; of all that reach the place those of the largest.
+        slews: (s,) angles of the slewing joint [rad]; one, at home, if nothing slews.
+        limiting_factors: Limiting factors.
+        values: (s, b, a) largest load [kg] or force [N]; NaN where the frame does not reach,
+            infinite where there is no limit.
+        limiting_factor_index: (s, b, a) index of the limiting factor, the first one of several
+            simultaneous ones; -1 where there is no limit.
+        values_by_factor: (s, b, a, K) values by limiting factor.
+        q_a: (s, b, a, n) active coordinates of the configuration with the largest value.
+
+    The attributes of `RatingConditions` come first.
     """
 
-    machine: Machine
-    places: ConfigurationSearch
-    action: UnitAction
-    rule: Rule
-    working_joints: tuple[str, ...]
-    ground_slope: float
-    with_friction: bool
-    with_weight: bool
     radii: Array
     heights: Array
     slews: Array
@@ -81,108 +69,99 @@ class RatingChart(Result):
     quantity: ClassVar[tuple[str, str]] = ("value", "1")
 
     @property
-    def frame(self) -> str:
-        """What is acted on."""
-        return self.places.statics.frame
-
-    @property
-    def section(self) -> WorkspaceSection:
-        """The plane of the places."""
-        return self.places.section
-
-    @property
     def active_factors(self) -> tuple[int, ...]:
-        """Indices of the causes that are the first to end it somewhere."""
-        return tuple(
-            np.unique(self.limiting_factor_index[self.limiting_factor_index >= 0]).tolist()
-        )
+        """Indices of the factors that limit the value at some position."""
+        index = self.limiting_factor_index
+        return tuple(np.unique(index[index >= 0]).tolist())
 
     @property
-    def together(self) -> NDArray[np.bool_]:
-        """(s, b, a, K) which causes end it: several where the best posture balances them."""
-        return _together(self.values_by_factor, self.values)
+    def simultaneous_factors(self) -> NDArray[np.bool_]:
+        """(s, b, a, K) which factors limit the value; several if the best configuration has."""
+        return _simultaneous_factors(self.values_by_factor, self.values)
 
     def derivatives(self, parameter_names: Sequence[str]) -> Array:
-        """Derivatives of the values by parameters, see `crane.ratings.rating_derivatives`.
+        """Compute derivatives of the values by parameters, see `rating_derivatives`.
 
         Args:
             parameter_names: Such as "boom_eye.x" or "cylinder.X_boom.area_a".
 
         Returns:
-            (s, b, a, k) per unit of each.
+            (s, b, a, k) per unit of each parameter; NaN where there is no positive finite value,
+            or where a pin limits it.
 
         Raises:
-            InputError: There is no such number, or it moves a support.
+            InputError: A parameter does not exist, or it moves a support.
         """
-        return chart_derivatives(self, parameter_names)
+        out = np.full((*self.values.shape, len(parameter_names)), np.nan)
+        s, b, a = np.nonzero(np.isfinite(self.values) & (self.values > 0))
+        rated = RatedConfigurations(self.q_a[s, b, a], self.slews[s], self.values[s, b, a])
+        out[s, b, a] = rating_derivatives(self, rated, parameter_names)
+        return out
+
+    def at_positions(self, radii: Sequence[float], heights: Sequence[float]) -> Self:
+        """Return the same rating at other radii and heights [m]."""
+        slews = None if self.section.slewing_joint is None else self.slews.tolist()
+        return compute_chart(type(self), self, slews=slews, radii=radii, heights=heights)
 
     def to_csv(self, path: str | Path) -> None:
-        """Write a row per place: slew, place, value, cause, values by cause, active coordinates.
+        """Write one row per position: slew, radius, height, value, limiting factor, coordinates.
+
+        Values by limiting factor precede the active coordinates.
 
         Raises:
             OutputError: The file cannot be written.
         """
         machine, (name, unit) = self.machine, self.quantity
         units = {
-            "slew": "rad", "radius": "m", "height": "m", name: unit, "cause": "1",
-            **{f"{name}_{_column_suffix(cause)}": unit for cause in self.limiting_factors},
+            "cause": "1",
+            **{f"{name}_{_column_suffix(factor)}": unit for factor in self.limiting_factors},
             **{joint: machine.unit(joint) for joint in machine.active},
-        }  # fmt: skip
+        }
         s, b, a = np.nonzero(np.isfinite(self.values) | (self.limiting_factor_index >= 0))
-        rows = np.column_stack(
-            [
-                self.slews[s],
-                self.radii[a],
-                self.heights[b],
-                self.values[s, b, a],
-                self.limiting_factor_index[s, b, a],
-                self.values_by_factor[s, b, a],
-                self.q_a[s, b, a],
-            ]
-        )
-        rows[~np.isfinite(rows)] = np.nan
-        notes = {"machine": machine.load_expression, "frame": self.frame, **self.file_notes()}
-        notes |= {f"cause {k}": str(cause) for k, cause in enumerate(self.limiting_factors)}
-        write_table(path, Table(units, rows, notes))
+        columns: tuple[Any, ...] = self.limiting_factor_index, self.values_by_factor, self.q_a
+        notes = {f"cause {k}": str(factor) for k, factor in enumerate(self.limiting_factors)}
+        self._write_rows(path, (s, b, a), units, [x[s, b, a] for x in columns], notes)
 
     def derivatives_to_csv(self, path: str | Path, parameter_names: Sequence[str]) -> None:
-        """Write a row per place: slew, place, value, its derivatives by numbers; empty for none.
+        """Write one row per position: slew, radius, height, value, derivatives by parameters.
 
         Raises:
             InputError: See `derivatives`.
             OutputError: The file cannot be written.
         """
         name, unit = self.quantity
-        units = {"slew": "rad", "radius": "m", "height": "m", name: unit}
-        units |= {f"{name}_by_{number}": f"{unit}/SI" for number in parameter_names}
-        s, b, a = np.nonzero(np.isfinite(self.values))
-        rows = np.column_stack(
-            [self.slews[s], self.radii[a], self.heights[b], self.values[s, b, a],
-             self.derivatives(parameter_names)[s, b, a]]
-        )  # fmt: skip
-        notes = {"machine": self.machine.load_expression, "frame": self.frame, **self.file_notes()}
-        write_table(path, Table(units, rows, notes))
+        units = {f"{name}_by_{parameter}": f"{unit}/SI" for parameter in parameter_names}
+        indices = np.nonzero(np.isfinite(self.values))
+        derivatives = self.derivatives(parameter_names)[indices]
+        self._write_rows(path, indices, units, [derivatives], {})
 
     def file_notes(self) -> dict[str, str]:
-        """What else a file of it says above its table."""
+        """Return further notes for the head of a file."""
         return {}
+
+    def _write_rows(
+        self,
+        path: str | Path,
+        indices: tuple[Any, ...],
+        units: dict[str, str],
+        columns: Sequence[Array],
+        notes: dict[str, str],
+    ) -> None:
+        name, unit = self.quantity
+        units = {"slew": "rad", "radius": "m", "height": "m", name: unit, **units}
+        s, b, a = indices
+        rows = np.column_stack(
+            [self.slews[s], self.radii[a], self.heights[b], self.values[s, b, a], *columns]
+        )
+        rows[~np.isfinite(rows)] = np.nan
+        head = {"machine": self.machine.load_expression, "frame": self.frame, **self.file_notes()}
+        write_table(path, Table(units, rows, head | notes))
 
 
 ChartType = TypeVar("ChartType", bound=RatingChart)
 
 
-def configuration_search(machine: Machine, frame: str | None) -> ConfigurationSearch:
-    """The places of a frame of a machine that one can rate.
-
-    Raises:
-        InputError: Its drives are not its active joints, or see `Places`.
-    """
-    return ConfigurationSearch(StaticsEvaluator(check_drives(machine), frame))
-
-
-def compute_chart(
-    chart_class: type[ChartType],
-    machine: Machine,
+def rating_conditions(
     search: ConfigurationSearch,
     action: UnitAction,
     rule: Rule,
@@ -191,111 +170,116 @@ def compute_chart(
     ground_slope: float = 0.0,
     with_friction: bool = False,
     with_weight: bool = True,
+) -> RatingConditions:
+    """Return `RatingConditions` with their defaults."""
+    return RatingConditions(
+        search.machine, search, action, rule, tuple(working_joints), ground_slope, with_friction,
+        with_weight,
+    )  # fmt: skip
+
+
+def configuration_search(machine: Machine, frame: str | None) -> ConfigurationSearch:
+    """Return the search for configurations of a frame that can be rated.
+
+    Raises:
+        InputError: The drives of the machine are not its active joints; or see
+            `ConfigurationSearch`.
+    """
+    return ConfigurationSearch(StaticsEvaluator(check_drives(machine), frame))
+
+
+def compute_chart(
+    chart_class: type[ChartType],
+    conditions: RatingConditions,
+    *,
     slews: Sequence[float] | None = None,
     step: float | None = None,
     radii: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
+    **attributes: Any,
 ) -> ChartType:
-    """The field of an action.
+    """Compute a rating chart.
 
     Args:
-        chart_class: What it becomes.
-        machine: The machine.
-        search: Of the frame.
-        action: What acts on it.
-        rule: By which it is rated.
-        working_joints: Joints whose drives work; others hold.
-        ground_slope: Of the ground [rad].
-        with_friction: Whether drives that work overcome friction.
-        with_weight: Whether the machine has its weight.
-        slews: See `capacity`; so the next ones.
-        step: Between places [m].
-        radii: In place of steps.
-        heights: Likewise.
+        chart_class: Class of the result.
+        conditions: Conditions of the rating.
+        slews: Angles of the slewing joint, see `capacity` [rad].
+        step: Distance between positions [m].
+        radii: Radii, in place of a step [m].
+        heights: Heights, in place of a step [m].
+        **attributes: Further attributes of the result.
 
     Raises:
         InputError: See `capacity`.
     """
-    statics = search.statics
-    load_limits = LoadLimits(
-        statics,
-        drive_force_limits(machine, working_joints, with_friction),
-        rule,
-        action,
-        ground_slope,
-        with_weight,
-    )
+    search, machine, limits = conditions.places, conditions.machine, conditions.load_limits()
     axes = _chart_axes(search, step, radii, heights)
-    can_tip = any(cause.reason == TIPPING for cause in load_limits.factors)
+    can_tip = any(factor.reason == TIPPING for factor in limits.factors)
     slew_coordinates = _slew_coordinates(machine, search, slews, can_tip)
     configurations = search.find_all(axes)
     if not len(configurations.position_index):
-        raise InputError(f"'{statics.frame}' reaches none of these places, give others")
-    a, b, n, count = len(axes[0]), len(axes[1]), len(machine.active), len(load_limits.factors)
-    values_by_factor, q_a = (
-        np.full((len(slew_coordinates), a * b, count), np.nan),
-        np.full((len(slew_coordinates), a * b, n), np.nan),
-    )
+        raise InputError(f"'{conditions.frame}' reaches none of these positions, give others")
+    shape = (len(slew_coordinates), len(axes[1]) * len(axes[0]))
+    values_by_factor = np.full((*shape, len(limits.factors)), np.nan)
+    q_a = np.full((*shape, len(machine.active)), np.nan)
     slewing_joint, active = search.section.slewing_joint, machine.closure.active
-    angles = slew_angles(machine, statics.frame, search.section, slew_coordinates)
+    angles = slew_angles(machine, conditions.frame, search.section, slew_coordinates)
     for k, slew_coordinate in enumerate(slew_coordinates):
-
-        def factor_values(
-            q: Array,
-            statics_values: StaticQuantities,
-            turn: float = slew_coordinate,
-            angle: float = angles[k],
-        ) -> Array:
-            if slewing_joint is not None and turn != machine.home[active[slewing_joint]]:
-                q = q.copy()
-                q[:, active[slewing_joint]] = turn
-                statics_values = statics.evaluate(q)
-            return load_limits.max_magnitudes(statics_values, np.full(len(q), angle), q)
-
-        best_configurations, _ = search.select_best(
-            configurations, axes, lambda q, at: factor_values(q, at).min(axis=1)
-        )
-        values_by_factor[k, best_configurations.position_index] = factor_values(
-            best_configurations.q, best_configurations.statics
-        )
-        q_a[k, best_configurations.position_index] = best_configurations.q[:, active]
+        values = _FactorValues(conditions, limits, slew_coordinate, angles[k])
+        best, _ = search.select_best(configurations, axes, values.smallest)
+        values_by_factor[k, best.position_index] = values.by_factor(best.q, best.statics)
+        q_a[k, best.position_index] = best.q[:, active]
         if slewing_joint is not None:
-            q_a[k, best_configurations.position_index, slewing_joint] = slew_coordinate
-    is_reached = np.isfinite(q_a[..., 0])
-    smallest_values = np.where(
-        is_reached,
-        np.where(np.isnan(values_by_factor), np.inf, values_by_factor).min(axis=2),
-        np.nan,
-    )
-    factor_indices = np.where(
-        np.isfinite(smallest_values),
-        _together(values_by_factor, smallest_values).argmax(axis=2),
-        -1,
-    )
-    shape = (len(slew_coordinates), b, a)
+            q_a[k, best.position_index, slewing_joint] = slew_coordinate
+    smallest = np.where(np.isnan(values_by_factor), np.inf, values_by_factor).min(axis=2)
+    smallest = np.where(np.isfinite(q_a[..., 0]), smallest, np.nan)
+    first_factor = _simultaneous_factors(values_by_factor, smallest).argmax(axis=2)
+    grid = (len(slew_coordinates), len(axes[1]), len(axes[0]))
     return chart_class(
-        machine,
-        search,
-        action,
-        rule,
-        tuple(working_joints),
-        ground_slope,
-        with_friction,
-        with_weight,
-        *axes,
-        slew_coordinates,
-        load_limits.factors,
-        smallest_values.reshape(shape),
-        factor_indices.reshape(shape),
-        values_by_factor.reshape(*shape, count),
-        q_a.reshape(*shape, n),
+        **{x.name: getattr(conditions, x.name) for x in dataclasses.fields(RatingConditions)},
+        radii=axes[0],
+        heights=axes[1],
+        slews=slew_coordinates,
+        limiting_factors=limits.factors,
+        values=smallest.reshape(grid),
+        limiting_factor_index=np.where(np.isfinite(smallest), first_factor, -1).reshape(grid),
+        values_by_factor=values_by_factor.reshape(*grid, -1),
+        q_a=q_a.reshape(*grid, -1),
+        **attributes,
     )
 
 
-def _together(each: Array, least: Array) -> NDArray[np.bool_]:
+@dataclass(frozen=True)
+class _FactorValues:
+    """Loads or forces by limiting factor, with the machine slewed."""
+
+    conditions: RatingConditions
+    limits: LoadLimits
+    slew_coordinate: float
+    angle: float
+
+    def smallest(self, q: Array, statics: StaticQuantities) -> Array:
+        """Return the smallest values (N,) over all factors."""
+        return np.asarray(self.by_factor(q, statics).min(axis=1))
+
+    def by_factor(self, q: Array, statics: StaticQuantities) -> Array:
+        """Return the values (N, K) at configurations (N, nq) found with the slew at home."""
+        machine, slewing_joint = self.conditions.machine, self.conditions.section.slewing_joint
+        if slewing_joint is not None:
+            column = machine.closure.active[slewing_joint]
+            if self.slew_coordinate != machine.home[column]:
+                q = q.copy()
+                q[:, column] = self.slew_coordinate
+                statics = self.conditions.places.statics.evaluate(q)
+        return self.limits.max_magnitudes(statics, np.full(len(q), self.angle), q)
+
+
+def _simultaneous_factors(values_by_factor: Array, smallest: Array) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
-        ends: NDArray[np.bool_] = each <= least[..., None] * (1 + EQUAL)
-    return ends & np.isfinite(least)[..., None]
+        is_limiting: NDArray[np.bool_] = values_by_factor <= smallest[..., None] * (
+            1 + SIMULTANEOUS_TOLERANCE
+        )
+    return is_limiting & np.isfinite(smallest)[..., None]
 
 
 def _chart_axes(
@@ -304,7 +288,7 @@ def _chart_axes(
     radii: Sequence[float] | None,
     heights: Sequence[float] | None,
 ) -> tuple[Array, Array]:
-    """Coordinates of the places: multiples of a step within the reach, or those that are given."""
+    """Return the coordinates of the positions: multiples of a step within the reach, or given."""
     lower, upper = search.section_positions.min(axis=0), search.section_positions.max(axis=0)
     if step is None:
         raw_step = float((upper - lower).max()) / _DEFAULT_CELLS[len(search.free_strokes)]
@@ -334,7 +318,7 @@ def _chart_axes(
 def _slew_coordinates(
     machine: Machine, search: ConfigurationSearch, slews: Sequence[float] | None, can_tip: bool
 ) -> Array:
-    """Angles of the slewing joint."""
+    """Return the angles of the slewing joint [rad]: given, or home and a quarter turn."""
     slewing_joint = search.section.slewing_joint
     home = (
         0.0

@@ -1,7 +1,7 @@
-"""How rated loads and forces change with numbers of the machine, exactly."""
+"""Exact derivatives of rated loads and forces by parameters of the machine."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,189 +13,225 @@ from crane.common.samples import Array
 from crane.dynamics.constant_derivatives import ConstantDerivatives
 from crane.dynamics.statics import StaticQuantities
 from crane.machine import Machine
-from crane.ratings.drive_force_limits import drive_force_limits
-from crane.ratings.limiting_factors import LoadLimits, tipping_lines
-from crane.ratings.unit_actions import slew_angles
+from crane.ratings.limiting_factors import (
+    LimitBound,
+    LoadLimits,
+    RatingConditions,
+    tipping_lines,
+)
+from crane.ratings.rating_rules import slew_angles
 
-if TYPE_CHECKING:
-    from crane.ratings.rating_chart import RatingChart
-
-EQUAL = 1e-6  # of a load: causes that end it together
-_LIMIT_TOLERANCE = 1e-6  # of a stroke
+SIMULTANEOUS_TOLERANCE = 1e-6  # share of a load within which factors limit it simultaneously
+_LIMIT_TOLERANCE = 1e-6  # share of a stroke
 
 
-def chart_derivatives(chart: "RatingChart", parameter_names: Sequence[str]) -> Array:
-    """Derivatives of a field's values by numbers of the machine, places held still.
+class RatedConfigurations(NamedTuple):
+    """Configurations of the largest load or force at N positions.
 
-    With p a number, a posture of the largest value m is stationary under the place x(q_A, p) and
-    under limits of the strokes,
+    Attributes:
+        q_a: (N, n) active coordinates.
+        slews: (N,) coordinates of the slewing joint [rad].
+        magnitudes: (N,) rated loads or forces [kg], [N].
+    """
+
+    q_a: Array
+    slews: Array
+    magnitudes: Array
+
+
+class _BoundDerivatives(NamedTuple):
+    """Magnitudes (N, bounds) at which bounds are reached, and their derivatives by bound.
+
+    Derivatives by active coordinates (N, n) and by parameters (N, k) are absent for pins.
+    """
+
+    magnitudes: Array
+    by_coordinates: dict[int, Array]
+    by_parameters: dict[int, Array]
+
+
+def rating_derivatives(
+    conditions: RatingConditions, rated: RatedConfigurations, parameter_names: Sequence[str]
+) -> Array:
+    """Compute the derivatives of rated loads or forces by parameters, at fixed positions.
+
+    With a parameter p, the configuration of the largest value m is stationary under the position
+    x(q_A, p) and under the limits of the strokes,
 
         sum mu_k dm_k/dq + lambda^T dx/dq + sum nu_j e_j = 0,    sum mu_k = 1,
 
-    over causes k that end it together and strokes j at their limits, so that
+    over the factors k that limit m simultaneously and the strokes j at their limits, so that
 
         dm/dp = sum mu_k dm_k/dp + lambda^T dx/dp,
 
-    derivatives on the right at the same q_A; limits of strokes stay. Where just two strokes move
-    the frame, lambda follows from them alone.
+    with the derivatives on the right at fixed q_A. The limits of the strokes are constant. If
+    only two strokes move the frame, lambda follows from them alone.
 
     Args:
-        chart: See `crane.capacity`, `crane.tool_force`.
-        parameter_names: Numbers of the machine, such as "boom_eye.x".
+        conditions: Conditions of the rating.
+        rated: Configurations and their rated values.
+        parameter_names: Parameters of the machine, such as "boom_eye.x".
 
     Returns:
-        (s, b, a, k) per unit of each number; NaN where there is no value or no end to it, or where
-        a pin's limit ends it, whose derivatives are not computed.
+        (N, k) per unit of each parameter; NaN where a pin limits the value, whose derivatives are
+        not computed.
 
     Raises:
-        InputError: There is no such number, or it moves a support.
+        InputError: A parameter does not exist, or it moves a support.
     """
-    machine, parameter_names = chart.machine, list(parameter_names)
-    search, statics = chart.places, chart.places.statics
-    drives = drive_force_limits(machine, chart.working_joints, chart.with_friction)
-    load_limits = LoadLimits(
-        statics, drives, chart.rule, chart.action, chart.ground_slope, chart.with_weight
+    parameter_names = list(parameter_names)
+    constants = ConstantDerivatives(conditions.machine)
+    by_drive = constants.jacobian(
+        parameter_names, lambda variant: _drive_force_values(variant, conditions)
     )
-    constant_derivatives = ConstantDerivatives(machine)
-    drive_derivatives = constant_derivatives.jacobian(
-        parameter_names, lambda variant: _drive_force_values(variant, chart)
-    )
-    if np.any(constant_derivatives.jacobian(parameter_names, _tipping_line_values)):
-        raise InputError("a number that moves the supports cannot be varied here, leave it out")
-    out = np.full((*chart.values.shape, len(parameter_names)), np.nan)
-    chart_indices = np.argwhere(np.isfinite(chart.values) & (chart.values > 0))
-    if not len(chart_indices) or not parameter_names:
+    if np.any(constants.jacobian(parameter_names, _tipping_line_values)):
+        raise InputError("a parameter that moves the supports cannot be varied here, leave it out")
+    out = np.full((len(rated.q_a), len(parameter_names)), np.nan)
+    if not len(rated.q_a) or not parameter_names:
         return out
-    s, b, a = chart_indices.T
-    q_a = np.ascontiguousarray(chart.q_a[s, b, a])
-    q = machine.closure.solve(q_a)
-    statics_values, coordinate_derivatives, parameter_derivatives = (
-        statics.evaluate(q),
-        statics.coordinate_derivatives(q),
-        statics.parameter_derivatives(q, parameter_names),
-    )
-    angles = slew_angles(machine, chart.frame, search.section, chart.slews[s])
-    loads = chart.values[s, b, a]
-    unit, pin_forces = (
-        chart.action.unit_vectors(statics_values, angles),
-        load_limits.pin_loads(statics_values, angles, q),
-    )
-    # by bound but pins: derivatives of its load by q_A (N, n) and by numbers (N, k)
-    derivatives_by_bound = {}
-    bound_magnitudes = np.empty((len(chart_indices), len(load_limits.bounds)))
-    for j, bound in enumerate(load_limits.bounds):
-        coefficients = load_limits.bound_coefficients(bound, statics_values, unit, pin_forces)
-        x = load_limits.bound_magnitude(bound, coefficients)
-        bound_magnitudes[:, j] = x * load_limits.rated_shares[bound.factor_index]
-        if bound.pin_index is not None:
+    statics = conditions.places.statics
+    q = conditions.machine.closure.solve(np.ascontiguousarray(rated.q_a))
+    at_rest = statics.evaluate(q)
+    by_coordinates = statics.coordinate_derivatives(q)
+    by_parameters = statics.parameter_derivatives(q, parameter_names)
+    angles = slew_angles(conditions.machine, conditions.frame, conditions.section, rated.slews)
+    limits = conditions.load_limits()
+    bounds = _bound_derivatives(
+        limits, (at_rest, by_coordinates, by_parameters), limits.pin_loads(at_rest, angles, q),
+        angles, by_drive,
+    )  # fmt: skip
+    jacobian, by_position = _position_derivatives(conditions, at_rest, by_parameters, angles)
+    for i, magnitude in enumerate(rated.magnitudes):
+        is_active = bounds.magnitudes[i] <= magnitude * (1 + SIMULTANEOUS_TOLERANCE)
+        active = np.flatnonzero(is_active).tolist()
+        if not all(j in bounds.by_coordinates for j in active):
             continue
-        magnitude_by_coordinates, magnitude_by_parameters = (
-            _bound_derivatives(
-                load_limits, j, x, coefficients, statics_values, derivatives, angles
-            )
-            for derivatives in (coordinate_derivatives, parameter_derivatives)
-        )
-        if bound.drive is not None:  # what its strength changes by
-            k = 2 * drives.index(bound.drive) + (bound.sign < 0)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                magnitude_by_parameters = (
-                    magnitude_by_parameters
-                    + bound.sign
-                    * drive_derivatives[:, k]
-                    / _magnitude_derivative(x, coefficients)[:, None]
-                )
-        derivatives_by_bound[j] = (
-            magnitude_by_coordinates * load_limits.rated_shares[bound.factor_index],
-            magnitude_by_parameters * load_limits.rated_shares[bound.factor_index],
-        )
-    strokes = search.moving
-    section = search.section  # it stands at home: seen from there, what slews is turned back
-    slew_back_rotations = Rotation.from_rotvec(
-        -angles[:, None] * section.second_direction
-    ).as_matrix()
-    home_plane_positions = (
-        section.origin
-        + (slew_back_rotations @ (statics_values.tip_positions - section.origin)[:, :, None])[
-            :, :, 0
-        ]
-    )
-    position_jacobian = section.section_jacobian(
-        home_plane_positions, slew_back_rotations @ statics_values.tip_jacobian
-    )[:, :, strokes]
-    position_by_parameters = section.section_jacobian(
-        home_plane_positions, slew_back_rotations @ parameter_derivatives.tip_positions
-    )
-    span = search.high - search.low
-    for i in range(len(chart_indices)):
-        active_bounds = np.flatnonzero(bound_magnitudes[i] <= loads[i] * (1 + EQUAL)).tolist()
-        if not all(j in derivatives_by_bound for j in active_bounds):
-            continue
-        factor_gradients = np.array(
-            [derivatives_by_bound[j][0][i, strokes] for j in active_bounds]
-        )
+        strokes = conditions.places.moving
+        gradients = np.array([bounds.by_coordinates[j][i, strokes] for j in active])
         if len(strokes) == 2:
-            factor_multipliers = np.zeros(len(active_bounds))
-            factor_multipliers[np.argmin(bound_magnitudes[i, active_bounds])] = 1.0
-            position_multipliers = -np.linalg.solve(
-                position_jacobian[i].T, factor_multipliers @ factor_gradients
-            )
+            factor_multipliers = np.zeros(len(active))
+            factor_multipliers[np.argmin(bounds.magnitudes[i, active])] = 1.0
+            position_multipliers = -np.linalg.solve(jacobian[i].T, factor_multipliers @ gradients)
         else:
-            at_low = q_a[i, strokes] <= (search.low + _LIMIT_TOLERANCE * span)[strokes]
-            at_high = q_a[i, strokes] >= (search.high - _LIMIT_TOLERANCE * span)[strokes]
             factor_multipliers, position_multipliers = _lagrange_multipliers(
-                factor_gradients, position_jacobian[i], at_low, at_high, span[strokes]
+                gradients, jacobian[i], *_stroke_limits(conditions, rated.q_a[i])
             )
-        out[s[i], b[i], a[i]] = factor_multipliers @ np.array(
-            [derivatives_by_bound[j][1][i] for j in active_bounds]
-        )
-        out[s[i], b[i], a[i]] += position_multipliers @ position_by_parameters[i]
+        out[i] = factor_multipliers @ np.array([bounds.by_parameters[j][i] for j in active])
+        out[i] += position_multipliers @ by_position[i]
     return out
 
 
+def _bound_derivatives(
+    limits: LoadLimits,
+    statics: tuple[StaticQuantities, StaticQuantities, StaticQuantities],
+    pin_forces: tuple[Array, Array] | None,
+    angles: Array,
+    by_drive: Array,
+) -> _BoundDerivatives:
+    """Compute the rated magnitudes of all bounds and their derivatives.
+
+    Args:
+        limits: Limits of the load.
+        statics: The machine at rest, its derivatives by coordinates and by parameters.
+        pin_forces: Result of `LoadLimits.pin_loads`.
+        angles: (N,) slew angles [rad].
+        by_drive: (k, 2 d) derivatives of the drives' force limits by parameters.
+    """
+    at_rest, by_coordinates, by_parameters = statics
+    unit = limits.action.unit_vectors(at_rest, angles)
+    out = _BoundDerivatives(np.empty((len(angles), len(limits.bounds))), {}, {})
+    for j, bound in enumerate(limits.bounds):
+        coefficients = limits.bound_coefficients(bound, at_rest, unit, pin_forces)
+        x = limits.bound_magnitude(bound, coefficients)
+        share = limits.rated_shares[bound.factor_index]
+        out.magnitudes[:, j] = x * share
+        if bound.pin_index is not None:
+            continue
+        by_q, by_p = (
+            _magnitude_derivatives(limits, bound, x, coefficients, at_rest, derivatives, angles)
+            for derivatives in (by_coordinates, by_parameters)
+        )
+        if bound.drive is not None:  # the force limit depends on parameters, too
+            k = 2 * bound.factor_index + (bound.sign < 0)
+            slope = _slope(x, coefficients)[:, None]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                by_p = by_p + bound.sign * by_drive[:, k] / slope
+        out.by_coordinates[j], out.by_parameters[j] = by_q * share, by_p * share
+    return out
+
+
+def _position_derivatives(
+    conditions: RatingConditions,
+    at_rest: StaticQuantities,
+    by_parameters: StaticQuantities,
+    angles: Array,
+) -> tuple[Array, Array]:
+    """Return dx/dq of the moving strokes (N, 2, s) and dx/dp (N, 2, k) in the section.
+
+    The section stands at home, so that positions are turned back by the slew angles (N,).
+    """
+    section, strokes = conditions.section, conditions.places.moving
+    rotations = Rotation.from_rotvec(-angles[:, None] * section.second_direction).as_matrix()
+    offsets = (rotations @ (at_rest.tip_positions - section.origin)[:, :, None])[:, :, 0]
+    positions = section.origin + offsets
+    jacobian = section.section_jacobian(positions, rotations @ at_rest.tip_jacobian)
+    return jacobian[:, :, strokes], section.section_jacobian(
+        positions, rotations @ by_parameters.tip_positions
+    )
+
+
+def _stroke_limits(
+    conditions: RatingConditions, q_a: Array
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
+    """Return which moving strokes (s,) are at the lower and upper limit, and their lengths."""
+    search, strokes = conditions.places, conditions.places.moving
+    span = search.high - search.low
+    at_low = q_a[strokes] <= (search.low + _LIMIT_TOLERANCE * span)[strokes]
+    at_high = q_a[strokes] >= (search.high - _LIMIT_TOLERANCE * span)[strokes]
+    return at_low, at_high, span[strokes]
+
+
 def _lagrange_multipliers(
-    factor_gradients: Array,
-    position_jacobian: Array,
+    gradients: Array,
+    jacobian: Array,
     at_low: NDArray[np.bool_],
     at_high: NDArray[np.bool_],
     stroke_lengths: Array,
 ) -> tuple[Array, Array]:
-    """Shares mu (c,) of causes and forces lambda (2,) that hold a posture of the most load.
+    """Return the multipliers mu (c,) and lambda (2,) of a configuration of the largest load.
 
     Args:
-        factor_gradients: (c, k) of the causes' loads by the strokes.
-        position_jacobian: (2, k) of the place by the strokes.
-        at_low: (k,) which strokes are at their lower limit.
-        at_high: (k,) at their upper one.
-        stroke_lengths: (k,) of the strokes.
+        gradients: (c, s) derivatives of the loads of the limiting factors by the strokes.
+        jacobian: (2, s) derivatives of the position by the strokes.
+        at_low: (s,) which strokes are at their lower limit.
+        at_high: (s,) which strokes are at their upper limit.
+        stroke_lengths: (s,) lengths of the strokes.
     """
-    gradient_scale = np.abs(factor_gradients * stroke_lengths).max() or 1.0
-    position_scale = np.abs(position_jacobian * stroke_lengths).max()
+    gradient_scale = np.abs(gradients * stroke_lengths).max() or 1.0
+    position_scale = np.abs(jacobian * stroke_lengths).max()
     limits = np.vstack([np.diag(stroke_lengths)[at_low], -np.diag(stroke_lengths)[at_high]])
-    stationarity_rows = np.vstack(
+    rows = np.vstack(
         [
-            factor_gradients * stroke_lengths / gradient_scale,
-            position_jacobian * stroke_lengths / position_scale,
-            -position_jacobian * stroke_lengths / position_scale,
+            gradients * stroke_lengths / gradient_scale,
+            jacobian * stroke_lengths / position_scale,
+            -jacobian * stroke_lengths / position_scale,
             limits / stroke_lengths,
         ]
     )
-    factor_count = len(factor_gradients)
-    normalization = np.zeros((len(stationarity_rows), 1))
-    normalization[:factor_count] = 1.0
-    solution = nnls(
-        np.hstack([stationarity_rows, normalization]).T,
-        np.r_[np.zeros(stationarity_rows.shape[1]), 1.0],
-    )[0]
+    count = len(gradients)
+    normalization = np.zeros((len(rows), 1))
+    normalization[:count] = 1.0
+    solution = nnls(np.hstack([rows, normalization]).T, np.r_[np.zeros(rows.shape[1]), 1.0])[0]
     position_multipliers = (
-        (solution[factor_count : factor_count + 2] - solution[factor_count + 2 : factor_count + 4])
+        (solution[count : count + 2] - solution[count + 2 : count + 4])
         * gradient_scale
         / position_scale
     )
-    return solution[:factor_count], position_multipliers
+    return solution[:count], position_multipliers
 
 
-def _magnitude_derivative(x: Array, coefficients: tuple[Array, ...]) -> Array:
-    """How fast a + b x + |c + d x| rises with x (N,)."""
+def _slope(x: Array, coefficients: tuple[Array, ...]) -> Array:
+    """Return the derivative (N,) of a + b x + |c + d x| by x."""
     _, b, c, d = coefficients
     return np.asarray(b + (_unit_vector(x, c, d) * d).sum(axis=-1))
 
@@ -206,41 +242,36 @@ def _unit_vector(x: Array, c: Array, d: Array) -> Array:
     return vector / np.where(length > 0, length, 1.0)
 
 
-def _bound_derivatives(
-    load_limits: LoadLimits,
-    j: int,
+def _magnitude_derivatives(
+    limits: LoadLimits,
+    bound: LimitBound,
     x: Array,
     coefficients: tuple[Array, ...],
     statics: StaticQuantities,
     derivatives: StaticQuantities,
     angles: Array,
 ) -> Array:
-    """Derivatives (N, k) of the load at which bound j ends, by k numbers or strokes."""
-    unit_vector, magnitude_derivative = (
-        _unit_vector(x, *coefficients[2:]),
-        _magnitude_derivative(x, coefficients),
-    )
+    """Return the derivatives (N, k) of the load x at a bound by k parameters or coordinates."""
+    unit_vector, slope = _unit_vector(x, *coefficients[2:]), _slope(x, coefficients)
     x = np.where(np.isfinite(x), x, 0.0)
     columns = []
     for k in range(derivatives.total_mass.shape[-1]):
-        parameter_derivative = StaticQuantities(*(part[..., k] for part in derivatives))
-        a, b, c, d = load_limits.coefficient_derivatives(
-            load_limits.bounds[j], statics, parameter_derivative, angles
-        )
-        bound_change = a + b * x + (unit_vector * (c + d * x[:, None])).sum(axis=-1)
+        derivative = StaticQuantities(*(part[..., k] for part in derivatives))
+        a, b, c, d = limits.coefficient_derivatives(bound, statics, derivative, angles)
+        change = a + b * x + (unit_vector * (c + d * x[:, None])).sum(axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            columns.append(-bound_change / magnitude_derivative)
+            columns.append(-change / slope)
     return np.stack(columns, axis=-1)
 
 
-def _drive_force_values(machine: Machine, chart: "RatingChart") -> Array:
-    """What its drives push and pull at most."""
-    force_limits = drive_force_limits(machine, chart.working_joints, chart.with_friction)
-    return np.array([x for drive in force_limits for x in (drive.max_force, drive.min_force)])
+def _drive_force_values(machine: Machine, conditions: RatingConditions) -> Array:
+    """Return the force limits (2 d,) of all drives."""
+    limits = conditions.drive_limits(machine)
+    return np.array([x for drive in limits for x in (drive.max_force, drive.min_force)])
 
 
 def _tipping_line_values(machine: Machine) -> Array:
-    """Places of the tipping lines."""
+    """Return the points and directions of all tipping lines in one vector."""
     return np.concatenate(
         [np.zeros(1), *(np.r_[x.point, x.direction] for x in tipping_lines(machine))]
     )

@@ -1,29 +1,33 @@
-"""Rules by which lifting capacities are rated."""
+"""Rules by which loads and forces are rated, and the unit actions that are rated."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from crane.common.errors import InputError, suggest_names
-from crane.common.samples import as_number
+from crane.common.samples import Array, as_number
+from crane.dynamics.frame_jacobians import FrameJacobians
+from crane.dynamics.statics import StaticQuantities
+from crane.machine import Machine
+from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
 
-_MAX_GROUND_SLOPE = np.deg2rad(45.0)  # of the ground
+MAX_GROUND_SLOPE = np.deg2rad(45.0)
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What share of a load a rule lets count.
+    """A rating rule: the shares of each limit that count as rated load.
 
     Attributes:
-        name: Of the rule.
-        description: In words.
-        hydraulic: Share of what the drives lift and hold.
-        tipping: Share of what tips the machine.
-        structural: Share of what pins bear.
+        name: Name of the rule.
+        description: Description for reports.
+        hydraulic: Share of the load that the drives lift and hold.
+        tipping: Share of the load that tips the machine.
+        structural: Share of the load that the pins bear.
         only_raising_drive: Whether only the drive that raises the load works, at the pressure of
-            its pump, and all others hold behind closed valves, at that of their port relief
-            valves.
-        min_ground_slope: Of the ground, at least [rad].
+            its pump. All other drives then hold behind closed valves, at the pressure of their
+            port relief valves.
+        min_ground_slope: Smallest slope of the ground that is assumed [rad].
     """
 
     name: str
@@ -38,12 +42,8 @@ class Rule:
         for name in ("hydraulic", "tipping", "structural"):
             as_number(getattr(self, name), f"the {name} share of rule '{self.name}'", "",
                       greater_than=0.0, max_magnitude=1.0)  # fmt: skip
-        as_number(
-            self.min_ground_slope,
-            f"the slope of rule '{self.name}'",
-            "rad",
-            max_magnitude=_MAX_GROUND_SLOPE,
-        )
+        as_number(self.min_ground_slope, f"the slope of rule '{self.name}'", "rad",
+                  max_magnitude=MAX_GROUND_SLOPE)  # fmt: skip
 
 
 RULES = {
@@ -70,7 +70,7 @@ RULES = {
         Rule(
             "sfs4677",
             "SFS 4677 (tractor cranes for timber, as the Farmi 4670's manual gives it): 10 % more "
-            "than the load does not tip the machine on ground that leans by 5 degrees",
+            "than the load does not tip the machine on ground that slopes by 5 degrees",
             tipping=1 / 1.1,
             min_ground_slope=np.deg2rad(5.0),
         ),
@@ -79,13 +79,135 @@ RULES = {
 
 
 def find_rule(name: str | Rule) -> Rule:
-    """A rule by its name, or as it is.
+    """Return the rule with a name; a `Rule` is returned as it is.
 
     Raises:
-        InputError: There is none.
+        InputError: The name is unknown.
     """
     if isinstance(name, Rule):
         return name
     if not isinstance(name, str) or name not in RULES:
         raise InputError(f"rule '{name}' is unknown, {suggest_names(RULES, str(name))}")
     return RULES[name]
+
+
+@dataclass(frozen=True)
+class FixedUnitAction:
+    """A constant vector e per unit of load or force, which turns with the slewing joint.
+
+    Attributes:
+        direction: (3,) e in the world with the slewing joint at home: unit vector [1] for a
+            force [N]; gravity [m/s2] for a load [kg].
+        up: (3,) slewing axis.
+        is_weight: Whether e is gravity, whose direction changes with the slope of the ground.
+    """
+
+    direction: Array
+    up: Array
+    is_weight: bool = False
+
+    def unit_vectors(self, statics: StaticQuantities, angles: Array) -> Array:
+        """Return e (N, 3) with the machine slewed by angles (N,) from home [rad]."""
+        return rotate_about_axis(
+            np.broadcast_to(self.direction, statics.tip_positions.shape), self.up, angles
+        )
+
+    def unit_derivatives(
+        self, statics: StaticQuantities, derivatives: StaticQuantities, angles: Array
+    ) -> Array:
+        """Return the derivative (N, 3) of e by the parameter of `derivatives`: zero."""
+        return np.zeros_like(statics.tip_positions)
+
+
+@dataclass(frozen=True)
+class PathUnitAction:
+    """The unit vector along, or across, the path of the frame when one stroke alone moves.
+
+        e = sign u / |u|,   u = dp/dq_i;   across: e = sign n x u / |u|,
+
+    with the normal n of the section. If the stroke turns the frame about a pin, u is the tangent
+    of the circle about that pin.
+
+    Attributes:
+        stroke: Index i among the active joints.
+        sign: 1 or -1.
+        up: (3,) slewing axis.
+        section_normal: (3,) n with the slewing joint at home; None for e along the path.
+    """
+
+    stroke: int
+    sign: float
+    up: Array
+    section_normal: Array | None = None
+    is_weight = False
+
+    def unit_vectors(self, statics: StaticQuantities, angles: Array) -> Array:
+        """Return e (N, 3), see `FixedUnitAction`; NaN where the frame does not move."""
+        tangent = statics.tip_jacobian[:, :, self.stroke]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self._signed_direction(
+                tangent / np.linalg.norm(tangent, axis=1, keepdims=True), angles
+            )
+
+    def unit_derivatives(
+        self, statics: StaticQuantities, derivatives: StaticQuantities, angles: Array
+    ) -> Array:
+        """Return the derivative (N, 3) of e by the parameter of `derivatives`."""
+        tangent = statics.tip_jacobian[:, :, self.stroke]
+        derivative = derivatives.tip_jacobian[:, :, self.stroke]
+        length = np.linalg.norm(tangent, axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            tangent = tangent / length
+            across = derivative - (tangent * derivative).sum(1, keepdims=True) * tangent
+            return self._signed_direction(across / length, angles)
+
+    def _signed_direction(self, direction: Array, angles: Array) -> Array:
+        if self.section_normal is not None:
+            normal = rotate_about_axis(
+                np.broadcast_to(self.section_normal, direction.shape), self.up, angles
+            )
+            direction = np.cross(normal, direction)
+        return self.sign * direction
+
+
+UnitAction = FixedUnitAction | PathUnitAction
+
+
+def gravity_action(machine: Machine) -> FixedUnitAction:
+    """Return the unit action of a load: gravity per kilogram.
+
+    Raises:
+        InputError: The machine has no gravity.
+    """
+    gravity = np.array(machine.model.gravity.linear)
+    if not gravity.any():
+        raise InputError(f"'{machine.name}' has no gravity, a load has no weight there")
+    return FixedUnitAction(gravity, up_direction(machine), is_weight=True)
+
+
+def rotate_about_axis(vectors: Array, axis: Array, angles: Array) -> Array:
+    """Rotate vectors (N, 3) by angles (N,) [rad] about a unit vector (3,)."""
+    cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    axial_part = (vectors @ axis)[:, None] * axis
+    return np.asarray(
+        axial_part + cosine * (vectors - axial_part) + sine * np.cross(axis, vectors)
+    )
+
+
+def slew_angles(
+    machine: Machine, frame: str, section: WorkspaceSection, slew_coordinates: Array
+) -> Array:
+    """Return rotations (N,) about the vertical from home [rad]; 0 without a slewing joint.
+
+    Args:
+        machine: The machine.
+        frame: A link that the slewing joint carries.
+        section: Section of the frame.
+        slew_coordinates: (N,) coordinates of the slewing joint [rad].
+    """
+    if section.slewing_joint is None:
+        return np.zeros(len(slew_coordinates))
+    frames, column = FrameJacobians(machine), machine.closure.active[section.slewing_joint]
+    frames.set_configuration(machine.home)
+    rotation_sign = np.sign(frames.jacobian(frame)[3:, column] @ up_direction(machine))
+    return np.asarray(rotation_sign * (slew_coordinates - machine.home[column]))

@@ -1,6 +1,5 @@
-"""Tool forces: how hard a machine pushes at a frame, all over its reach, and what ends it."""
+"""Tool forces: the largest force at a frame over the whole reach, and its limiting factors."""
 
-import dataclasses
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -15,27 +14,31 @@ from crane.machine import Machine
 from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits
-from crane.ratings.pivot_joints import bucket_and_arm_strokes, frame_angular_jacobian
-from crane.ratings.rating_chart import RatingChart, compute_chart, configuration_search
-from crane.ratings.rating_rules import find_rule
-from crane.ratings.strokes import Strokes
-from crane.ratings.unit_actions import (
+from crane.ratings.rating_chart import (
+    RatingChart,
+    compute_chart,
+    configuration_search,
+    rating_conditions,
+)
+from crane.ratings.rating_rules import (
     FixedUnitAction,
     PathUnitAction,
     UnitAction,
+    find_rule,
     rotate_about_axis,
     slew_angles,
 )
+from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, frame_angular_jacobian
 
 TOOL_DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-normal")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolForce(RatingChart):
-    """Tool forces over reach and height [N], see `RatingChart`.
+    """Tool forces over radius and height [N], see `RatingChart`.
 
     Attributes:
-        direction: In which the tool pushes, in words.
+        direction: Description of the direction in which the tool pushes.
     """
 
     direction: str = ""
@@ -43,7 +46,6 @@ class ToolForce(RatingChart):
     quantity: ClassVar[tuple[str, str]] = ("force", "N")
 
     def _one_line(self) -> str:
-        """Its direction, and the largest force."""
         forces = self.forces[np.isfinite(self.forces)]
         force_text = (
             f"up to {format_quantity(forces.max(), 'N', 4)}" if len(forces) else "no force"
@@ -54,24 +56,24 @@ class ToolForce(RatingChart):
 
     @property
     def forces(self) -> Array:
-        """(s, b, a) the largest forces [N]: its values."""
+        """(s, b, a) largest forces [N], the same as `values`."""
         return self.values
 
     def file_notes(self) -> dict[str, str]:
-        """Its direction."""
+        """Return the direction for the head of a file."""
         return {"direction": self.direction}
 
     def to_markdown(self) -> str:
-        """A summary: the largest force and where, and how often each cause ends it."""
-        weight_text = "weights and tipping count" if self.with_weight else "weights left out"
+        """Return the largest force and its position, and the share of each limiting factor."""
+        weight_text = f"weight and tipping {'included' if self.with_weight else 'left out'}"
         working = ", ".join(self.working_joints)
         lines = [
             f"# Tool force of {self.machine.name}, {self.direction}\n",
-            f"At `{self.frame}`; working {working}; {weight_text}, friction left out.\n",
-            "| slew [deg] | largest [kN] | radius [m] | height [m] | ends by |",
+            f"At `{self.frame}`; working: {working}; {weight_text}; without friction.\n",
+            "| slew [deg] | largest [kN] | radius [m] | height [m] | limited by |",
             "| --- | --- | --- | --- | --- |",
         ]
-        for slew_coordinate, forces, cause in zip(
+        for slew, forces, factors in zip(
             self.slews, self.forces, self.limiting_factor_index, strict=True
         ):
             finite_forces = np.where(np.isfinite(forces), forces, -np.inf)
@@ -79,11 +81,11 @@ class ToolForce(RatingChart):
             if not np.isfinite(finite_forces[b, a]):
                 continue
             lines.append(
-                f"| {np.rad2deg(slew_coordinate):.4g} | {finite_forces[b, a] / 1e3:.2f} | "
-                f"{self.radii[a]:.4g} | "
-                f"{self.heights[b]:.4g} | {self.limiting_factors[cause[b, a]]} |"
+                f"| {np.rad2deg(slew):.4g} | {finite_forces[b, a] / 1e3:.2f} | "
+                f"{self.radii[a]:.4g} | {self.heights[b]:.4g} | "
+                f"{self.limiting_factors[factors[b, a]]} |"
             )
-        lines += ["", "| ends by | of the places |", "| --- | --- |"]
+        lines += ["", "| limited by | of all positions |", "| --- | --- |"]
         reached_count = np.isfinite(self.q_a[..., 0]).sum()
         for k in self.active_factors:
             lines.append(
@@ -93,7 +95,7 @@ class ToolForce(RatingChart):
         return "\n".join([*lines, ""])
 
     def section_directions(self) -> Array:
-        """(s, b, a, 2) unit vectors of the tool's pushing, in the section; NaN out of reach."""
+        """Return unit vectors (s, b, a, 2) of the tool force in the section; NaN out of reach."""
         out = np.full((*self.values.shape, 2), np.nan)
         s, b, a = np.nonzero(np.isfinite(self.q_a[..., 0]))
         angles = slew_angles(self.machine, self.frame, self.section, self.slews[s])
@@ -104,7 +106,7 @@ class ToolForce(RatingChart):
             self.action.unit_vectors(statics, angles), up_direction(self.machine), -angles
         )
         first_directions = np.broadcast_to(self.section.first_direction, unit_vectors.shape)
-        if self.section.is_radial:  # outwards from the axis, wherever the frame is
+        if self.section.is_radial:  # outwards from the axis at each position
             first_directions = statics.tip_positions - self.section.origin
             first_directions = (
                 first_directions
@@ -139,43 +141,44 @@ def tool_force(
     radii: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
 ) -> ToolForce:
-    """The largest force with which a machine at rest pushes at a frame, all over its reach.
+    """Compute the largest force of a machine at rest at a frame, over its whole reach.
 
-    Of each place the least over all causes, of all postures that reach it the largest: what the
-    drives exert and hold, and tipping over each line between the supports, which is where the
-    machine pushes itself off the ground, too. What acts on the frame is the opposite; a machine
-    that pushes upwards lifts, and so has the loads of `capacity` in newtons.
+    At each position the force is the smallest over all limiting factors: the forces that the
+    drives exert and hold, and tipping over each line between supports, which includes lifting
+    off the ground. If several configurations reach a position, the one with the largest force
+    counts. The reaction on the frame is opposite to the force; a machine that pushes upwards
+    lifts, with the loads of `capacity` in newtons.
 
     Args:
-        machine: With hydraulics, or limits of `effort` in its URDFs.
-        direction: In which the tool pushes: "up", "down", "in" (towards the slewing axis), "out";
-            "tangent" to the frame's path as one stroke alone moves, in the sense in which its
-            drive is stronger (a bucket that curls), "normal" to it, away from the pivot, and both
-            with a minus sign; or (3,) in the world while the slewing joint is at home, with which
-            it turns.
-        frame: Where it pushes; the tip if not given.
-        joint: Whose path tangent and normal are of; the bucket's if not given, see `breakout`.
-        working: Joints whose drives work at the pressure of their pump, while others hold behind
-            closed valves. All if not given, or of the tangent the joint.
-        weights: Whether the machine has its weight; without it, nothing tips.
-        slews: Angles of the slewing joint [rad], as in `capacity`; so the next ones.
-        step: Between places [m].
-        radii: First coordinates of the places [m], in place of steps.
-        heights: Second coordinates [m].
+        machine: A machine with hydraulics, or with `effort` limits in its URDFs.
+        direction: Direction in which the tool pushes: "up", "down", "in" (towards the slewing
+            axis), "out"; "tangent" to the frame's path when one stroke alone moves, in the
+            direction in which its drive is stronger (a bucket that curls); "normal" to this path,
+            away from the pivot; "-tangent" and "-normal"; or a vector (3,) in the world with the
+            slewing joint at home, with which it turns.
+        frame: Link at which the tool pushes; the tip by default.
+        joint: Joint of the path for tangent and normal; the bucket's by default, see `breakout`.
+        working: Joints whose drives work at the pressure of their pump, while all others hold
+            behind closed valves. By default all, or for a tangent the joint of the path.
+        weights: Whether the machine has weight; without weight it does not tip.
+        slews: Angles of the slewing joint, see `capacity` [rad].
+        step: Distance between positions [m].
+        radii: First coordinates of the positions, in place of a step [m].
+        heights: Second coordinates of the positions, in place of a step [m].
 
     Raises:
-        InputError: An unknown direction, frame or joint, nothing that limits a force, or a frame
-            that two to four strokes do not move in a plane through the slewing axis.
+        InputError: A direction, frame or joint is unknown, nothing limits the force, or the frame
+            is not moved by two to four strokes in a plane through the slewing axis.
     """
     search = configuration_search(machine, frame)
     action, single_joint = _direction_action(search, direction, joint)
     if working is None:
         working = machine.driven_joints if single_joint is None else [single_joint]
-    chart = compute_chart(
-        ToolForce, machine, search, action, find_rule("none"), working, with_weight=weights,
-        slews=slews, step=step, radii=radii, heights=heights,
+    conditions = rating_conditions(search, action, find_rule("none"), working, with_weight=weights)
+    return compute_chart(
+        ToolForce, conditions, slews=slews, step=step, radii=radii, heights=heights,
+        direction=_direction_text(direction, action, machine),
     )  # fmt: skip
-    return dataclasses.replace(chart, direction=_direction_text(direction, action, machine))
 
 
 def _direction_text(direction: str | Sequence[float], action: UnitAction, machine: Machine) -> str:
@@ -187,10 +190,10 @@ def _direction_text(direction: str | Sequence[float], action: UnitAction, machin
 
 
 def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
-    """What acts on the frame that stroke i moves as its drive pushes where it is stronger.
+    """Return the reaction on the frame when a stroke's drive pushes in its stronger direction.
 
     Raises:
-        InputError: Nothing limits the drive.
+        InputError: The drive has no limit.
     """
     machine = strokes.machine
     joint = machine.active[stroke_index]
@@ -204,7 +207,7 @@ def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
 def _direction_action(
     search: ConfigurationSearch, direction: str | Sequence[float], joint: str | None
 ) -> tuple[UnitAction, str | None]:
-    """What acts on the frame, and the joint along whose path it does."""
+    """Return the unit action on the frame, and the joint for a tangent of a path."""
     machine, section = search.machine, search.section
     up = up_direction(machine)
     if not isinstance(direction, str):
@@ -248,14 +251,12 @@ def _fixed_action(
 def _normal_action(
     search: ConfigurationSearch, path_action: PathUnitAction, sign: float
 ) -> PathUnitAction:
-    """Away from the pivot, or towards it; what acts on the frame is the opposite."""
+    """Return the reaction to a force away from the pivot, or with sign -1 towards it."""
     machine, frame, section = search.machine, search.statics.frame, search.section
     normal = np.cross(section.first_direction, section.second_direction)
     statics = search.statics.evaluate(machine.home[None])
-    tip_tangent, angular_rate = (
-        statics.tip_jacobian[0, :, path_action.stroke],
-        frame_angular_jacobian(machine, frame, machine.home)[:, path_action.stroke],
-    )
+    tip_tangent = statics.tip_jacobian[0, :, path_action.stroke]
+    angular_rate = frame_angular_jacobian(machine, frame, machine.home)[:, path_action.stroke]
     outward = np.cross(tip_tangent, angular_rate)  # r w^2, from the centre of rotation
     orientation = np.sign(np.cross(normal, tip_tangent) @ outward)
     return PathUnitAction(path_action.stroke, -sign * float(orientation), path_action.up, normal)

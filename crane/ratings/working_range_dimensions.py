@@ -1,6 +1,6 @@
-"""The dimensions of a working range, one by one."""
+"""Dimensions of a working range, each an optimum over the strokes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,33 +10,148 @@ from crane.common.samples import Array
 from crane.description.soil_cutting import SoilCutting
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine import Machine
+from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces import Workspace
-from crane.motion.workspaces.workspace_extremes import Objective
+from crane.motion.workspaces.workspace_extremes import (
+    Objective,
+    ObjectiveConstraint,
+    maximize_on_branch,
+)
 from crane.motion.workspaces.workspace_section import find_slewing_joint
-from crane.ratings.workspace_optimizer import (
-    FrameSectionCoordinates,
-    WorkspaceOptimizer,
-    objective_difference,
-)
 
-_MIN_DEPTH = 1e-6  # [m] that is no depth
-_SCANNED_RADII = 13  # radii between which a level bottom is sought to begin
-_CHECKED_POINTS = (
-    9  # places of a wall or a bottom at which it is looked whether the lip gets there
-)
+_START_COUNT = 3  # configurations from which an optimum is searched
+_MIN_START_DISTANCE = 0.05  # share of the strokes between two starts
+_CONSTRAINT_WEIGHT = 10.0  # of the violation of constraints by a start, against the objective
+_MIN_IMPROVEMENT = 1e-9  # share of the characteristic length by which a later optimum is better
+_MIN_DEPTH = 1e-6  # smallest depth that is reported [m]
+_SCANNED_RADII = 13  # radii between which the start of a level bottom is searched
+_CHECKED_POINTS = 9  # points of a wall or a bottom at which the reach of the lip is checked
 _POSITION_TOLERANCE = 1e-9  # [m]
-_ROUNDING_DIGITS = 12  # behind the point: what is below is rounding
+_ROUNDING_DIGITS = 12  # decimal places; further ones are rounding errors
+
+Optimum = tuple[float, Array] | None
+
+
+class WorkspaceOptimizer:
+    """Optima over the configurations of a workspace.
+
+    The best configurations of the workspace that satisfy the constraints best are improved by
+    `maximize_on_branch`.
+
+    Args:
+        workspace: The workspace.
+
+    Attributes:
+        q: (N, nq) closed configurations of the workspace.
+    """
+
+    def __init__(self, workspace: Workspace):
+        self._workspace, self._machine = workspace, workspace.machine
+        self._strokes = [workspace.machine.active.index(joint) for joint in workspace.strokes]
+        self._size = workspace.machine.closure.characteristic_length
+        self.q = np.concatenate(
+            [patch.configurations[patch.is_closed] for patch in workspace.patches]
+        )
+        lengths = workspace.upper - workspace.lower
+        self._lengths = np.where(workspace.upper > workspace.lower, lengths, 1.0)
+
+    def maximize(
+        self,
+        objective: Objective,
+        values: Array,
+        constraints: Sequence[ObjectiveConstraint] = (),
+        violation: Array | None = None,
+    ) -> Optimum:
+        """Find the largest value of an objective.
+
+        Args:
+            objective: See `maximize_on_branch`.
+            values: (N,) values of the objective at the configurations `q`.
+            constraints: Constraints; lengths as shares of the characteristic length.
+            violation: (N,) violation of the constraints at `q`, 0 where they hold.
+
+        Returns:
+            The value and its configuration (nq,); None if no start satisfies the constraints.
+        """
+        weight = _CONSTRAINT_WEIGHT * self._size
+        score = values if violation is None else values - weight * violation
+        best: Optimum = None
+        limits = (self._workspace.lower, self._workspace.upper)
+        for start in self._select_starts(score):
+            value, configuration = maximize_on_branch(
+                self._machine, start, self._strokes, limits, objective, constraints
+            )
+            margin = _MIN_IMPROVEMENT * self._size
+            if np.isfinite(value) and (best is None or value > best[0] + margin):
+                best = value, configuration
+        return best
+
+    def _select_starts(self, score: Array) -> list[Array]:
+        """Return the configurations with the best scores that are not close to each other."""
+        columns = self._machine.closure.active[self._strokes]
+        out: list[Array] = []
+        for k in np.argsort(-score, kind="stable"):
+            q = self.q[k]
+            distances = [
+                np.abs((q - x)[columns] / self._lengths[self._strokes]).max() for x in out
+            ]
+            if not distances or min(distances) > _MIN_START_DISTANCE:
+                out.append(q)
+            if len(out) == _START_COUNT:
+                break
+        return out
+
+
+class FrameSectionCoordinates:
+    """Coordinates (u, w) of a frame in the section of a workspace, with derivatives.
+
+    Args:
+        workspace: The workspace.
+        frame: A link.
+    """
+
+    def __init__(self, workspace: Workspace, frame: str):
+        self._section, self._kinematics = workspace.section, Kinematics(workspace.machine, frame)
+
+    def coordinates(self, q: Array) -> Array:
+        """Return the coordinates (N, 2) at configurations (N, nq) [m]."""
+        return self._section.coordinates(self._kinematics.positions_at_configurations(q))
+
+    def coordinate_objective(
+        self, axis: int, sign: float = 1.0, offset: float = 0.0, scale: float = 1.0
+    ) -> Objective:
+        """Return the objective sign (x - offset) / scale of coordinate x, axis 0 or 1."""
+
+        def evaluate(q: Array) -> tuple[float, Array]:
+            position = self._kinematics.position_at_configuration(q)[None]
+            section_jacobian = self._section.section_jacobian(
+                position, self._kinematics.tree_jacobian(q)[None]
+            )
+            coordinate = float(self._section.coordinates(position)[0, axis])
+            return sign * (coordinate - offset) / scale, sign * section_jacobian[0, axis] / scale
+
+        return evaluate
+
+
+def objective_difference(first: Objective, second: Objective) -> Objective:
+    """Return the first objective minus the second."""
+
+    def evaluate(q: Array) -> tuple[float, Array]:
+        (a, first_gradient), (b, second_gradient) = first(q), second(q)
+        return a - b, first_gradient - second_gradient
+
+    return evaluate
 
 
 class Dimension(NamedTuple):
-    """One number of a working range.
+    """One dimension of a working range.
 
     Attributes:
         name: Such as "digging depth".
-        value: [m].
-        section_position: (2,) in the section, at which it is measured.
-        q_a: (n,) active coordinates there.
-        definition: How it is defined.
+        value: Length [m].
+        section_position: (2,) position in the section at which it is measured [m].
+        q_a: (n,) active coordinates at this position.
+        definition: Definition in words.
     """
 
     name: str
@@ -47,326 +162,241 @@ class Dimension(NamedTuple):
 
 
 class DimensionFinder:
-    """The dimensions of a working range, one by one.
+    """Computes the dimensions of a working range.
 
     Args:
-        workspace: What the lip reaches.
-        ground_height: Its height.
-        bucket_pivot: The bucket's pivot, None where there is none.
+        workspace: Workspace of the lip.
+        ground_height: Height of the ground [m].
+        bucket_pivot: Pivot joint of the bucket; None if there is no bucket.
     """
 
     def __init__(self, workspace: Workspace, ground_height: float, bucket_pivot: str | None):
-        self.workspace, self.ground, self.machine = workspace, ground_height, workspace.machine
-        self._optimizer, self._lip_coordinates = (
-            WorkspaceOptimizer(workspace),
-            FrameSectionCoordinates(workspace, workspace.frame),
-        )
-        self._characteristic_length, self._lip_positions = (
-            workspace.machine.closure.characteristic_length,
-            self._lip_coordinates.coordinates(self._optimizer.q),
-        )
-        self._pivot_coordinates = (
-            None
-            if bucket_pivot is None
-            else FrameSectionCoordinates(workspace, self.machine.tree.joints[bucket_pivot].child)
-        )
+        self._workspace, self._ground, self._machine = workspace, ground_height, workspace.machine
+        self._optimizer = WorkspaceOptimizer(workspace)
+        self._lip = FrameSectionCoordinates(workspace, workspace.frame)
+        self._size = workspace.machine.closure.characteristic_length
+        self._positions = self._lip.coordinates(self._optimizer.q)
+        self._pivot = None
+        if bucket_pivot is not None:
+            link = self._machine.tree.joints[bucket_pivot].child
+            self._pivot = FrameSectionCoordinates(workspace, link)
 
     def find_all(self, level_length: float) -> Iterator[Dimension]:
-        """Those that there are, in the order of brochures.
+        """Yield the dimensions that exist, in the order of brochures.
 
         Args:
             level_length: Length of the level bottom [m].
         """
-        lip_coordinates, ground_height, has_bucket = (
-            self._lip_coordinates,
-            self.ground,
-            self._pivot_coordinates is not None,
-        )
-        has_slewing_joint = self.workspace.slewing_joint_name is not None
-        dimensions: list[Dimension | None] = [
-            self._extreme_dimension(
-                "reach",
-                lip_coordinates.coordinate_objective(0),
-                0,
-                1.0,
-                "largest distance from the slewing axis"
-                if has_slewing_joint
-                else "largest first coordinate",
+        pivot, has_slewing_joint = self._pivot, self._workspace.slewing_joint_name is not None
+        distance_text = "distance from the slewing axis" if has_slewing_joint else (
+            "first coordinate")  # fmt: skip
+        dimensions = [
+            self._dimension("reach", self._maximize_lip(0), f"largest {distance_text}"),
+            self._dimension(
+                "reach at ground level",
+                self._maximize_lip(0, fixed={1: self._ground}),
+                "with the lip on the ground",
             ),
-            self._ground_level_reach(),
         ]
-        depth = self._extreme_dimension(
-            "digging depth" if has_bucket else "depth",
-            lip_coordinates.coordinate_objective(1, -1.0, ground_height),
-            1,
-            -1.0,
+        depth = self._dimension(
+            "digging depth" if pivot else "depth",
+            self._maximize_lip(1, -1.0, self._ground),
             "lowest below the ground",
         )
         if depth is not None and depth.value > _MIN_DEPTH:
             dimensions.append(depth)
-            if self._pivot_coordinates is not None:
-                dimensions += [
-                    self._level_bottom_depth(level_length),
-                    self._vertical_wall_depth(self._pivot_coordinates),
-                ]
+            if pivot is not None:
+                dimensions.append(self._level_bottom_depth(level_length))
+                dimensions.append(self._vertical_wall_depth(pivot))
+        height = self._maximize_lip(1, 1.0, self._ground)
         dimensions.append(
-            self._extreme_dimension(
-                "cutting height" if has_bucket else "height",
-                lip_coordinates.coordinate_objective(1, 1.0, ground_height),
-                1,
-                1.0,
-                "highest above the ground",
+            self._dimension(
+                "cutting height" if pivot else "height", height, "highest above the ground"
             )
         )
-        if self._pivot_coordinates is not None:
-            dimensions.append(self._dump_height(self._pivot_coordinates))
+        if pivot is not None:
+            dimensions.append(self._dump_height(pivot))
             dimensions.append(self._front_slewing_radius() if has_slewing_joint else None)
         yield from (dimension for dimension in dimensions if dimension is not None)
 
-    def _extreme_dimension(
-        self, name: str, objective: Objective, axis: int, sign: float, definition: str
-    ) -> Dimension | None:
-        return self._create_dimension(
-            name,
-            self._optimizer.maximize(objective, sign * self._lip_positions[:, axis]),
-            definition,
+    def _maximize_lip(
+        self,
+        axis: int,
+        sign: float = 1.0,
+        offset: float = 0.0,
+        fixed: Mapping[int, float] | None = None,
+    ) -> Optimum:
+        """Maximize sign (x - offset) of coordinate x of the lip, with other coordinates fixed."""
+        values = sign * self._positions[:, axis]
+        return self._maximize_fixed(
+            self._lip.coordinate_objective(axis, sign, offset), values, fixed or {}
         )
 
-    def _create_dimension(
-        self, name: str, optimum: tuple[float, Array] | None, definition: str
-    ) -> Dimension | None:
+    def _maximize_fixed(
+        self, objective: Objective, values: Array, fixed: Mapping[int, float]
+    ) -> Optimum:
+        """Maximize an objective with some coordinates of the lip fixed."""
+        if not fixed:
+            return self._optimizer.maximize(objective, values)
+        axes, targets = list(fixed), list(fixed.values())
+        constraints: list[ObjectiveConstraint] = [
+            ("eq", self._lip.coordinate_objective(k, 1.0, x, self._size)) for k, x in fixed.items()
+        ]
+        violation = np.abs(self._positions[:, axes] - targets).sum(axis=1) / self._size
+        return self._optimizer.maximize(objective, values, constraints, violation)
+
+    def _dimension(self, name: str, optimum: Optimum, definition: str) -> Dimension | None:
         if optimum is None:
             return None
         value, q = optimum
-        q_a = np.round(q[self.machine.closure.active], _ROUNDING_DIGITS) + 0.0
-        return Dimension(
-            name, value, self._rounded_position(self._lip_coordinates, q), q_a, definition
-        )
+        q_a = np.round(q[self._machine.closure.active], _ROUNDING_DIGITS) + 0.0
+        return Dimension(name, value, self._rounded_position(self._lip, q), q_a, definition)
 
     def _rounded_position(self, coordinates: FrameSectionCoordinates, q: Array) -> Array:
         return np.asarray(np.round(coordinates.coordinates(q[None])[0], _ROUNDING_DIGITS) + 0.0)
 
-    def _ground_level_reach(self) -> Dimension | None:
-        optimum = self._optimizer.maximize(
-            self._lip_coordinates.coordinate_objective(0),
-            self._lip_positions[:, 0],
-            [
-                (
-                    "eq",
-                    self._lip_coordinates.coordinate_objective(
-                        1, 1.0, self.ground, self._characteristic_length
-                    ),
-                )
-            ],
-            np.abs(self._lip_positions[:, 1] - self.ground) / self._characteristic_length,
-        )
-        return self._create_dimension(
-            "reach at ground level", optimum, "with the lip on the ground"
-        )
-
-    def _lowest_height(self, radius: float) -> tuple[float, Array] | None:
-        """The lowest height that the lip reaches at a radius, below 0, and its posture."""
-        return self._optimizer.maximize(
-            self._lip_coordinates.coordinate_objective(1, -1.0),
-            -self._lip_positions[:, 1],
-            [
-                (
-                    "eq",
-                    self._lip_coordinates.coordinate_objective(
-                        0, 1.0, radius, self._characteristic_length
-                    ),
-                )
-            ],
-            np.abs(self._lip_positions[:, 0] - radius) / self._characteristic_length,
-        )
+    def _lowest_height(self, radius: float) -> Optimum:
+        """Return the lowest height of the lip at a radius, negated, and its configuration."""
+        return self._maximize_lip(1, -1.0, fixed={0: radius})
 
     def _level_bottom_depth(self, level_length: float) -> Dimension | None:
-        """The deepest level line: its ends are where the reach is equally deep."""
-        deepest = float(self._lip_positions[self._lip_positions[:, 1].argmin(), 0])
-        lower, upper = max(deepest - level_length, float(self._lip_positions[:, 0].min())), deepest
+        """Return the deepest level line: at both ends the reach is equally deep."""
+        deepest = float(self._positions[self._positions[:, 1].argmin(), 0])
+        first = max(deepest - level_length, float(self._positions[:, 0].min()))
 
         def height_difference(radius: float) -> float:
-            near_end, far_end = (
-                self._lowest_height(radius),
-                self._lowest_height(radius + level_length),
-            )
-            return np.nan if near_end is None or far_end is None else near_end[0] - far_end[0]
+            near = self._lowest_height(radius)
+            far = self._lowest_height(radius + level_length)
+            return np.nan if near is None or far is None else near[0] - far[0]
 
-        scanned_radii = np.linspace(lower, upper, _SCANNED_RADII)
-        differences = [height_difference(x) for x in scanned_radii.tolist()]
-        sign_change = next(
-            (k for k in range(_SCANNED_RADII - 1) if differences[k] <= 0 <= differences[k + 1]),
-            None,
-        )
-        if sign_change is None:
+        radii = np.linspace(first, deepest, _SCANNED_RADII).tolist()
+        differences = [height_difference(x) for x in radii]
+        k = next((k for k, (a, b) in enumerate(zip(differences, differences[1:], strict=False))
+                  if a <= 0 <= b), None)  # fmt: skip
+        if k is None:
             return None
-        radius = float(
-            brentq(
-                height_difference,
-                scanned_radii[sign_change],
-                scanned_radii[sign_change + 1],
-                xtol=_POSITION_TOLERANCE,
-            )
-        )
+        radius = float(brentq(height_difference, radii[k], radii[k + 1], xtol=_POSITION_TOLERANCE))
         bottom = self._lowest_height(radius)
         inner_radii = np.linspace(radius, radius + level_length, _CHECKED_POINTS)[1:-1]
-        inner_bottoms = [self._lowest_height(x) for x in inner_radii.tolist()]
-        if bottom is None or any(x is None or x[0] < bottom[0] - 1e-6 for x in inner_bottoms):
+        inner = [self._lowest_height(x) for x in inner_radii.tolist()]
+        if bottom is None or any(x is None or x[0] < bottom[0] - 1e-6 for x in inner):
             return None
-        return self._create_dimension(
-            f"depth of a {level_length:g} m level bottom", (bottom[0] + self.ground, bottom[1]),
+        return self._dimension(
+            f"depth of a {level_length:g} m level bottom", (bottom[0] + self._ground, bottom[1]),
             "deepest level line of that length that the lip follows",
         )  # fmt: skip
 
     def _vertical_wall_depth(self, pivot: FrameSectionCoordinates) -> Dimension | None:
-        """The deepest point of an upright wall: the lip follows it, the floor keeps off it."""
+        """Return the deepest point of a vertical wall that the lip follows.
+
+        Neither the floor of the bucket nor its pivot may be beyond the wall.
+        """
         blade = next(
-            (x.blade for x in self.machine.external_forces
-             if isinstance(x, SoilCutting) and x.frame == self.workspace.frame), None,
+            (x.blade for x in self._machine.external_forces
+             if isinstance(x, SoilCutting) and x.frame == self._workspace.frame), None,
         )  # fmt: skip
-        if blade is None or self.workspace.section.is_radial:
+        if blade is None or self._workspace.section.is_radial:
             return None
-        frames, section, size = (
-            FrameJacobians(self.machine),
-            self.workspace.section,
-            self._characteristic_length,
-        )
-
-        def floor_direction_objective(way: Array) -> Objective:
-            """How far the floor points along a direction, from the lip on."""
-
-            def evaluate(q: Array) -> tuple[float, Array]:
-                frames.set_configuration(q)
-                blade_direction = frames.frame_pose(self.workspace.frame).rotation @ np.array(
-                    blade
-                )
-                angular_jacobian = frames.jacobian(self.workspace.frame)[3:]
-                return float(way @ blade_direction), np.asarray(
-                    np.cross(blade_direction, way) @ angular_jacobian
-                )
-
-            return evaluate
-
-        inward_objective, rise_objective = (
-            floor_direction_objective(-section.first_direction),
-            floor_direction_objective(section.second_direction),
-        )
-        pivot_objective = objective_difference(
-            self._lip_coordinates.coordinate_objective(0, scale=size),
+        section, size = self._workspace.section, self._size
+        inward = self._floor_objective(np.array(blade), -section.first_direction)
+        upward = self._floor_objective(np.array(blade), section.second_direction)
+        pivot_behind = objective_difference(
+            self._lip.coordinate_objective(0, scale=size),
             pivot.coordinate_objective(0, scale=size),
         )
-        q, positions = self._optimizer.q, self._lip_positions
-        direction_components = np.array(
-            [[inward_objective(x)[0], rise_objective(x)[0]] for x in q]
-        )
-        constraint_violation = np.maximum(-direction_components, 0.0).sum(axis=1)
-        constraint_violation += np.maximum(pivot.coordinates(q) - positions, 0.0)[:, 0] / size
+        q, positions = self._optimizer.q, self._positions
+        components = np.array([[inward(x)[0], upward(x)[0]] for x in q])
+        violation = np.maximum(-components, 0.0).sum(axis=1)
+        violation += np.maximum(pivot.coordinates(q) - positions, 0.0)[:, 0] / size
         optimum = self._optimizer.maximize(
-            self._lip_coordinates.coordinate_objective(1, -1.0, self.ground),
+            self._lip.coordinate_objective(1, -1.0, self._ground),
             -positions[:, 1],
-            [("ineq", inward_objective), ("ineq", rise_objective), ("ineq", pivot_objective)],
-            constraint_violation,
+            [("ineq", inward), ("ineq", upward), ("ineq", pivot_behind)],
+            violation,
         )
-        if (
-            optimum is None
-            or optimum[0] <= _MIN_DEPTH
-            or not self._reaches_ground_vertically(optimum[1])
-        ):
+        if optimum is None or optimum[0] <= _MIN_DEPTH:
             return None
-        return self._create_dimension(
+        if not self._reaches_ground_vertically(optimum[1]):
+            return None
+        return self._dimension(
             "vertical wall digging depth", optimum,
             "deepest lip with neither the bucket's floor nor its pivot beyond an upright line, "
             "that the lip follows to the ground",
         )  # fmt: skip
 
+    def _floor_objective(self, blade: Array, direction: Array) -> Objective:
+        """Return the component along a direction (3,) of the floor behind the lip."""
+        frames, frame = FrameJacobians(self._machine), self._workspace.frame
+
+        def evaluate(q: Array) -> tuple[float, Array]:
+            frames.set_configuration(q)
+            floor = frames.frame_pose(frame).rotation @ blade
+            gradient = np.cross(floor, direction) @ frames.jacobian(frame)[3:]
+            return float(direction @ floor), np.asarray(gradient)
+
+        return evaluate
+
     def _reaches_ground_vertically(self, q: Array) -> bool:
-        """Whether the lip gets from a posture straight up to the ground."""
-        radius, lip_height = self._lip_coordinates.coordinates(q[None])[0].tolist()
-        for height in np.linspace(lip_height, self.ground, _CHECKED_POINTS)[1:].tolist():
-            optimum = self._optimizer.maximize(
-                self._lip_coordinates.coordinate_objective(1),
-                np.zeros(len(self._lip_positions)),
-                [
-                    (
-                        "eq",
-                        self._lip_coordinates.coordinate_objective(
-                            0, 1.0, radius, self._characteristic_length
-                        ),
-                    ),
-                    (
-                        "eq",
-                        self._lip_coordinates.coordinate_objective(
-                            1, 1.0, height, self._characteristic_length
-                        ),
-                    ),
-                ],
-                np.abs(self._lip_positions - [radius, height]).sum(axis=1)
-                / self._characteristic_length,
-            )
-            if optimum is None:
-                return False
-        return True
+        """Return whether the lip can move from a configuration vertically to the ground."""
+        radius, lip_height = self._lip.coordinates(q[None])[0].tolist()
+        objective, zeros = self._lip.coordinate_objective(1), np.zeros(len(self._positions))
+        return all(
+            self._maximize_fixed(objective, zeros, {0: radius, 1: height}) is not None
+            for height in np.linspace(lip_height, self._ground, _CHECKED_POINTS)[1:].tolist()
+        )
 
     def _dump_height(self, pivot: FrameSectionCoordinates) -> Dimension | None:
-        lip_coordinates, size = self._lip_coordinates, self._characteristic_length
-        lip_positions, pivot_positions = self._lip_positions, pivot.coordinates(self._optimizer.q)
-        horizontal_difference = objective_difference(
-            lip_coordinates.coordinate_objective(0, scale=size),
-            pivot.coordinate_objective(0, scale=size),
+        lip, size = self._lip, self._size
+        horizontal = objective_difference(
+            lip.coordinate_objective(0, scale=size), pivot.coordinate_objective(0, scale=size)
         )
-        vertical_difference = objective_difference(
-            pivot.coordinate_objective(1, scale=size),
-            lip_coordinates.coordinate_objective(1, scale=size),
+        vertical = objective_difference(
+            pivot.coordinate_objective(1, scale=size), lip.coordinate_objective(1, scale=size)
         )
+        offsets = self._positions - pivot.coordinates(self._optimizer.q)
         optimum = self._optimizer.maximize(
-            lip_coordinates.coordinate_objective(1, 1.0, self.ground),
-            lip_positions[:, 1],
-            [("eq", horizontal_difference), ("ineq", vertical_difference)],
-            (
-                np.abs(lip_positions - pivot_positions)[:, 0]
-                + np.maximum(lip_positions - pivot_positions, 0.0)[:, 1]
-            )
-            / size,
+            lip.coordinate_objective(1, 1.0, self._ground),
+            self._positions[:, 1],
+            [("eq", horizontal), ("ineq", vertical)],
+            (np.abs(offsets)[:, 0] + np.maximum(offsets, 0.0)[:, 1]) / size,
         )
-        return self._create_dimension(
+        return self._dimension(
             "dump height", optimum, "highest lip straight under the bucket's pivot"
         )
 
     def _front_slewing_radius(self) -> Dimension | None:
-        """The least radius that holds all pins of the front: of each that may be the outermost."""
-        q, size = self._optimizer.q, self._characteristic_length
-        pin_coordinates = [
-            FrameSectionCoordinates(self.workspace, link)
-            for link in _front_pin_links(self.machine, self.workspace.frame)
+        """Return the smallest radius that contains all pins of the front.
+
+        Each pin that is the outermost one in some configuration is tried.
+        """
+        q, size = self._optimizer.q, self._size
+        signed_pins = [
+            (FrameSectionCoordinates(self._workspace, link), sign)
+            for link in _front_pin_links(self._machine, self._workspace.frame)
+            for sign in (1.0, -1.0)
         ]
-        signed_pins = [(pin, sign) for pin in pin_coordinates for sign in (1.0, -1.0)]
-        signed_distances = np.column_stack(
-            [sign * pin.coordinates(q)[:, 0] for pin, sign in signed_pins]
-        )
+        distances = np.column_stack([sign * pin.coordinates(q)[:, 0] for pin, sign in signed_pins])
         objectives = [pin.coordinate_objective(0, sign, scale=size) for pin, sign in signed_pins]
-        best_candidate: tuple[FrameSectionCoordinates, float, Array] | None = None
-        for k in np.unique(signed_distances.argmax(axis=1)).tolist():
+        best: tuple[FrameSectionCoordinates, float, Array] | None = None
+        for k in np.unique(distances.argmax(axis=1)).tolist():
             pin, sign = signed_pins[k]
-            constraints = [
+            constraints: list[ObjectiveConstraint] = [
                 ("ineq", objective_difference(objectives[k], other))
                 for j, other in enumerate(objectives)
                 if j != k
             ]
-            constraint_violation = (signed_distances.max(axis=1) - signed_distances[:, k]) / size
+            violation = (distances.max(axis=1) - distances[:, k]) / size
             optimum = self._optimizer.maximize(
-                pin.coordinate_objective(0, -sign),
-                -signed_distances[:, k],
-                constraints,
-                constraint_violation,
+                pin.coordinate_objective(0, -sign), -distances[:, k], constraints, violation
             )
-            if optimum is not None and (best_candidate is None or -optimum[0] < best_candidate[1]):
-                best_candidate = pin, -optimum[0], optimum[1]
-        if best_candidate is None:
+            if optimum is not None and (best is None or -optimum[0] < best[1]):
+                best = pin, -optimum[0], optimum[1]
+        if best is None:
             return None
-        pin, radius, configuration = best_candidate
-        dimension = self._create_dimension(
+        pin, radius, configuration = best
+        dimension = self._dimension(
             "smallest front slewing radius", (radius, configuration),
-            "least radius that holds the lip and all pins of the front",
+            "smallest radius that contains the lip and all pins of the front",
         )  # fmt: skip
         return dimension and dimension._replace(
             section_position=self._rounded_position(pin, configuration)
@@ -374,7 +404,7 @@ class DimensionFinder:
 
 
 def _front_pin_links(machine: Machine, frame: str) -> list[str]:
-    """Links whose origins are the pins of what slews, and the frame itself."""
+    """Return the frame and the links whose origins are the pins of the slewing part."""
     slewing_joint = find_slewing_joint(machine, frame)
     assert slewing_joint is not None, "it slews"
     model = machine.model
@@ -385,6 +415,4 @@ def _front_pin_links(machine: Machine, frame: str) -> list[str]:
             joint_id = model.getJointId(joint.name)
             if joint_id != slew_joint_id and slew_joint_id in list(model.supports[joint_id]):
                 out.append(joint.child)
-    for loop in machine.closure.equations.loops:
-        out.append(loop.successor)
-    return out
+    return out + [loop.successor for loop in machine.closure.equations.loops]

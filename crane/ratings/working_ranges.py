@@ -1,4 +1,4 @@
-"""Working range, as brochures draw it: how far, deep and high a machine works."""
+"""Working range: reach, depth and height of a machine (ISO 7135, brochures)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,27 +12,26 @@ from crane.dynamics.statics import StaticsEvaluator
 from crane.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
 from crane.motion.workspaces.workspace_section import up_direction
-from crane.ratings.pivot_joints import bucket_and_arm_strokes, find_pivot
-from crane.ratings.strokes import Strokes, check_drives
+from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, check_drives, find_pivot
 from crane.ratings.working_range_dimensions import Dimension, DimensionFinder
 from crane.recordings.timeseries import Table, write_table
 
-DEFAULT_LEVEL_LENGTH = 2.44  # length of the level bottom, 8 ft [m]
-_WORKSPACE_SAMPLES = 4000  # postures
+DEFAULT_LEVEL_LENGTH = 2.44  # 8 ft [m]
+_WORKSPACE_SAMPLES = 4000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WorkingRange(Result):
-    """How far a machine works.
+    """Dimensions of the working range of a machine.
 
     Attributes:
         machine: The machine.
-        frame: Whose reach it is: the lip.
+        frame: Lip, whose reach is measured.
         ground_height: Height of the ground [m].
-        workspace: What the frame reaches.
-        bucket_joint: Joint of the bucket, None where there is none.
+        workspace: Workspace of the frame.
+        bucket_joint: Joint of the bucket; None if there is no bucket.
         level_length: Length of the level bottom [m].
-        dimensions: The numbers.
+        dimensions: Dimensions, in the order of brochures.
     """
 
     machine: Machine
@@ -44,7 +43,6 @@ class WorkingRange(Result):
     dimensions: tuple[Dimension, ...]
 
     def _one_line(self) -> str:
-        """Its numbers."""
         dimension_texts = ", ".join(
             f"{dimension.name} {dimension.value:.4g} m" for dimension in self.dimensions
         )
@@ -58,7 +56,7 @@ class WorkingRange(Result):
         raise InputError(f"'{name}' is no dimension of '{self.machine.name}', {hint}")
 
     def to_markdown(self) -> str:
-        """A table: each dimension, where it is, and how it is defined."""
+        """Return a table of the dimensions with their positions and definitions."""
         lines = [
             f"# Working range of {self.machine.name}\n",
             f"Of `{self.frame}`, over ground at height {self.ground_height:g} m.\n",
@@ -74,7 +72,7 @@ class WorkingRange(Result):
         return "\n".join([*lines, ""])
 
     def to_csv(self, path: str | Path) -> None:
-        """Write a row per dimension: value, place, active coordinates; names are above.
+        """Write one row per dimension: value, position, active coordinates; names in the head.
 
         Raises:
             OutputError: The file cannot be written.
@@ -100,52 +98,44 @@ def working_range(
     bucket: str | None = None,
     level: float = DEFAULT_LEVEL_LENGTH,
 ) -> WorkingRange:
-    """How far, deep and high a machine works, by the terms of ISO 7135 and brochures.
+    """Compute reach, depth and height of a machine by the terms of ISO 7135 and brochures.
 
-    Every number is an optimum over all strokes within their limits, with exact slopes, from
-    several postures (`crane.motion.workspaces.workspace_extremes.maximize_on_branch`); the slewing
-    joint stays at home. Without a bucket there are reach, depth and height alone.
+    Each dimension is an optimum over all strokes within their limits, computed with exact
+    derivatives from several starts (`maximize_on_branch`); the slewing joint stays at home.
+    Without a bucket there are only reach, depth and height.
 
     Args:
         machine: The machine.
-        frame: The lip; the tip if not given.
-        bucket: The joint whose drive turns the bucket, see `breakout`.
+        frame: The lip; the tip by default.
+        bucket: Joint whose drive turns the bucket, see `breakout`.
         level: Length of the level bottom [m].
 
     Raises:
-        InputError: An unknown frame or joint, or a frame that moves in no upright plane.
+        InputError: A frame or joint is unknown, or the frame does not move in a vertical plane.
     """
     level = as_number(level, "the level bottom's length", "m", greater_than=0.0)
-    reachable_space = workspace(machine, _WORKSPACE_SAMPLES, frame)
-    vertical = up_direction(machine)
-    if (
-        not reachable_space.area
-        or abs(reachable_space.section.second_direction @ vertical) < 1 - 1e-9
-    ):
+    reach = workspace(machine, _WORKSPACE_SAMPLES, frame)
+    is_upright = abs(reach.section.second_direction @ up_direction(machine)) >= 1 - 1e-9
+    if not reach.area or not is_upright:
         raise InputError(
-            f"'{reachable_space.frame}' of '{machine.name}' moves in no upright plane, a "
-            f"working range is "
+            f"'{reach.frame}' of '{machine.name}' moves in no upright plane, a working range is "
             "drawn in one: name another frame"
         )
     joint = pivot_joint = None
     strokes = Strokes(StaticsEvaluator(check_drives(machine), frame))
     try:
         i = bucket_and_arm_strokes(strokes, bucket)[0]
-        joint, pivot_joint = machine.active[i], find_pivot(machine, reachable_space.frame, i)
+        joint, pivot_joint = machine.active[i], find_pivot(machine, reach.frame, i)
     except InputError:
         if bucket is not None:
             raise
     ground_height = _ground_height(machine)
-    dimensions = tuple(
-        DimensionFinder(reachable_space, ground_height, pivot_joint).find_all(level)
-    )
-    return WorkingRange(
-        machine, reachable_space.frame, ground_height, reachable_space, joint, level, dimensions
-    )
+    dimensions = tuple(DimensionFinder(reach, ground_height, pivot_joint).find_all(level))
+    return WorkingRange(machine, reach.frame, ground_height, reach, joint, level, dimensions)
 
 
 def _ground_height(machine: Machine) -> float:
-    """Height of the ground under the machine: that of what touches it, else 0 [m]."""
+    """Return the height of the ground under the machine [m]; 0 if nothing touches ground."""
     for force in machine.external_forces:
         ground = getattr(force, "ground", None)
         if ground is not None and not ground.profile:

@@ -1,268 +1,49 @@
-"""The power account of a hydraulic run: what the pumps' shafts give, and where all of it goes."""
+"""Power balance of a hydraulic run: power of the pumps' shafts, and what it goes into."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from crane.codegen import Program, Tape
 from crane.common.errors import RecordingError, suggest_names
-from crane.common.result import Result
 from crane.common.samples import Array
-from crane.common.units import format_quantity
 from crane.control import ValveDrive, ValveSignals
 from crane.description import Friction
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.dynamics import Dynamics
 from crane.hydraulics import CircuitEquations, Engine
 from crane.hydraulics.circuit_elements import MAIN_PUMP
-from crane.hydraulics.power_balance import ROD_POWER, SHAFT_POWER, STORED_POWERS, component_powers
+from crane.hydraulics.power_balance import ROD_POWER, SHAFT_POWER, component_powers
 from crane.machine import Machine
 from crane.recordings import Recording
 from crane.recordings.missing_measurements import check_columns_present
-from crane.recordings.timeseries import TIME, check_unit, write_columns
-
-DIESEL_DENSITY = 840.0  # [kg/m3]
-LOAD, JOINT_FRICTION, _FRICTION_FORCE = "load", "friction", "grip"
-# What an owner's power goes into, in the order in which it is told.
-POWER_PARTS = (
-    SHAFT_POWER,
-    "friction",
-    "slip",
-    "relief",
-    "bypass",
-    "element",
-    "inlet",
-    "compensator",
-    "outlet",
-    "regeneration",
-    "leak",
-    "refill",
-    "damper",
-    "cooling",
+from crane.recordings.timeseries import check_unit
+from crane.studies.power_balance_result import (
+    JOINT_FRICTION,
     LOAD,
-    *STORED_POWERS,
+    POWER_PARTS,
+    PowerBalance,
+    part_kind,
+    part_owner,
 )
-POWER_CLASSES = (  # what belongs together of that
-    LOAD, "friction", "outlet", "inlet", "compensator", "leaks and relief", "pump", "elements",
-    "stored",
-)  # fmt: skip
-_CLASS_OF_PART = {
-    "friction": "friction", "damper": "friction", "outlet": "outlet", "float": "outlet",
-    "inlet": "inlet", "regeneration": "inlet", "compensator": "compensator",
-    "leak": "leaks and relief", "relief": "leaks and relief", "refill": "leaks and relief",
-    "element": "elements", "cooling": "elements", LOAD: LOAD, "stored": "stored",
-    "spring": "stored",
-}  # fmt: skip
-_MIN_TABLE_SHARE = 1e-4  # share of the shafts' energy that a table tells
-_TABLE_HEADING = ("item", "energy [kJ]", "share", "back [kJ]", "mean [kW]", "peak [kW]")
 
-
-@dataclass(frozen=True, eq=False, repr=False)
-class PowerBalance(Result):
-    """Power of every part of a circuit over time, and energies over the recording.
-
-    Parts are called OWNER.WHAT, the owner being a pump, joint, line, accumulator, element or the
-    tank. `shaft_power` is what turns a pump (what its line draws, of one that keeps its pressure).
-    All others are what that power goes into, so that at every instant
-
-        sum of the shafts = sum of all others.
-
-    | what | of | power |
-    |---|---|---|
-    | friction | pump | its torque losses and drag |
-    | slip, relief, bypass | pump | Q (p - p_tank) of leak, relief valve, open centres |
-    | inlet | joint | Q times the drop at the edge that meters, or at all where none follows |
-    | compensator | joint | Q times the rest of the drop from pump to chamber |
-    | outlet, refill | joint | Q times the drop, with load holding and cushion |
-    | regeneration | joint | from B to A |
-    | leak, relief | joint | to the tank, and from one chamber to the other |
-    | damper | joint | heat in the damper of a series spring |
-    | friction | joint | its friction times its velocity |
-    | load | joint | F v less that: what moves and lifts; negative where it drives the cylinder |
-    | element | element | Q times the drop |
-    | cooling | accumulator | heat that leaves its gas |
-    | stored, spring | chambers, lines, gas, tank | p times the oil that comes in; springs |
-
-    The tank's oil counts at the tank's pressure like that of any node.
-
-    Attributes:
-        time: (N,) [s].
-        powers: (N,) [W] by part.
-        pumps: Their names.
-        joints: Those with a cylinder.
-        engine_power: (N,) what it gives [W], that is all shafts where its speed was not recorded;
-            None without one.
-        fuel_mass: Burnt from the first sample to the last [kg], None where consumption is not
-            known.
-        machine_name: Its name.
-        task_name: What it was doing, "" if not known.
-    """
-
-    time: Array
-    powers: Mapping[str, Array]
-    pumps: tuple[str, ...]
-    joints: tuple[str, ...]
-    engine_power: Array | None
-    fuel_mass: float | None
-    machine_name: str
-    task_name: str
-
-    def _one_line(self) -> str:
-        """Of what, how long, and what its shafts gave."""
-        subject = ": ".join(text for text in (self.machine_name, self.task_name) if text)
-        fuel = "" if self.fuel_mass is None else f", {self.fuel_mass:.4g} kg of fuel"
-        return (
-            f"PowerBalance of {subject or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s: "
-            f"shafts "
-            f"{format_quantity(self.integrate_energy(self.shaft_power), 'J', 4)}{fuel}"
-        )
-
-    @property
-    def shaft_power(self) -> Array:
-        """(N,) that turns all pumps [W]."""
-        return self._total_power(name for name in self.powers if part_kind(name) == SHAFT_POWER)
-
-    @property
-    def residual(self) -> Array:
-        """(N,) shafts less all others: rounding [W]."""
-        return self.shaft_power - self._total_power(
-            name for name in self.powers if part_kind(name) != SHAFT_POWER
-        )
-
-    @property
-    def energies(self) -> dict[str, float]:
-        """By part over the recording, by the trapezoidal rule [J]."""
-        return {name: self.integrate_energy(power) for name, power in self.powers.items()}
-
-    @property
-    def totals(self) -> dict[str, float]:
-        """Of shafts, losses, loads, and what is stored at the end, over the recording [J]."""
-        totals_by_kind = dict.fromkeys((SHAFT_POWER, "lost", LOAD, "stored"), 0.0)
-        for name, energy in self.energies.items():
-            totals_by_kind[part_total(name)] += energy
-        return totals_by_kind
-
-    @property
-    def fuel_volume(self) -> float | None:
-        """Of the fuel, as diesel of 840 kg/m3 [m3]."""
-        return None if self.fuel_mass is None else self.fuel_mass / DIESEL_DENSITY
-
-    def owner_powers(self, owner: str) -> dict[str, Array]:
-        """Powers (N,) of one owner by what they are [W]."""
-        return {part_kind(x): power for x, power in self.powers.items() if part_owner(x) == owner}
-
-    def integrate_energy(self, power: Array) -> float:
-        """Of a power (N,) over the recording [J]."""
-        return float(np.trapezoid(power, self.time))
-
-    def mean_power(self, power: Array) -> float:
-        """Of a power (N,) over the recording [W]."""
-        duration = float(self.time[-1] - self.time[0])
-        return self.integrate_energy(power) / duration if duration else float(power[0])
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write all powers over time, whole or not at all.
-
-        Raises:
-            OutputError: It cannot be written there.
-        """
-        columns = dict(self.powers) | (
-            {} if self.engine_power is None else {"engine": self.engine_power}
-        )
-        units = {TIME: "s"} | dict.fromkeys(columns, "W")
-        notes = {"crane power account": "", "machine": self.machine_name, "task": self.task_name}
-        notes = {key: text for key, text in notes.items() if text or key.startswith("crane")}
-        write_columns(path, units, [self.time, *columns.values()], notes)
-
-    def to_markdown(self) -> str:
-        """Energies, means and peaks by part, totals, and fuel."""
-        rows = [_TABLE_HEADING, ("---",) + ("---:",) * (len(_TABLE_HEADING) - 1)]
-        min_energy = _MIN_TABLE_SHARE * self.integrate_energy(np.abs(self.shaft_power))
-        listed_parts = [
-            x for x in self.powers if self.integrate_energy(np.abs(self.powers[x])) > min_energy
-        ]
-        rows += [self._table_row(f"{part_owner(x)}: {part_kind(x)}", [x]) for x in listed_parts]
-        total_labels = {SHAFT_POWER: "all shafts", "lost": "all losses", LOAD: "all loads",
-                 "stored": "all that is stored"}  # fmt: skip
-        for total_kind, label in total_labels.items():
-            rows.append(
-                self._table_row(
-                    f"**{label}**", [x for x in self.powers if part_total(x) == total_kind]
-                )
-            )
-        if self.engine_power is not None:
-            rows.append(self._table_cells("**engine**", self.engine_power))
-        text = "".join(f"| {' | '.join(row)} |\n" for row in rows)
-        text += (
-            f"\n{self.time[-1] - self.time[0]:.6g} s; share of what the shafts give; back is what "
-            "of it was negative, as where a load drives its cylinder; peaks are sizes; parts of "
-            "less than 0.01 % are left out.\n"
-        )
-        if self.fuel_mass is not None:
-            volume = 1e6 * self.fuel_mass / DIESEL_DENSITY
-            text += (
-                f"fuel: {self.fuel_mass:.4g} kg, {volume:.4g} ml of diesel ({DIESEL_DENSITY:g} "
-                f"kg/m3)\n"
-            )
-        return text
-
-    def _total_power(self, names: Iterable[str]) -> Array:
-        return sum((self.powers[name] for name in names), np.zeros_like(self.time))
-
-    def _table_row(self, label: str, names: Sequence[str]) -> tuple[str, ...]:
-        return self._table_cells(label, self._total_power(names))
-
-    def _table_cells(self, label: str, power: Array) -> tuple[str, ...]:
-        energy, shaft_energy = (
-            self.integrate_energy(power),
-            self.integrate_energy(self.shaft_power),
-        )
-        returned_energy = self.integrate_energy(np.maximum(-power, 0.0))
-        share = f"{100 * energy / shaft_energy:z.1f} %" if shaft_energy > 0 else ""
-        figures = (returned_energy, self.mean_power(power), float(np.abs(power).max()))
-        return (label, f"{1e-3 * energy:z.3f}", share, *(f"{1e-3 * x:z.3f}" for x in figures))
-
-
-def part_owner(name: str) -> str:
-    """Of a part, `X_lift` of `X_lift.inlet`."""
-    return name.rpartition(".")[0]
-
-
-def part_kind(name: str) -> str:
-    """Of a part, `inlet` of `X_lift.inlet`."""
-    return name.rpartition(".")[2]
-
-
-def part_total(name: str) -> str:
-    """Which total a part belongs to: "shaft", "load", "stored", or "lost"."""
-    kind = part_kind(name)
-    return "stored" if kind in STORED_POWERS else kind if kind in (SHAFT_POWER, LOAD) else "lost"
-
-
-def part_class(balance: PowerBalance, name: str) -> str:
-    """What a part belongs to that is not a shaft, of `POWER_CLASSES`."""
-    kind = part_kind(name)
-    if part_owner(name) in balance.pumps and kind != "stored":
-        return "pump"
-    return _CLASS_OF_PART[kind]
+_FRICTION_FORCE = "grip"
 
 
 def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
-    """Where the power of a hydraulic run goes, from what was recorded.
+    """Compute the power balance of a recorded hydraulic run.
 
-    The circuit's formulas are evaluated anew at every sample, so it takes simulations as well as
-    measurements, as far as they have the channels: velocities, pressures of all nodes, spools (or
-    voltages of valves without inertia and play), compressions of series springs, and of a pump
-    that was simulated its share. Where the power that turns the first pump is not recorded, its
-    line's pressure is taken as it is, and the pump gives what is drawn: what its own regulator,
-    slip, friction and relief valve take is not told then. Friction of joints is that of the
-    channels `friction_X`, or else the machine's.
+    The equations of the circuit are evaluated at every sample. The recording may be simulated or
+    measured; it needs the channels of velocities, pressures of all nodes, spools (or voltages of
+    valves without inertia and play), compressions of series springs, and for a simulated pump its
+    share. If the power of the first pump's shaft is not recorded, the pressure of its line is
+    taken as given and the pump delivers the flow that is drawn; the losses of its regulator,
+    slip, friction and relief valve are then unknown. The friction of joints is read from the
+    channels `friction_X`, or else computed by the laws of the machine.
 
     Args:
-        machine: What was recorded, with a circuit.
-        recording: Of it; `Recording.between` has a part.
+        machine: The recorded machine, with a circuit.
+        recording: The recording; `Recording.between` returns a part of one.
 
     Raises:
         InputError: The machine has no circuit.
@@ -278,7 +59,7 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
     _check_joints(machine, recording)
     m = len(circuit.joints)
     lower_limits = drive.settings[len(circuit.constants) :][:m]
-    columns = _CircuitColumns(recording, circuit, machine)
+    columns = _CircuitColumns(recording, circuit)
     columns.check_channels()
     x = np.column_stack([recorded[joint] for joint in circuit.joints]) - lower_limits
     v = np.column_stack([recorded[joint + VELOCITY_SUFFIX] for joint in circuit.joints])
@@ -322,7 +103,7 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
 
 
 def _engine_power(engine: Engine, speed: Array) -> Array:
-    """(N,) power of its governor at speeds (N,) [rad/s]."""
+    """Return the power (N,) of the governed engine at speeds (N,) [rad/s]."""
     torque_share = np.clip(
         (engine.speed + engine.speed_droop - speed) / engine.speed_droop, 0.0, 1.0
     )
@@ -343,7 +124,13 @@ def _check_joints(machine: Machine, recording: Recording) -> None:
 def _joint_friction(
     machine: Machine, recording: Recording, friction_forces: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """(N,) of the active joints [N], [N m]; `friction_forces` are of seals and brakes."""
+    """Return the friction (N,) of the active joints [N], [N m].
+
+    Args:
+        machine: The machine.
+        recording: The recording.
+        friction_forces: Coulomb friction (N,) of seals and brakes by joint.
+    """
     names = {joint: f"friction_{joint}" for joint in machine.active}
     if all(name in recording.channels for name in names.values()):
         return {joint: recording.channels[name] for joint, name in names.items()}
@@ -359,24 +146,23 @@ def _joint_friction(
 
 
 class _CircuitColumns:
-    """What a recording has of a circuit's states.
+    """Columns of a recording as states of a circuit.
 
     Args:
         recording: The recording.
-        circuit: Its circuit.
-        machine: Whose it is.
+        circuit: The circuit.
     """
 
-    def __init__(self, recording: Recording, circuit: CircuitEquations, machine: Machine):
-        self._recording, self._circuit, self._machine = recording, circuit, machine
+    def __init__(self, recording: Recording, circuit: CircuitEquations):
+        self._recording, self._circuit = recording, circuit
         self._channels = recording.channels
         self._spools = circuit.hydraulics.spools
 
     def check_channels(self) -> None:
-        """See that all channels are there, in their units.
+        """Check that all channels are recorded in their units.
 
         Raises:
-            RecordingError: The message names all that are not.
+            RecordingError: Channels are missing, or in other units.
         """
         try:
             check_columns_present(self._required_columns(), self._channels)
@@ -400,7 +186,7 @@ class _CircuitColumns:
             yield (f"spool_{name}", f"voltage_{name}") if is_instantaneous else (f"spool_{name}",)
 
     def state_column(self, name: str) -> Array:
-        """(N,) of one state: s = p - p_vapour of a pressure."""
+        """Return a state (N,); the state of a pressure is s = p - p_vapour."""
         prefix, _, owner = name.partition("_")
         oil = self._circuit.hydraulics.oil
         if name == "engine":
@@ -410,11 +196,13 @@ class _CircuitColumns:
         if prefix == "pressure":
             return self._channels[name] - oil.vapour_pressure
         if name.startswith("spool_rate_") or prefix == "load":
-            return np.zeros_like(self._recording.time)  # no flow depends on it, given the share
+            return np.zeros_like(
+                self._recording.time
+            )  # no flow depends on it if the share is given
         return self._spool_position(owner) if prefix in ("play", "spool") else self._channels[name]
 
     def signal_columns(self) -> list[Array]:
-        """(N,) of each spool [V], at which it would stand as recorded."""
+        """Return the signal (N,) of each spool at its recorded position [V]."""
         return [
             spool.neutral + (spool.full - spool.neutral) * self._spool_position(name)
             for name, spool in self._spools.items()
@@ -427,7 +215,7 @@ class _CircuitColumns:
         return (self._channels[f"voltage_{name}"] - spool.neutral) / (spool.full - spool.neutral)
 
     def boundary_pressures(self) -> list[Array]:
-        """(N,) pressures of supply and tank [Pa]."""
+        """Return the pressures (N,) of supply and tank [Pa]."""
         default_tank_pressure = np.full_like(
             self._recording.time, self._circuit.hydraulics.supply.tank
         )
@@ -438,9 +226,9 @@ class _CircuitColumns:
 
 
 def _evaluate_powers(circuit: CircuitEquations, rows: Array) -> tuple[list[str], Array]:
-    """Names (k,) and values (N, k) of powers and grips at rows (N, .).
+    """Return names (k,) and values (N, k) of powers and Coulomb friction at rows (N, .).
 
-    A row has x, v, states, signals and given pressures.
+    A row has strokes, velocities, states, signals and given pressures.
     """
 
     def build(program: Program) -> None:

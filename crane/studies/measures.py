@@ -1,4 +1,4 @@
-"""What a machine needs for its tasks, and where its strokes take it."""
+"""Measures of a machine: forces and energy of its tasks, ranges of its strokes, reach."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -18,20 +18,20 @@ from crane.motion.workspaces.workspace_section import up_direction
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation import simulate
 
-_SAMPLES_PER_SECOND = 200  # samples per second of a task
-_LEVER_TASK_STEP = 5e-3  # [s] between samples of a task of levers
-_COUPLED_GRID_SIZE = 1000  # postures of the grid over the strokes that move passive joints
-_MAX_CONFIGURATIONS = 5000  # with those of the other strokes
-_CONTINUATION_STEPS = 16  # from one of the grid to the next
-_RANDOM_CONFIGURATIONS = 8  # postures at which a stroke is seen to move the tip
-_MOTION_TOLERANCE = 1e-9  # slope of the tip that it does so by [m/m], [m/rad]
-_REACH_START_COUNT = 12  # postures of the grid from which the farthest reach is sought
-_STROKE_START_COUNT = 4  # the same for the end of a stroke
-_MIN_START_DISTANCE = 0.2  # of the strokes, between two of them
+_SAMPLES_PER_SECOND = 200  # of a task
+_LEVER_TASK_STEP = 5e-3  # between samples of a task of levers [s]
+_COUPLED_GRID_SIZE = 1000  # configurations of the grid over strokes that move passive joints
+_MAX_CONFIGURATIONS = 5000  # of this grid and of all other strokes
+_CONTINUATION_STEPS = 16  # between neighbours of the grid
+_RANDOM_CONFIGURATIONS = 8  # configurations that decide whether a stroke moves the tip
+_MOTION_TOLERANCE = 1e-9  # derivative of the tip position at rest [m/m], [m/rad]
+_REACH_START_COUNT = 12  # configurations of the grid from which the reach is searched
+_STROKE_START_COUNT = 4  # configurations from which the end of a stroke is searched
+_MIN_START_DISTANCE = 0.2  # share of the strokes between two starts
 
 
 def task_measures(machine: Machine) -> dict[str, str]:
-    """Names and units of what is measured task by task; pump_work of tasks of levers alone."""
+    """Return names and units of the measures of tasks; pump_work for tasks of levers only."""
     units = {joint: FORCE_UNITS[machine.unit(joint)] for joint in machine.driven_joints}
     return {
         **{f"peak_{joint}": unit for joint, unit in units.items()},
@@ -44,7 +44,7 @@ def task_measures(machine: Machine) -> dict[str, str]:
 
 
 def stroke_measures(machine: Machine) -> dict[str, str]:
-    """Names and units of what is measured over the strokes."""
+    """Return names and units of the measures of strokes."""
     return {
         **({} if machine.tip is None else {"reach": "m"}),
         "range": "",
@@ -56,18 +56,17 @@ def stroke_measures(machine: Machine) -> dict[str, str]:
 def measure_task(
     machine: Machine, dynamics: Dynamics, task: str
 ) -> tuple[float, dict[str, float]]:
-    """What the driven joints need to move as a task asks, and its duration [s].
+    """Compute the duration [s] of a task and its measures.
 
-    Inverse dynamics of the reference motion, friction included, while free joints move as they
-    will: with some, the motion is that of a simulation under `ComputedTorque`. A task of levers
-    is simulated with its circuit: the forces are those of the cylinders then, and pump_work is
-    what the pumps gave.
+    Forces follow from inverse dynamics of the trajectory, friction included. With free joints, the
+    motion is simulated under `ComputedTorque`. A task of levers is simulated with its circuit;
+    the forces are then those of the cylinders, and pump_work is the work of the pumps.
 
         tau = inverse(q_ref, v_ref, a_ref),     peak = max |tau|,   rms^2 = 1/T int tau^2 dt,
         energy = int sum max(0, tau_i v_i) dt,  work = int sum tau_i v_i dt.
 
     Raises:
-        CraneError: The machine cannot do it.
+        CraneError: The machine cannot perform the task.
     """
     if machine.tasks[task].space == "joystick":
         return _measure_lever_task(machine, task)
@@ -86,7 +85,7 @@ def measure_task(
 
 
 def _measure_lever_task(machine: Machine, name: str) -> tuple[float, dict[str, float]]:
-    """The same of a task of levers, simulated with its circuit and loads."""
+    """Compute duration and measures of a task of levers, with its circuit and loads."""
     task = machine.tasks[name]
     run = simulate(
         machine.with_external_forces(*task.loads),
@@ -100,7 +99,7 @@ def _measure_lever_task(machine: Machine, name: str) -> tuple[float, dict[str, f
 
 
 def _force_measures(machine: Machine, time: Array, v_a: Array, tau: Array) -> dict[str, float]:
-    """Measures of forces (N, n) along a motion."""
+    """Return the measures of forces tau (N, n) along a motion."""
     power, duration = tau * v_a, float(time[-1] - time[0])
     measures = {}
     for joint in machine.driven_joints:
@@ -115,7 +114,7 @@ def _force_measures(machine: Machine, time: Array, v_a: Array, tau: Array) -> di
 
 
 def combine_task_measures(tasks: Sequence[tuple[float, dict[str, float]]]) -> dict[str, float]:
-    """Measures of tasks done one after the other, from those of each, see `measure_task`."""
+    """Combine the measures of tasks that follow each other, see `measure_task`."""
     total_duration = sum(duration for duration, _ in tasks)
     out = {}
     for name in [x for x in tasks[0][1] if all(x in found for _, found in tasks)]:
@@ -131,12 +130,12 @@ def combine_task_measures(tasks: Sequence[tuple[float, dict[str, float]]]) -> di
 
 
 def measure_strokes(machine: Machine) -> dict[str, float]:
-    """Where the strokes can go from home with the loops closed, within the limits.
+    """Compute the ranges of the strokes that are reached from home with closed loops.
 
-    A grid over the limits finds where, and the extremes of it are improved until they are exact,
-    see `farthest`: lower and upper are the ends of each stroke, reach is the largest horizontal
-    distance of the tip from the world's origin. range is the share of the grid that closes, and as
-    fine as that.
+    A grid over the limits is closed from home, and its extremes are improved until they are exact
+    (`maximize_on_branch`): lower and upper are the ends of each stroke, reach is the largest
+    horizontal distance of the tip from the world's origin. range is the share of the grid that
+    closes; its resolution is that of the grid.
     """
     home = machine.home[machine.closure.active]
     is_coupled = _coupled_strokes(machine)
@@ -166,7 +165,7 @@ def measure_strokes(machine: Machine) -> dict[str, float]:
 
 
 def resolution_notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ...]:
-    """How fine measures are that are not exact, a line each."""
+    """Return one line per measure that is not exact, with its resolution."""
     lines = []
     if any(name in task_measures(machine) for name in measures):
         lines.append(f"forces are taken every {1e3 / _SAMPLES_PER_SECOND:g} ms of a task")
@@ -181,18 +180,18 @@ def resolution_notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ..
 
 
 def _coupled_strokes(machine: Machine) -> NDArray[np.bool_]:
-    """Which driven joints (n,) move passive ones."""
+    """Return which driven joints (n,) move passive joints."""
     gamma = machine.closure.gamma(machine.home)[machine.closure.passive]
     return np.asarray((np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.is_driven)
 
 
 def _values_per_stroke(is_coupled: NDArray[np.bool_]) -> int:
-    """How many values of each stroke the grid has."""
+    """Return the number of values of each stroke in the grid."""
     return max(3, int(_COUPLED_GRID_SIZE ** (1 / max(1, int(is_coupled.sum()))) + 1e-9))
 
 
 def _stroke_ranges(machine: Machine, home_values: Array) -> tuple[Array, Array]:
-    """Limits of the active joints; a turn about home where an angle has none, free ones there."""
+    """Return limits of the active joints: a turn if unlimited; home for free joints."""
     half_turn = np.array(
         [np.pi if machine.unit(joint) == "rad" else 0.0 for joint in machine.active]
     )
@@ -206,14 +205,14 @@ def _stroke_ranges(machine: Machine, home_values: Array) -> tuple[Array, Array]:
 def _neighbouring_cells(
     cell: tuple[int, ...], grid_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, ...]]:
-    """The neighbours of a cell along the axes of a grid."""
+    """Yield the neighbours of a cell along the axes of a grid."""
     for i, step in itertools.product(range(len(grid_shape)), (-1, 1)):
         if 0 <= cell[i] + step < grid_shape[i]:
             yield (*cell[:i], cell[i] + step, *cell[i + 1 :])
 
 
 def _closed_configurations(machine: Machine, axes: list[Array]) -> Array:
-    """Closed postures (N, nq) of a grid that are connected with home."""
+    """Return the closed configurations (N, nq) of a grid that are connected with home."""
     closure = machine.closure
     try:
         return closure.solve(np.array(list(itertools.product(*axes))))
@@ -249,9 +248,9 @@ def _closed_configurations(machine: Machine, axes: list[Array]) -> Array:
 
 
 def _close_from_neighbour(machine: Machine, q: Array, target: Array) -> Array | None:
-    """The closed posture at a target beside a posture q (nq,), None where the loops open."""
+    """Return the closed configuration at a target near q (nq,); None if the loops open."""
     closure = machine.closure
-    if closure.is_compiled:  # to find out slowly that they do would take most of the time
+    if closure.is_compiled:  # the slow search for open loops would take most of the time
         compiled_closure = closure.compiled_closure
         cursor, start = compiled_closure.new_cursor(), q[closure.active]
         compiled_closure.start_cursor_at(cursor, q)
@@ -276,7 +275,7 @@ def _stroke_end(
     stroke_index: int,
     sign: float,
 ) -> float:
-    """How far one stroke goes up (sign 1) or down (-1), from the closed postures of the grid."""
+    """Return the upper (sign 1) or lower (-1) end of a stroke from closed configurations."""
     column = machine.closure.active[stroke_index]
     limit = float(limits[int(sign > 0)][stroke_index])
     values = sign * configurations[:, column]
@@ -303,7 +302,7 @@ def _largest_reach(
     is_coupled: NDArray[np.bool_],
     limits: tuple[Array, Array],
 ) -> float:
-    """Largest horizontal distance of the tip, over all strokes."""
+    """Return the largest horizontal distance of the tip over all strokes."""
     kinematics, up = Kinematics(machine), up_direction(machine)
     active = machine.closure.active
 
@@ -329,16 +328,8 @@ def _largest_reach(
     values_per_stroke = max(
         2, int((_MAX_CONFIGURATIONS / len(configurations)) ** (1 / max(1, len(uncoupled_strokes))))
     )
-    stroke_values = np.array(
-        list(
-            itertools.product(
-                *(
-                    np.linspace(limits[0][i], limits[1][i], values_per_stroke)
-                    for i in uncoupled_strokes
-                )
-            )
-        )
-    )
+    axes = [np.linspace(limits[0][i], limits[1][i], values_per_stroke) for i in uncoupled_strokes]
+    stroke_values = np.array(list(itertools.product(*axes)))
     all_configurations = np.repeat(configurations, len(stroke_values), axis=0)
     all_configurations[:, active[uncoupled_strokes]] = np.tile(
         stroke_values, (len(configurations), 1)
@@ -356,12 +347,12 @@ def _largest_reach(
 
 
 def _relative_strokes(q_a: Array, limits: tuple[Array, Array]) -> Array:
-    """Active coordinates (N, n) as shares of the way between their ends."""
+    """Return active coordinates (N, n) as shares of their ranges."""
     return (q_a - limits[0]) / np.where(limits[1] > limits[0], limits[1] - limits[0], 1.0)
 
 
 def _separated_indices(values: Array, relative_strokes: Array) -> list[int]:
-    """Indices of the largest values (N,) whose places (N, n) are not beside each other."""
+    """Return indices of the largest values (N,) whose strokes (N, n) are apart."""
     remaining = np.argsort(-values, kind="stable")
     chosen: list[int] = []
     while len(remaining) and len(chosen) < _REACH_START_COUNT:

@@ -1,40 +1,108 @@
-"""Jobs of a study: here, in processes, or on a cluster."""
+"""Jobs of a study: in this process, in several processes, or on a Dask cluster."""
 
 import multiprocessing
 import os
 import pickle
+import re
 import threading
+import uuid
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from crane.common.errors import InputError
+from crane.common.errors import CraneWarning, InputError
+from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import as_count
 from crane.formats import load
 from crane.machine import Machine
-from crane.studies.dask_cluster import compute_on_cluster
 
-_PROCESSES_PER_CORE = (
-    8  # processes: more would wait for each other, and each has the machine in memory
-)
-# What of a machine its files describe.
-_COMPARED_ATTRIBUTES = (
-    "tree", "active", "free", "friction", "forces", "gas_springs", "ropes", "end_stops",
-    "hydraulics",
-)  # fmt: skip
+_CONNECTION_TIMEOUT = 10.0  # [s] for the scheduler to answer
 
 J = TypeVar("J")
 R = TypeVar("R")
 
 
-def machine_from_files(machine: Machine | str | Path) -> tuple[Machine, str]:
-    """The machine as its files and the changes given to `load` describe it, and what loads it.
+def compute_on_cluster(
+    function: Callable[[J], R], jobs: Sequence[J], scheduler: str
+) -> Iterator[tuple[int, Any]]:
+    """Yield indices and results of jobs on a Dask cluster as they finish.
+
+    Jobs of a worker that dies are computed by the other workers.
+
+    Args:
+        function: Function of a job; workers import it from this package.
+        jobs: Arguments of the function.
+        scheduler: Address of the scheduler.
 
     Raises:
-        InputError: It is another one: variants are loaded from files.
+        InputError: Dask is not installed, the scheduler does not answer, or workers keep dying.
+    """
+    dask = import_optional_library("distributed", "a scheduler")
+    if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+/?", scheduler):
+        raise InputError(
+            f"'{scheduler}' is no address of a scheduler, give one such as tcp://HOST:8786"
+        )
+    try:
+        client = dask.Client(scheduler, timeout=_CONNECTION_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"no scheduler answers at '{scheduler}' ({error}), start one with 'dask scheduler' "
+            "and give the address that it prints"
+        ) from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            warnings.warn(
+                f"the scheduler at {scheduler} has no workers yet, start some with "
+                f"'dask worker {scheduler}'",
+                CraneWarning,
+                stacklevel=2,
+            )
+        run = uuid.uuid4().hex
+        keys = [f"crane-study-{run}-{index}" for index in range(len(jobs))]
+        futures = client.map(function, jobs, key=keys, pure=False)
+        indices = {future.key: index for index, future in enumerate(futures)}
+        for future in dask.as_completed(futures, loop=client.loop):
+            yield indices[future.key], _job_result(future, indices[future.key], scheduler)
+
+
+def _job_result(future: Any, index: int, scheduler: str) -> Any:
+    """Return the result of a finished job, or raise the reason of its failure."""
+    from distributed import KilledWorker
+
+    if future.status == "finished":
+        return future.result()
+    failure = future.exception() if future.status == "error" else None
+    if isinstance(failure, KilledWorker):
+        raise InputError(
+            f"variant {index} was begun by several workers and all of them died, see "
+            "their logs: give them more memory or fewer threads"
+        )
+    if isinstance(failure, ImportError | AttributeError):
+        raise InputError(
+            f"the workers cannot run this version of crane ({failure}), install it there"
+        )
+    if failure is None:
+        raise InputError(f"the scheduler at {scheduler} is gone, start it again")
+    raise failure
+
+
+_PROCESSES_PER_CORE = 8  # more would wait for each other, and each keeps the machine in memory
+# attributes of a machine that its files describe
+_COMPARED_ATTRIBUTES = (
+    "tree", "active", "free", "friction", "forces", "gas_springs", "ropes", "end_stops",
+    "hydraulics",
+)  # fmt: skip
+
+
+def machine_from_files(machine: Machine | str | Path) -> tuple[Machine, str]:
+    """Return a machine as its files and changes describe it, and the argument that loads it.
+
+    Raises:
+        InputError: The machine differs from its files, from which variants are loaded.
     """
     if not isinstance(machine, Machine):
         loaded = load(machine)
@@ -54,17 +122,17 @@ def machine_from_files(machine: Machine | str | Path) -> tuple[Machine, str]:
 
 
 def _tasks_without_loads(machine: Machine) -> dict[str, tuple[object, int]]:
-    """Its tasks but for their loads, which are counted."""
+    """Return the tasks without their loads, and the number of these loads."""
     return {
         name: (replace(task, loads=()), len(task.loads)) for name, task in machine.tasks.items()
     }
 
 
 def check_process_count(count: int) -> int:
-    """How many processes compute, at most eight per core.
+    """Return a number of processes, at most eight per core.
 
     Raises:
-        InputError: It is no such number.
+        InputError: The number is not valid.
     """
     max_processes = _PROCESSES_PER_CORE * (os.cpu_count() or 1)
     return as_count(count, "the number of processes", 1, max_processes)
@@ -73,12 +141,12 @@ def check_process_count(count: int) -> int:
 def compute_jobs(
     function: Callable[[J], R], jobs: Sequence[J], processes: int, scheduler: str | None
 ) -> Iterator[tuple[int, R]]:
-    """Indices and results of jobs as they get ready, here or elsewhere.
+    """Yield indices and results of jobs as they finish.
 
     Args:
-        function: What is computed; other processes import it from this package.
-        jobs: Its arguments.
-        processes: How many compute.
+        function: Function of a job; other processes import it from this package.
+        jobs: Arguments of the function.
+        processes: Number of processes.
         scheduler: Address of a Dask scheduler whose workers compute instead.
     """
     if scheduler is not None:
@@ -91,7 +159,7 @@ def compute_jobs(
 
 
 def _exit_with_parent() -> None:
-    """Let this process end when the one that started it has, however that was."""
+    """End this process when its parent ends, for whatever reason."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -105,7 +173,7 @@ def _exit_with_parent() -> None:
 def _compute_in_processes(
     function: Callable[[J], R], jobs: Sequence[J], processes: int
 ) -> Iterator[tuple[int, R]]:
-    # threads would wait for each other: most of a variant is computed in Python
+    # processes, because most of a variant is computed in Python, under the interpreter lock
     try:
         pickle.dumps(jobs[0])
     except (AttributeError, TypeError, pickle.PicklingError) as error:

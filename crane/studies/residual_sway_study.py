@@ -1,4 +1,4 @@
-"""How much sway a motion leaves, by method and payload."""
+"""Residual sway of a motion, by sway suppression method and payload."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from crane.motion.sway import SWAY_METHODS, Sway
 from crane.motion.task_trajectories import task_trajectory
 from crane.simulation import simulate
 
-_OBSERVATION_TIME = 10.0  # [s] after the motion
+_OBSERVATION_TIME = 10.0  # after the motion [s]
 _STEP = 1e-2  # [s]
 DEFAULT_DAMPING_RATIO = 0.2
 
@@ -27,17 +27,17 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class SwayRow:
-    """What one motion leaves.
+    """Residual sway of one motion.
 
     Attributes:
-        payload: [kg].
-        method: Of `suppress_sway`.
-        damping: Damping ratio that the feedback of sway asks for, 0 without.
-        duration: The shortest that the flow allows [s].
-        relative_duration: That over the duration without any method.
-        residual_sway: The largest sway in 10 s after it, of all free joints together (root of the
-            sum of squares) [rad].
-        relative_reduction: By which share that is less than without any method.
+        payload: Mass of the payload [kg].
+        method: Method of `suppress_sway`.
+        damping: Damping ratio of the sway feedback; 0 without feedback.
+        duration: Shortest duration that the flow allows [s].
+        relative_duration: Duration over that without any method.
+        residual_sway: Largest sway in the 10 s after the motion, root of the sum of squares over
+            all free joints [rad].
+        relative_reduction: Reduction of the sway, as a share of that without any method.
     """
 
     payload: float
@@ -50,33 +50,31 @@ class SwayRow:
 
     @property
     def label(self) -> str:
-        """The method in words."""
+        """Description of the method."""
         return f"{self.method}, damped" if self.damping else self.method
 
 
 @dataclass(frozen=True, repr=False)
 class SwayStudy(OneLineRepr):
-    """Sway that a task leaves through the valves.
+    """Residual sway of a task that is driven through the valves.
 
     Attributes:
-        task: Its name.
-        rows: By payload, then by method.
+        task: Name of the task.
+        rows: Results, by payload, then by method.
     """
 
     task: str
     rows: tuple[SwayRow, ...]
 
     def _one_line(self) -> str:
-        """Its task, and what leaves the least sway."""
         best_row = min(self.rows, key=lambda row: row.residual_sway)
         return (
             f"SwayStudy of '{self.task}': {format_count(len(self.rows), 'motion')}, the least "
-            f"sway "
-            f"{np.degrees(best_row.residual_sway):.3g} deg by {best_row.label}"
+            f"sway {np.degrees(best_row.residual_sway):.3g} deg by {best_row.label}"
         )
 
     def to_text(self) -> str:
-        """A table."""
+        """Return a table of the results."""
         heading = ("payload", "method", "duration", "against none", "residual sway", "less")
         cells = [heading] + [
             (
@@ -100,22 +98,22 @@ def sway_study(
     changes: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> SwayStudy:
-    """Sway that a task leaves, with and without each method, as fast as the flow allows.
+    """Compute the residual sway of a task, with and without each sway suppression method.
 
-    Every motion is run through the valves by `ValveFeedforward`, in the shortest time that the
-    circuit has the flow for (`fastest`). The sway is that of the free joints against where they
-    hang still.
+    Every motion is driven through the valves by `ValveFeedforward`, in the shortest time that the
+    flow of the circuit allows (`fastest_trajectory`). The sway is the deviation of the free joints
+    from their hanging equilibrium.
 
     Args:
-        machine: What `load` takes; with free joints and a circuit.
-        task: From rest to rest.
-        payloads: [kg].
-        damping: Damping ratio that the feedback of sway asks for; 0 for none.
-        changes: Further parameters.
-        progress: Is told the share that is done.
+        machine: Argument of `load`: a machine with free joints and a circuit.
+        task: Name of a task from rest to rest.
+        payloads: Masses [kg].
+        damping: Damping ratio of the sway feedback; 0 for no feedback.
+        changes: Further parameter changes.
+        progress: Function that is called with the finished share, 0 to 1.
 
     Raises:
-        CraneError: As `load`, `fastest` and `simulate`.
+        CraneError: See `load`, `fastest_trajectory` and `simulate`.
     """
     progress = progress_reporter(progress)
     if not payloads:
@@ -155,7 +153,7 @@ def sway_study(
 
 
 def _residual_sway(machine: Machine, control: ValveFeedforward, duration: float) -> float:
-    """The largest sway after a motion [rad]."""
+    """Return the largest sway after a motion [rad]."""
     start = control.planned_trajectory.position(0.0)
     end_time = _STEP * np.ceil((duration + _OBSERVATION_TIME) / _STEP)
     run = simulate(

@@ -1,4 +1,4 @@
-"""The table that a study results in."""
+"""Result of a study: a table of measures by variant."""
 
 import csv
 from collections.abc import Mapping
@@ -20,17 +20,16 @@ class Study(Result):
     """Measures of V variants of a machine.
 
     Attributes:
-        machine_reference: What `crane.load` takes.
+        machine_reference: Argument of `crane.load`.
         parameters: Names of the parameters that vary.
-        measures: Names of the measures, those over all tasks.
+        measures: Names of the measures over all tasks.
         tasks: Names of the tasks.
-        units: Unit of every column but the last, empty for a share.
-        columns: By name (V,): parameters, measures, and where there are several tasks "MEASURE
-            TASK" for each of them. NaN where a variant could not be measured. SI units.
-        failure_reasons: Why a variant could not be measured, or "".
-        grid_shape: Numbers of values of the parameters, whose last one varies fastest; () if
-            drawn.
-        resolution_notes: How fine measures are that are not exact.
+        units: Unit of every column; empty for a share.
+        columns: Values (V,) by name, in SI units: parameters, measures, and with several tasks
+            "MEASURE TASK" for each of them. NaN where a variant could not be measured.
+        failure_reasons: Reason by variant why it could not be measured, or "".
+        grid_shape: Number of values of each parameter, the last one varies fastest; () if drawn.
+        resolution_notes: Resolution of measures that are not exact.
     """
 
     machine_reference: str
@@ -44,17 +43,15 @@ class Study(Result):
     resolution_notes: tuple[str, ...] = ()
 
     def _one_line(self) -> str:
-        """What varies, and what is measured."""
         failed = sum(map(bool, self.failure_reasons))
         return (
             f"Study of {self.machine_reference}: {len(self)} variants of "
-            f"{', '.join(self.parameters)}, "
-            f"{failed} not measured; {', '.join(self.measures)}"
+            f"{', '.join(self.parameters)}, {failed} not measured; {', '.join(self.measures)}"
         )
 
     @property
     def rows(self) -> list[dict[str, float | str]]:
-        """One dictionary per variant, with its "reason"."""
+        """One dictionary per variant, with its "reason" of failure."""
         return [
             {**{name: float(values[i]) for name, values in self.columns.items()}, "reason": reason}
             for i, reason in enumerate(self.failure_reasons)
@@ -64,13 +61,13 @@ class Study(Result):
         return len(self.failure_reasons)
 
     def rank(self, measure: str) -> list[int]:
-        """Variants from best to worst, without those that could not be measured.
+        """Return the measured variants from best to worst.
 
-        The least is best, of reach, range, highest and upper strokes the largest; of expressions
-        the least comes first.
+        The smallest value is best; of reach, range, highest and upper strokes the largest.
+        Expressions are sorted with the smallest value first.
 
         Raises:
-            InputError: There is no such measure.
+            InputError: The measure is not in the study.
         """
         if measure not in self.columns or measure in self.parameters:
             names = [name for name in self.columns if name not in self.parameters]
@@ -86,10 +83,10 @@ class Study(Result):
         return sorted(measured_indices, key=lambda i: keys[i])
 
     def best_row(self, measure: str) -> dict[str, float | str]:
-        """The best row, see `rank`.
+        """Return the best row, see `rank`.
 
         Raises:
-            InputError: There is no such measure, or no variant has it.
+            InputError: The measure is not in the study, or no variant has a value.
         """
         ranking = self.rank(measure)
         if not ranking:
@@ -97,7 +94,7 @@ class Study(Result):
         return self.rows[ranking[0]]
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the table: a column each with its unit, the reason last, empty cells for NaN.
+        """Write the table: one column per name with its unit, reason last, empty cells for NaN.
 
         Raises:
             OutputError: The file cannot be written.
@@ -112,9 +109,10 @@ class Study(Result):
                 writer.writerow(["" if value != value else value for value in row.values()])
 
     def to_text(self, max_rows: int = 10) -> str:
-        """The best rows by the first measure, for reading; the best one is marked.
+        """Return the best rows by the first measure as text; the best one is marked.
 
-        Of an expression the least comes first, unmarked: nobody knows which is best.
+        Rows of an expression are sorted, smallest first, without a mark, because the better
+        direction is not known.
         """
         shown_columns = [*self.parameters, *self.measures[:5]]
         titles = [

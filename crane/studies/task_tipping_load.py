@@ -1,4 +1,4 @@
-"""The load under which a machine tips while it does a task."""
+"""The payload at which a machine tips during a task."""
 
 import warnings
 from typing import NamedTuple
@@ -16,18 +16,18 @@ from crane.recordings.recording import Recording
 from crane.simulation import simulate
 
 PAYLOAD_MASS = "payload.mass"
-_STEP = 5e-3  # [s] between the instants at which it may tip
-_RELATIVE_TOLERANCE = 1e-4  # of the load
+_STEP = 5e-3  # between instants at which tipping is checked [s]
+_RELATIVE_TOLERANCE = 1e-4  # of the payload
 _MAX_DOUBLINGS = 20
 
 
 class TippingLoad(NamedTuple):
-    """What tips a machine that moves.
+    """Payload at which a moving machine tips.
 
     Attributes:
-        mass: Of the payload [kg], infinite where none does.
-        time: When it is on a tipping line [s].
-        static_mass: The payload under which it would tip standing still at the worst posture [kg].
+        mass: Mass of the payload [kg]; infinite if the machine does not tip.
+        time: Instant at which the machine is on a tipping line [s].
+        static_mass: Mass at which the machine would tip at rest in the worst configuration [kg].
     """
 
     mass: float
@@ -36,24 +36,25 @@ class TippingLoad(NamedTuple):
 
 
 def tipping_load(machine: Machine, task: str) -> TippingLoad:
-    """The payload with which a task brings a machine just onto a tipping line, by bisection.
+    """Find the payload with which a task brings a machine just onto a tipping line.
 
-    A trajectory is followed exactly (computed torque), so what tips are inertial forces of the
-    task itself, not of a controller that swings. A task of levers is what these do to the machine
-    with that payload. Loads of the task act besides.
+    Trajectories are followed exactly by computed torque, so that only the inertial forces of the
+    task count, not those of a controller that oscillates. Tasks of levers are simulated with the
+    payload. Loads of the task act in addition.
 
     Args:
-        machine: Fixed to the world, with `supports` and a payload.
-        task: One of its tasks.
+        machine: A machine that is fixed to the world, with `supports` and a payload.
+        task: Name of one of its tasks.
 
     Raises:
-        InputError: It has no such task, no payload, or no supports; or it tips without a load.
+        InputError: The machine has no such task, no payload or no supports, or it tips without
+            payload.
     """
     if task not in machine.tasks:
         raise InputError(
             f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
         )
-    TippingStability(machine)  # that it has supports
+    TippingStability(machine)  # raises without supports
     variants = MachineVariants(machine)
     if PAYLOAD_MASS not in variants.values:
         raise InputError(f"'{machine.name}' has no payload, describe one in its machine file")
@@ -61,7 +62,7 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
 
     def smallest_margin(mass: float, channel: str = "stability") -> float:
         if mass not in recordings:
-            with warnings.catch_warnings():  # that it tips is what is asked for
+            with warnings.catch_warnings():  # tipping is expected
                 warnings.simplefilter("ignore", CraneWarning)
                 recordings[mass] = _simulate_task(variants.machine({PAYLOAD_MASS: mass}), task)
         return float(recordings[mass].channels[channel].min())

@@ -1,4 +1,4 @@
-"""Design studies: the same measures of many variants, here or on a cluster."""
+"""Design studies: the same measures of many variants of a machine."""
 
 import itertools
 import math
@@ -25,10 +25,11 @@ from crane.formats import load
 from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 from crane.ratings.rating_rules import Rule, find_rule
-from crane.studies.design.measure_expressions import MeasureExpression, parse_requirement
-from crane.studies.design.user_measures import (
+from crane.studies.design.measure_expressions import (
+    MeasureExpression,
     MeasureFunction,
     load_user_measures,
+    parse_requirement,
     transferable_measures,
 )
 from crane.studies.design.variant_measures import (
@@ -49,31 +50,31 @@ from crane.studies.measures import (
 from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
 from crane.studies.study_table import Study
 
-_MAX_VARIANTS = 100_000  # variants
-_REQUIREMENT_TOLERANCE = 1e-9  # by which a requirement may fail
-# Parameters that inverse dynamics does not know, by their first word.
+_MAX_VARIANTS = 100_000
+_REQUIREMENT_TOLERANCE = 1e-9  # relative violation of a requirement that is accepted
+# first words of parameters that do not change inverse dynamics
 _NON_MECHANICAL_PREFIXES = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
 Progress = Callable[[float], None]
 
-# One machine per set of formulas: as long as it lives, variants share its machine code.
+# one machine per set of formulas; variants share its machine code as long as it exists
 _CODE_OWNERS: dict[int, Machine] = {}
 
 
 class StudyJob(NamedTuple):
-    """What a variant is computed from, wherever that happens.
+    """Everything that the measures of a variant depend on, independent of the process.
 
     Attributes:
-        machine: What `load` takes.
-        changes: Of its parameters.
-        locked_joints: Joints that are fixed.
-        tasks: To measure it with.
-        with_strokes: Whether to measure its strokes.
-        expressions: Of measures, see `crane.studies.design`.
-        requirements: What has to hold.
-        user_measures: A Python file of a user's own measures, or these.
-        frame: Where loads hang.
-        rule: By which they are rated.
-        expression_tasks: Tasks that expressions are measured with.
+        machine: Argument of `load`.
+        changes: Parameter changes.
+        locked_joints: Joints that are held.
+        tasks: Tasks that are measured.
+        with_strokes: Whether the strokes are measured.
+        expressions: Expressions of measures, see `crane.studies.design`.
+        requirements: Requirements.
+        user_measures: Python file of user measures, or functions by name.
+        frame: Link at which loads hang.
+        rule: Rating rule of loads.
+        expression_tasks: Tasks of expressions.
     """
 
     machine: str
@@ -105,36 +106,35 @@ def study(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Study:
-    """Measure variants of a machine: the grid of all values, or random draws.
+    """Measure variants of a machine: a grid of parameter values, or random draws.
 
-    Measures, see `crane.studies.measures`: peak_JOINT, rms_JOINT, energy and work of the active
-    joints over the tasks; reach, range, lower_JOINT and upper_JOINT of the strokes; and any
-    expression that `crane.design` takes, such as "load(4, 0) / mass". Tasks of levers are
-    simulated with their circuit. Every variant is loaded afresh, so its row does not depend on
-    where it is computed, or after what.
+    The measures (see `crane.studies.measures`) are peak_JOINT, rms_JOINT, energy and work of the
+    active joints over the tasks; reach, range, lower_JOINT and upper_JOINT of the strokes; and
+    any expression that `crane.design` takes, such as "load(4, 0) / mass". Tasks of levers are
+    simulated with their circuit. Every variant is loaded from the files, so that its row does not
+    depend on the process that computes it, nor on the order.
 
     Args:
-        machine: What `crane.load` takes, or what it gave.
-        vary: By name of a parameter, see `crane.description.parameters`: values, of which all
-            combinations are taken, or with `draws` the two ends of a range.
-        tasks: Of the machine; all if not given.
-        measures: Which ones; all if not given.
-        require: "A >= B", "A <= B" or "A == B" of such expressions; variants that fail are not
-            measured, and say by how much.
-        user_measures: Functions of a machine by name that expressions know, or a Python file of
-            them.
-        frame: Where loads hang, of expressions; the tip if not given.
-        rule: By which they are rated.
-        draws: Number of variants drawn uniformly from the ranges.
-        seed: Of the draws.
-        processes: How many to compute with, at most eight per core; more than one need a main
-            module that may be imported (`if __name__ == "__main__":`).
+        machine: Argument or result of `crane.load`.
+        vary: Values by parameter name (see `crane.description.parameters`), of which all
+            combinations are taken; with `draws` the two ends of a range.
+        tasks: Tasks of the machine; all by default.
+        measures: Measures; all by default.
+        require: Requirements "A >= B", "A <= B" or "A == B" of expressions. Variants that fail
+            are not measured; their reason states the violation.
+        user_measures: Functions of a machine by name for expressions, or a Python file of them.
+        frame: Link at which loads of expressions hang; the tip by default.
+        rule: Rating rule of loads.
+        draws: Number of variants that are drawn uniformly from the ranges.
+        seed: Seed of the draws.
+        processes: Number of processes, at most eight per core. More than one needs a main module
+            that can be imported (`if __name__ == "__main__":`).
         scheduler: Address of a Dask scheduler whose workers compute instead.
-        progress: Called with the finished share, 0 to 1.
+        progress: Function that is called with the finished share, 0 to 1.
 
     Raises:
-        InputError: Unknown names, values that do not go together, no variant can be measured, or a
-            machine that was changed after it was loaded.
+        InputError: A name is unknown, values are inconsistent, no variant can be measured, or the
+            machine was changed after it was loaded.
     """
     progress = progress_reporter(progress)
     check_process_count(processes)
@@ -181,36 +181,39 @@ def study(
         rows[index] = row
         if progress is not None:
             progress(len(rows) / len(jobs))
-    columns = dict(zip(vary, values.T, strict=True))
-    measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
-    available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
-    for measure in measures:
-        names = [measure]
-        if measure in task_measure_units and len(tasks) > 1:
-            names += [f"{measure} {task}" for task in tasks]
-        for column in names:
-            columns[column] = np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
-            units[column] = available[measure]
     reasons = tuple(rows[i][1] for i in range(len(jobs)))
     if all(reasons):
         raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
+    measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
+    available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
+    column_measures = _column_measures(measures, task_measure_units, tasks)
+    columns = dict(zip(vary, values.T, strict=True)) | {
+        column: np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
+        for column in column_measures
+    }
+    units |= {column: available[measure] for column, measure in column_measures.items()}
     return Study(
-        name,
-        tuple(vary),
-        measures,
-        tasks,
-        units,
-        columns,
-        reasons,
-        grid_shape,
-        resolution_notes(base_machine, measures),
-    )
+        name, tuple(vary), measures, tasks,
+        units, columns, reasons, grid_shape, resolution_notes(base_machine, measures),
+    )  # fmt: skip
+
+
+def _column_measures(
+    measures: Sequence[str], task_measures: Mapping[str, str], tasks: Sequence[str]
+) -> dict[str, str]:
+    """Return the measure of each column; with several tasks there is a column for each task."""
+    task_columns = tasks if len(tasks) > 1 else ()
+    return {
+        column: x
+        for x in measures
+        for column in (x, *(f"{x} {task}" for task in task_columns if x in task_measures))
+    }
 
 
 def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
-    """Columns of one variant, and why some are missing."""
+    """Return the columns of one variant, and the reasons for missing ones."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # told of the machine itself
+        warnings.simplefilter("ignore", CraneWarning)  # the machine itself has given them
         try:
             machine = load(study_job.machine, study_job.changes, study_job.locked_joints)
         except CraneError as error:
@@ -245,7 +248,7 @@ def _measure(machine: Machine, study_job: StudyJob) -> tuple[dict[str, float], s
 def _is_expression(
     text: str, available: Mapping[str, str], functions: Mapping[str, MeasureFunction]
 ) -> bool:
-    """Whether a measure is an expression and no name of the study's own.
+    """Return whether a measure is an expression, and not a name of the study.
 
     Raises:
         InputError: It is neither.
@@ -260,10 +263,10 @@ def _is_expression(
 
 
 def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, float]:
-    """Values of a variant's expressions.
+    """Return the values of a variant's expressions.
 
     Raises:
-        CraneError: One has no value, or a requirement fails.
+        CraneError: An expression has no value, or a requirement fails.
     """
     expressions = [
         *map(MeasureExpression, study_job.expressions),
@@ -292,7 +295,7 @@ def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, fl
 def _variant_values(
     vary: Mapping[str, ArrayLike], draws: int | None, seed: int
 ) -> tuple[Array, tuple[int, ...]]:
-    """Values (V, parameters), and the shape of the grid."""
+    """Return the values (V, parameters) and the shape of the grid."""
     if not vary:
         raise InputError("nothing varies, name a parameter and its values")
     axes = []
@@ -315,7 +318,7 @@ def _variant_values(
 def _unique_names(
     label: str, available: Mapping[str, object], requested: Sequence[str] | None
 ) -> tuple[str, ...]:
-    """Names without doubles, all if none are given."""
+    """Return the requested names without repetitions; all by default."""
     for name in requested or ():
         if name not in available:
             raise InputError(f"{label} '{name}' is unknown, {suggest_names(available, name)}")
@@ -323,12 +326,12 @@ def _unique_names(
 
 
 def _parameter_units(machine: Machine, vary: Mapping[str, object], with_circuit: bool) -> dict:
-    """Units by parameter; refuses those that do not exist or change nothing.
+    """Return units by parameter; raise for those that do not exist or change nothing.
 
     Args:
         machine: The machine.
-        vary: By name.
-        with_circuit: Whether something is measured that circuits and controllers change.
+        vary: Names of the parameters.
+        with_circuit: Whether a measure depends on circuits and controllers.
     """
     names = MachineVariants(machine).values
     units = {}

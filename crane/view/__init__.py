@@ -1,1 +1,1 @@
-"""Seeing a machine: pages, plots, sketches, and one to play with."""
+"""Views of machines and results: pages, figures, sketches, and a live view."""

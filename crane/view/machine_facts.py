@@ -1,4 +1,4 @@
-"""What a machine consists of, as facts and tables: for the terminal and for notebooks alike."""
+"""Facts about a machine with tables, for the terminal and for notebooks."""
 
 from collections.abc import Iterator, Mapping
 from math import inf, isfinite, isinf
@@ -14,13 +14,13 @@ from crane.recordings.recording import FORCE_UNITS
 
 
 class MachineFact(NamedTuple):
-    """One fact, and the rows of its table where it has one.
+    """One fact with an optional table.
 
     Attributes:
-        name: What it is about.
-        text: What is to be said.
-        heading: Of the columns, "" where a cell says by itself what it is.
-        rows: Cells, as many as there are columns; empty ones say nothing.
+        name: Subject of the fact.
+        text: Statement.
+        heading: Headings of the columns; "" for columns that need none.
+        rows: Cells of the table.
     """
 
     name: str
@@ -30,7 +30,7 @@ class MachineFact(NamedTuple):
 
 
 def machine_facts(machine: Machine) -> Iterator[MachineFact]:
-    """Files, joints, loops, drives, circuit, sensors and tasks of a machine."""
+    """Yield facts about files, joints, loops, drives, circuit, sensors and tasks of a machine."""
     if machine.source:
         yield MachineFact("source", machine.source)
     yield MachineFact("file", str(machine.path))
@@ -47,7 +47,6 @@ def machine_facts(machine: Machine) -> Iterator[MachineFact]:
 
 
 def _chain_fact(machine: Machine) -> MachineFact:
-    """The sub-chains, by their files where they have some of their own."""
     folder, chains = machine.path.parent, machine.chains
     rows = tuple((x.name, _relative_path(x.urdf, folder), x.parent or "") for x in chains)
     return MachineFact("chains", ", ".join(x.name for x in chains), ("", "", "on"), rows)
@@ -58,7 +57,7 @@ def _relative_path(file: Path, folder: Path) -> str:
 
 
 def _joint_fact(machine: Machine) -> MachineFact:
-    """All joints: those that are driven first."""
+    """Return all joints, active ones first."""
     free_text = f" and {len(machine.free)} free" if machine.free else ""
     mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
     columns = [*machine.closure.active, *machine.closure.passive]
@@ -72,7 +71,7 @@ def _joint_fact(machine: Machine) -> MachineFact:
 
 
 def _joint_row(machine: Machine, joint_index: int) -> tuple[str, ...]:
-    """A joint: its limits, its home, the most that drives it, and whether something does."""
+    """Return limits, home coordinate, largest effort and role of a joint."""
     joint = machine.joints[joint_index]
     unit, effort = machine.unit(joint), machine.model.effortLimit[joint_index]
     driven = joint in machine.active
@@ -179,7 +178,6 @@ def _format_sum(factors: Mapping[str, float]) -> str:
 
 
 def _format_limits(lower: float, upper: float, unit: str) -> str:
-    """A range in words, which may have no end."""
     if (lower, upper) == (-inf, inf):
         return "unlimited"
     if isinf(lower):

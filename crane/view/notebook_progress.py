@@ -1,4 +1,4 @@
-"""Cells of a notebook that take long say what goes on: one line with a bar, gone in the end."""
+"""Progress of long notebook cells: one line with a bar that disappears at the end."""
 
 from types import FrameType
 from typing import Any
@@ -7,10 +7,10 @@ from crane.common.progress import PROGRESS, MainThreadMonitor, current_activity
 
 
 def show_cell_progress(shell: Any) -> None:
-    """From this cell of a notebook on, tell what goes on in those that take long.
+    """Show the progress of long cells of a notebook from now on.
 
     Args:
-        shell: IPython's, of a kernel.
+        shell: IPython shell of the kernel.
     """
     bar = _CellProgressBar()
     shell.events.register("pre_run_cell", lambda *_: bar.start())
@@ -20,20 +20,20 @@ def show_cell_progress(shell: Any) -> None:
 
 
 class _CellProgressBar:
-    """The line of a cell."""
+    """Progress line of a cell."""
 
     def __init__(self) -> None:
         self._monitor: MainThreadMonitor | None = None
         self._display_handle: Any = None
 
     def start(self) -> None:
-        """A cell begins."""
+        """Start the progress of a cell."""
         self.stop()
         self._monitor = MainThreadMonitor(self._show_progress)
         self._monitor.start()
 
     def stop(self) -> None:
-        """It is over: no line stays."""
+        """Stop the progress and remove the line."""
         if self._monitor is not None:
             self._monitor.stop()
         if self._display_handle is not None:
@@ -43,7 +43,7 @@ class _CellProgressBar:
 
     def _show_progress(self, frame: FrameType | None, seconds: float) -> None:
         if not (activity := current_activity(frame)):
-            return  # of what is not the package's nothing is known
+            return  # progress is known only inside the package
         share = PROGRESS.finished_share(frame)
         value = "" if share is None else f' value="{share:.3f}"'
         share_text = "" if share is None else f"{share:.0%}, "
@@ -57,8 +57,6 @@ class _CellProgressBar:
 
 
 class _HtmlLine:
-    """A line of HTML."""
-
     def __init__(self, html: str):
         self._html = html
 

@@ -187,7 +187,9 @@ def _write_comparison(comparison: Any, folder: Path, npz: bool = False) -> None:
         (folder / SUMMARY).write_text(_recording_text(run), encoding="utf-8")
         _write_recording(run, folder, npz)
     if comparison.channels:
-        _write_figure(folder / "comparison.png", "comparison_figure.comparison_figure", comparison)
+        _write_figure(
+            folder / "comparison.png", "calibration_figure.comparison_figure", comparison
+        )
 
 
 def _capacity_text(chart: Any, torques: Any = None, **_: object) -> str:
@@ -278,7 +280,9 @@ def _write_orifices(
 ) -> None:
     sides = {f"recording {i + 1}": x for i, x in enumerate(result.training_sides)}
     sides |= {f"validation {i + 1}" if i else "validation": x for i, x in enumerate(validation)}
-    _write_figure(folder / "orifices.png", "hydraulics_figures.equation_sides_figure", sides, unit)
+    _write_figure(
+        folder / "orifices.png", "identification_figures.equation_sides_figure", sides, unit
+    )
 
 
 def _text_with_unit(result: Any, unit: str = "m") -> str:
@@ -286,11 +290,11 @@ def _text_with_unit(result: Any, unit: str = "m") -> str:
 
 
 def _write_valve(result: Any, folder: Path, unit: str = "m") -> None:
-    _write_figure(folder / "valve.png", "hydraulics_figures.valve_curve_figure", result, unit)
+    _write_figure(folder / "valve.png", "identification_figures.valve_curve_figure", result, unit)
 
 
 def _write_friction(result: Any, folder: Path, unit: str = "m") -> None:
-    _write_figure(folder / "friction.png", "hydraulics_figures.friction_figure", result, unit)
+    _write_figure(folder / "friction.png", "identification_figures.friction_figure", result, unit)
 
 
 RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
@@ -324,7 +328,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
         more_files=(RECORDING, RECORDING_NPZ, SUMMARY, "comparison.png"),
         stale=lambda *_: (FIGURE, PAGE),
         options=("npz",),
-        notebook_figures=("comparison_figure.comparison_figure",),
+        notebook_figures=("calibration_figure.comparison_figure",),
     ),
     "CylinderFriction": ResultFiles(
         summary="friction.txt",
@@ -379,7 +383,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     ),
     "PowerComparison": ResultFiles(
         summary="comparison.md",
-        figures={"comparison.png": "power_comparison_figure.power_comparison_figure"},
+        figures={"comparison.png": "power_figure.power_comparison_figure"},
         text=_power_comparison_text,
     ),
     "Recording": ResultFiles(
@@ -395,7 +399,7 @@ RESULT_FILES: Mapping[str, ResultFiles] = {  # by class
     "Sensitivities": ResultFiles(
         summary="sensitivities.md",
         tables={"sensitivities.csv": "to_csv"},
-        figures={"sensitivities.png": "sensitivities_figure.sensitivities_figure"},
+        figures={"sensitivities.png": "modes_figure.sensitivities_figure"},
     ),
     "SignalExcitation": ResultFiles(
         tables={"signals.csv": "to_csv"},

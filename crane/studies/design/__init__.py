@@ -1,5 +1,6 @@
-"""Numbers of a machine that are best for measures of it."""
+"""Design optimization: parameters of a machine that are best for measures of it."""
 
-from crane.studies.design.design_optimization import Design, DesignSolution, design
+from crane.studies.design.design_optimization import design
+from crane.studies.design.design_result import Design, DesignSolution
 
 __all__ = ["Design", "DesignSolution", "design"]

@@ -1,10 +1,148 @@
-"""Expressions of measures: parsed once, evaluated with whatever has arithmetic."""
+"""Expressions of measures, dual numbers for their derivatives, and measures of users."""
 
 import ast
-from collections.abc import Callable
+import importlib.util
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.machine import Machine
+
+
+@dataclass(frozen=True, eq=False)
+class DualNumber:
+    """A value with its derivatives by k variables; arithmetic propagates both exactly.
+
+    Attributes:
+        value: The value.
+        derivatives: (k,) derivatives.
+    """
+
+    value: float
+    derivatives: Array
+
+    def __add__(self, other: "DualNumber | float") -> "DualNumber":
+        second = self._as_dual(other)
+        return DualNumber(self.value + second.value, self.derivatives + second.derivatives)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> "DualNumber":
+        return DualNumber(-self.value, -self.derivatives)
+
+    def __pos__(self) -> "DualNumber":
+        return self
+
+    def __sub__(self, other: "DualNumber | float") -> "DualNumber":
+        return self + -self._as_dual(other)
+
+    def __rsub__(self, other: "DualNumber | float") -> "DualNumber":
+        return self._as_dual(other) - self
+
+    def __mul__(self, other: "DualNumber | float") -> "DualNumber":
+        second = self._as_dual(other)
+        derivatives = self.value * second.derivatives + second.value * self.derivatives
+        return DualNumber(self.value * second.value, derivatives)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: "DualNumber | float") -> "DualNumber":
+        second = self._as_dual(other)
+        value = self.value / second.value
+        return DualNumber(value, (self.derivatives - value * second.derivatives) / second.value)
+
+    def __rtruediv__(self, other: "DualNumber | float") -> "DualNumber":
+        return self._as_dual(other) / self
+
+    def __pow__(self, power: "DualNumber | float") -> "DualNumber":
+        if isinstance(power, DualNumber):
+            if power.derivatives.any():
+                return exp(power * log(self))
+            power = power.value
+        value = self.value**power
+        outer_derivative = power * self.value ** (power - 1.0) if power else 0.0
+        return DualNumber(value, outer_derivative * self.derivatives)
+
+    def __rpow__(self, base: float) -> "DualNumber":
+        return self._as_dual(base) ** self
+
+    def __abs__(self) -> "DualNumber":
+        return -self if self.value < 0 else self
+
+    def _as_dual(self, other: "DualNumber | float") -> "DualNumber":
+        return (
+            other
+            if isinstance(other, DualNumber)
+            else DualNumber(other, np.zeros_like(self.derivatives))
+        )
+
+
+def _apply_chain_rule(x: DualNumber, value: float, outer_derivative: float) -> DualNumber:
+    return DualNumber(value, outer_derivative * x.derivatives)
+
+
+def sqrt(x: DualNumber) -> DualNumber:
+    """Return the square root; at 0 with infinite derivatives."""
+    root = math.sqrt(x.value)
+    if not root:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return DualNumber(0.0, np.where(x.derivatives == 0, 0.0, x.derivatives / 0.0))
+    return _apply_chain_rule(x, root, 0.5 / root)
+
+
+def exp(x: DualNumber) -> DualNumber:
+    """Return the exponential."""
+    value = math.exp(x.value)
+    return _apply_chain_rule(x, value, value)
+
+
+def log(x: DualNumber) -> DualNumber:
+    """Return the natural logarithm."""
+    return _apply_chain_rule(x, math.log(x.value), 1.0 / x.value)
+
+
+def sin(x: DualNumber) -> DualNumber:
+    """Return the sine."""
+    return _apply_chain_rule(x, math.sin(x.value), math.cos(x.value))
+
+
+def cos(x: DualNumber) -> DualNumber:
+    """Return the cosine."""
+    return _apply_chain_rule(x, math.cos(x.value), -math.sin(x.value))
+
+
+def degrees(x: DualNumber) -> DualNumber:
+    """Return an angle [rad] in degrees."""
+    return x * (180.0 / math.pi)
+
+
+def minimum(*x: DualNumber) -> DualNumber:
+    """Return the smallest value."""
+    return min(x, key=lambda one: one.value)
+
+
+def maximum(*x: DualNumber) -> DualNumber:
+    """Return the largest value."""
+    return max(x, key=lambda one: one.value)
+
+
+DUAL_FUNCTIONS: dict[str, Callable[..., DualNumber]] = {
+    "sqrt": sqrt, "exp": exp, "log": log, "sin": sin, "cos": cos, "degrees": degrees,
+    "min": minimum, "max": maximum, "abs": abs,
+}  # fmt: skip
+
+
+def constant(value: float, count: int) -> DualNumber:
+    """Return a constant with `count` zero derivatives."""
+    return DualNumber(value, np.zeros(count))
+
 
 _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Add: lambda a, b: a + b,
@@ -21,15 +159,15 @@ _COMPARISONS = ("<=", ">=", "==")
 class MeasureExpression:
     """An expression such as "load(4, 0) / mass" or "min(reach, 6.2) * 2".
 
-    Numbers, + - * / **, parentheses, calls of functions, and names, which may have dots:
-    numbers of the machine such as boom_eye.x. Arguments of functions are numbers, or names in
-    quotes.
+    It consists of numbers, + - * / **, parentheses, function calls, and names, which may have
+    dots: parameters of the machine such as boom_eye.x. Arguments of functions are expressions, or
+    names in quotes.
 
     Args:
-        text: As it is written.
+        text: The expression.
 
     Raises:
-        InputError: It is no such expression.
+        InputError: The text is not a valid expression.
     """
 
     def __init__(self, text: str):
@@ -57,15 +195,15 @@ class MeasureExpression:
         evaluate_call: Callable[[str, tuple[Any, ...]], Any],
         constant: Callable[[float], Any] = float,
     ) -> Any:
-        """Its value.
+        """Evaluate the expression.
 
         Args:
-            evaluate_name: What a name stands for.
-            evaluate_call: What a function gives, of its arguments.
-            constant: What a number becomes.
+            evaluate_name: Returns the value of a name.
+            evaluate_call: Returns the value of a function for its arguments.
+            constant: Converts a number.
 
         Raises:
-            InputError: What it asks for is not a number: a root of something negative.
+            InputError: The result is not a number, such as the root of a negative number.
         """
         try:
             result = self._evaluate_node(self._tree, evaluate_name, evaluate_call, constant)
@@ -131,10 +269,13 @@ class MeasureExpression:
 
 
 def parse_requirement(text: str) -> tuple[MeasureExpression, bool]:
-    """What has to be at least 0, or 0, from "A >= B", "A <= B" or "A == B"; and whether it is 0.
+    """Parse "A >= B", "A <= B" or "A == B".
+
+    Returns:
+        The expression that must not be negative, or that must be 0, and whether it must be 0.
 
     Raises:
-        InputError: It is no such comparison.
+        InputError: The text is no such comparison.
     """
     comparisons = [sign for sign in _COMPARISONS if sign in text]
     sides = text.split(comparisons[0]) if len(comparisons) == 1 else []
@@ -153,3 +294,65 @@ def _dotted_name(node: ast.AST) -> str:
         case ast.Attribute(value=value, attr=name):
             return f"{_dotted_name(value)}.{name}"
     raise InputError(f"'{ast.unparse(node)}' is no name")
+
+
+MeasureFunction = Callable[[Machine], float]
+
+
+def load_user_measures(
+    source: str | Path | Mapping[str, MeasureFunction] | None,
+) -> dict[str, MeasureFunction]:
+    """Return functions of a machine by name: those given, or all public ones of a Python file.
+
+    The file is executed without restrictions; load only files that you trust.
+
+    Raises:
+        InputError: The file does not exist, raises, or has no function of one machine.
+    """
+    if source is None:
+        return {}
+    if isinstance(source, Mapping):
+        return dict(source)
+    path = Path(source)
+    if not path.is_file():
+        raise InputError(f"there is no file '{path}' of measures")
+    spec = importlib.util.spec_from_file_location(f"crane_measures_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"'{path}' is no Python file, call it {path.stem}.py")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path}: {type(error).__name__}: {error}") from error
+    functions: dict[str, MeasureFunction] = {
+        name: function
+        for name, function in vars(module).items()
+        if inspect.isfunction(function)
+        and function.__module__ == module.__name__
+        and not name.startswith("_")
+        and len(inspect.signature(function).parameters) == 1
+    }
+    if not functions:
+        raise InputError(
+            f"{path} has no function of a machine, write: def name(machine): return ..."
+        )
+    return functions
+
+
+def transferable_measures(
+    source: str | Path | Mapping[str, MeasureFunction] | None,
+) -> str | Mapping[str, MeasureFunction] | None:
+    """Return measures for another process, which may run in another folder."""
+    return source if source is None or isinstance(source, Mapping) else str(Path(source).resolve())
+
+
+def evaluate_user_measure(name: str, function: MeasureFunction, machine: Machine) -> float:
+    """Return the value of a user's function for a machine.
+
+    Raises:
+        InputError: The function raises, or does not return a number.
+    """
+    try:
+        return float(function(machine))
+    except Exception as error:
+        raise InputError(f"measure '{name}': {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""What can be measured of a variant, and how it changes with the numbers that vary."""
+"""Measures of a variant of a machine, and their derivatives by the parameters that vary."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,9 +18,14 @@ from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings import capacity, torques
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.rating_rules import Rule
-from crane.studies.design.dual_numbers import DUAL_FUNCTIONS, DualNumber, constant
-from crane.studies.design.measure_expressions import MeasureExpression
-from crane.studies.design.user_measures import MeasureFunction, evaluate_user_measure
+from crane.studies.design.measure_expressions import (
+    DUAL_FUNCTIONS,
+    DualNumber,
+    MeasureExpression,
+    MeasureFunction,
+    constant,
+    evaluate_user_measure,
+)
 from crane.studies.measures import (
     combine_task_measures,
     measure_strokes,
@@ -29,8 +34,8 @@ from crane.studies.measures import (
     task_measures,
 )
 
-_DIFFERENCE_STEP = 1e-4  # of a number's range, of differences
-_START_COUNT = 6  # of the search for an extreme of the tip
+_DIFFERENCE_STEP = 1e-4  # share of a parameter's range
+_START_COUNT = 6  # starts of the search for an extreme of the tip
 _ARGUMENT_COUNTS = {"load": (2, 3), "nearest": (3, 3), "net_torque": (1, 1), "number": (1, 1)}
 _FUNCTION_UNITS = {"load": "kg", "nearest": "m", "net_torque": "N m", "number": ""}
 PLAIN_MEASURES = {
@@ -40,13 +45,13 @@ PLAIN_MEASURES = {
 
 @dataclass(frozen=True)
 class MeasureOptions:
-    """What measures are taken with.
+    """Options of measures.
 
     Attributes:
-        frame: Where loads hang; the tip if None.
-        rule: Of `load` and `net_torque`.
-        tasks: Of peak_JOINT and its like.
-        user_measures: Functions of a user's own.
+        frame: Link at which loads hang; the tip if None.
+        rule: Rating rule of `load` and `net_torque`.
+        tasks: Tasks of peak_JOINT and similar measures.
+        user_measures: Functions of the user by name.
     """
 
     frame: str | None = None
@@ -56,21 +61,21 @@ class MeasureOptions:
 
 
 class VariantEvaluation:
-    """A variant: its measures, and their slopes by the numbers that vary.
+    """Measures of a variant, and their derivatives by the parameters that vary.
 
-    Slopes of `load`, reach, highest, lowest, `nearest` and mass are exact, through the closed
-    loops; those of all else central differences of variants beside it.
+    Derivatives of `load`, reach, highest, lowest, `nearest` and mass are exact, through the closed
+    loops; all others are central differences of neighbouring variants.
 
     Args:
-        variants: Of the machine.
-        parameter_names: Numbers that vary, in order.
-        values: (k,) theirs.
-        ranges: (k,) their ranges, to measure steps by.
-        options: What measures are taken with.
-        load_positions: All arguments of `load` that will be asked for, to be computed together.
+        variants: Variants of the machine.
+        parameter_names: Parameters that vary, in order.
+        values: (k,) values of these parameters.
+        ranges: (k,) ranges of these parameters, which scale the steps of differences.
+        options: Options of the measures.
+        load_positions: All arguments of `load` that are needed, to compute them together.
 
     Raises:
-        CraneError: No machine can be made with them.
+        CraneError: The machine cannot be assembled with these parameters.
     """
 
     def __init__(
@@ -82,22 +87,21 @@ class VariantEvaluation:
         options: MeasureOptions,
         load_positions: Sequence[tuple[float, ...]] = (),
     ):
-        self._variants, self._parameter_names, self._values = (
-            variants,
-            list(parameter_names),
-            values,
-        )
+        self._variants, self._parameter_names = variants, list(parameter_names)
+        self._values = values
         self._ranges, self._options, self._load_positions = ranges, options, list(load_positions)
         self.machine = variants.machine(dict(zip(parameter_names, values.tolist(), strict=True)))
         self._measure_cache: dict[tuple[Any, ...], float] = {}
         self._loads: dict[tuple[bool, tuple[float, ...]], DualNumber] = {}
+        self._neighbours: dict[tuple[int, float], VariantEvaluation] = {}
+        self._extremes: dict[tuple[Any, ...], tuple[float, Array]] = {}
 
     def evaluate(self, expression: MeasureExpression) -> float:
-        """Of an expression."""
+        """Return the value of an expression."""
         return float(expression(self._evaluate_name, self._evaluate_call))
 
     def evaluate_dual(self, expression: MeasureExpression) -> DualNumber:
-        """Of an expression, with its slopes."""
+        """Return the value of an expression with its derivatives."""
         count = len(self._parameter_names)
 
         def dual_of_name(name: str) -> DualNumber:
@@ -122,23 +126,17 @@ class VariantEvaluation:
         return self._measure(name, arguments)
 
     def _dual_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
-        """A measure with its slopes."""
         if name == "load":
             return self._rated_load(arguments)
         if name in ("reach", "highest", "lowest", "nearest"):
             value, q = self._extreme(name, arguments)
             return DualNumber(value, self._extreme_derivatives(name, arguments, q))
         if name == "mass":
-            static_derivatives = (
-                self._statics.parameter_derivatives(
-                    self._home_configuration, self._parameter_names
-                )
-                if self._parameter_names
-                else None
-            )
-            derivatives = (
-                np.zeros(0) if static_derivatives is None else static_derivatives.total_mass[0]
-            )
+            derivatives = np.zeros(0)
+            if self._parameter_names:
+                derivatives = self._statics.parameter_derivatives(
+                    self.machine.home[None], self._parameter_names
+                ).total_mass[0]
             return DualNumber(self._measure(name, ()), derivatives)
         if name == "number" or (name in self._variants.values and not arguments):
             parameter = str(arguments[0]) if name == "number" else name
@@ -147,7 +145,7 @@ class VariantEvaluation:
         return DualNumber(self._measure(name, arguments), self._differences(name, arguments))
 
     def _differences(self, name: str, arguments: tuple[Any, ...]) -> Array:
-        """Central differences of a measure, one-sided where one side cannot be made."""
+        """Return central differences of a measure; one-sided if one side cannot be assembled."""
         nominal = self._measure(name, arguments)
         out = np.zeros(len(self._parameter_names))
         for i, step in enumerate(_DIFFERENCE_STEP * self._ranges):
@@ -182,10 +180,6 @@ class VariantEvaluation:
             )
         return self._neighbours[key]
 
-    @cached_property
-    def _neighbours(self) -> dict[tuple[int, float], "VariantEvaluation"]:
-        return {}
-
     def _measure(self, name: str, arguments: tuple[Any, ...]) -> float:
         key = name, *arguments
         if key not in self._measure_cache:
@@ -203,21 +197,16 @@ class VariantEvaluation:
                 machine, self._options.frame, radius=arguments[0], rule=self._options.rule
             ).net_torque
         if name in ("gross_torque", "slewing_torque"):
-            torque_values = torques(
-                machine, self._options.frame, rule=self._options.rule, radius=self._median_radius
-            )
-            return (
-                torque_values.gross_torque
-                if name == "gross_torque"
-                else torque_values.slewing_torque
-            )
+            radius = float(np.median(self._configuration_search.section_positions[:, 0]))
+            result = torques(machine, self._options.frame, rule=self._options.rule, radius=radius)
+            return result.gross_torque if name == "gross_torque" else result.slewing_torque
         if name == "mass":
-            return float(self._statics.evaluate(self._home_configuration).total_mass[0])
+            return float(self._statics.evaluate(machine.home[None]).total_mass[0])
         if name == "number":
             return self._parameter_value(str(arguments[0]))
         if name in self._options.user_measures:
             return evaluate_user_measure(name, self._options.user_measures[name], machine)
-        if name in self._task_measures:
+        if name in task_measures(machine):
             return self._task_values[name]
         if name in stroke_measures(machine):
             if name not in self._stroke_values:
@@ -243,18 +232,6 @@ class VariantEvaluation:
     def _configuration_search(self) -> ConfigurationSearch:
         return ConfigurationSearch(self._statics)
 
-    @property
-    def _home_configuration(self) -> Array:
-        return self.machine.home[None]
-
-    @cached_property
-    def _median_radius(self) -> float:
-        return float(np.median(self._configuration_search.section_positions[:, 0]))
-
-    @cached_property
-    def _task_measures(self) -> dict[str, str]:
-        return task_measures(self.machine)
-
     @cached_property
     def _task_values(self) -> dict[str, float]:
         if not self._options.tasks:
@@ -271,7 +248,7 @@ class VariantEvaluation:
     def _rated_load(
         self, position: tuple[float, ...], with_derivatives: bool = True
     ) -> DualNumber:
-        """The rated load at a place, 0 where it is out of reach; with its slopes if asked for."""
+        """Return the rated load at a position, 0 if it is out of reach, with derivatives."""
         if (with_derivatives, position) not in self._loads:
             all_positions = [
                 position,
@@ -305,29 +282,25 @@ class VariantEvaluation:
             loads = np.nan_to_num(chart.loads[:, b, a], nan=0.0)
             s = int(loads.argmin())
             if not np.isfinite(loads[s]):
-                raise InputError(f"nothing ends the load at {position}, ask for another place")
+                raise InputError(f"nothing limits the load at {position}, choose another position")
             load_derivatives = zero.derivatives
             if chart_derivatives is not None and loads[s] > 0:
                 load_derivatives = chart_derivatives[s, b, a]
-                if np.isnan(load_derivatives).any():  # where a pin ends it
+                if np.isnan(load_derivatives).any():  # limited by a pin
                     load_derivatives = self._differences("load", position)
             self._loads[with_derivatives, position] = DualNumber(float(loads[s]), load_derivatives)
 
     def _extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Largest reach or height, lowest depth, or distance to a point, and its posture."""
+        """Return the extreme reach, height or distance of the tip, and its configuration."""
         key = name, *arguments
         if key not in self._extremes:
             self._extremes[key] = self._find_extreme(name, arguments)
         return self._extremes[key]
 
-    @cached_property
-    def _extremes(self) -> dict[tuple[Any, ...], tuple[float, Array]]:
-        return {}
-
     def _extreme_objective(
         self, name: str, arguments: tuple[Any, ...], tip: Array
     ) -> tuple[Array, Array]:
-        """What is the least at the extreme, (N,), and its slopes by the tip (N, 3)."""
+        """Return what is minimized (N,), and its derivatives by the tip (N, 3)."""
         if name == "nearest":
             offset = tip - np.array(arguments, dtype=float)
             length = np.linalg.norm(offset, axis=1)
@@ -342,7 +315,7 @@ class VariantEvaluation:
         return -length, -horizontal / np.maximum(length, 1e-300)[:, None]
 
     def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """From the best of the postures all over the strokes, by their exact slopes."""
+        """Search from the best configurations over all strokes, with exact derivatives."""
         search, closure = self._configuration_search, self.machine.closure
         strokes = search.moving
         columns = closure.active[strokes]
@@ -380,7 +353,7 @@ class VariantEvaluation:
         return sign * lowest_cost, best_configuration
 
     def _extreme_derivatives(self, name: str, arguments: tuple[Any, ...], q: Array) -> Array:
-        """By the envelope theorem: those at the posture of the extreme, held."""
+        """Return the derivatives at the fixed configuration of the extreme (envelope theorem)."""
         if not self._parameter_names:
             return np.zeros(0)
         tip_derivatives = self._statics.parameter_derivatives(
@@ -396,7 +369,7 @@ class VariantEvaluation:
 def available_measures(
     machine: Machine, user_measures: Mapping[str, MeasureFunction]
 ) -> dict[str, str]:
-    """All measures and functions of a machine, and their units."""
+    """Return all measures and functions of a machine with their units."""
     return {
         **task_measures(machine), **stroke_measures(machine), **PLAIN_MEASURES, **_FUNCTION_UNITS,
         **dict.fromkeys(user_measures, ""),
@@ -406,23 +379,18 @@ def available_measures(
 def check_unique_names(
     user_measures: Mapping[str, MeasureFunction], known_measures: Mapping[str, str]
 ) -> None:
-    """Refuse functions of a user's own that are called like a measure.
+    """Check that no function of a user has the name of a measure.
 
     Raises:
-        InputError: One is.
+        InputError: One has.
     """
     for name in user_measures:
-        if (
-            name in known_measures
-            or name in PLAIN_MEASURES
-            or name in _ARGUMENT_COUNTS
-            or name in DUAL_FUNCTIONS
-        ):
-            raise InputError(f"a measure '{name}' is there already, call your own otherwise")
+        if name in {*known_measures, *PLAIN_MEASURES, *_ARGUMENT_COUNTS, *DUAL_FUNCTIONS}:
+            raise InputError(f"a measure '{name}' exists already, give yours another name")
 
 
 def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float, ...]]:
-    """All arguments of `load` that are plain numbers."""
+    """Return all arguments of `load` that are numbers."""
     positions: list[tuple[float, ...]] = []
 
     def check_name(name: str) -> float:
@@ -442,7 +410,7 @@ def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float
 
 
 def _check_call(name: str, arguments: tuple[Any, ...]) -> None:
-    """Refuse functions that are not there, or with other arguments."""
+    """Check that a function exists and takes these arguments."""
     if name not in DUAL_FUNCTIONS and name not in _ARGUMENT_COUNTS:
         raise InputError(
             f"function '{name}' is unknown, "

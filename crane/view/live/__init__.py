@@ -1,4 +1,4 @@
-"""A machine to play with: sliders for its active joints, its loops closed at every move."""
+"""Live view of a machine: sliders for its active joints, with loops closed at every move."""
 
 from crane.view.live.live_session import Readout, Session
 

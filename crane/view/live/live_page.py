@@ -1,6 +1,8 @@
-"""The page of a live view: sliders, buttons and numbers beside the machine."""
+"""Page of a live view: sliders, buttons and readout beside the machine."""
 
 import time
+from collections.abc import Sequence
+from html import escape
 from queue import SimpleQueue
 from typing import Any
 
@@ -8,11 +10,96 @@ import numpy as np
 
 from crane.common.errors import CraneError
 from crane.common.samples import Array
+from crane.common.units import format_quantity
+from crane.machine import Machine
+from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS
 from crane.view.live.live_scene import LiveScene
-from crane.view.live.live_session import Readout, Session, round_up_to_nice
-from crane.view.live.playback import Playback
-from crane.view.live.readout_panel import readout_html, warning_html
+from crane.view.live.live_session import Playback, Readout, Session, round_up_to_nice
+
+_TABLE_TAG = '<table style="width:100%;font-size:0.8em;border-spacing:0 0.15em">'
+_HEADING_ROW_TAG = '<tr style="opacity:0.6">'
+_WARNING_BOX_TAG = (
+    '<div style="margin:0.3em 1em;padding:0.5em 0.7em;border-left:4px solid #d0401c;'
+    'background:#d0401c22;font-size:0.8em">'
+)
+
+
+def format_coordinate(machine: Machine, joint: str, value: float) -> str:
+    """Return a joint coordinate [m], [rad] as text in its display unit."""
+    unit, scale = DISPLAY_UNITS[machine.unit(joint)]
+    return f"{round(scale * value, 2) + 0.0:.2f} {unit}"
+
+
+def readout_html(
+    machine: Machine, readout: Readout, payload_mass: float, recorded_forces: Array | None = None
+) -> str:
+    """Return forces, tip, passive joints and the state of the loops as HTML.
+
+    Args:
+        machine: The machine.
+        readout: Configuration with its forces.
+        payload_mass: Mass at the tip [kg].
+        recorded_forces: (n,) forces of a recording at this instant [N], [N m].
+    """
+    headings = [
+        "joint",
+        "holding force" if not payload_mass else "holding force with payload",
+    ]
+    headings += ["recorded"] if recorded_forces is not None else []
+    rows = []
+    for i, joint in enumerate(machine.active):
+        unit = FORCE_UNITS[machine.unit(joint)]
+        forces = [readout.gravity[i], *([] if recorded_forces is None else [recorded_forces[i]])]
+        is_free = joint in machine.free
+        rows.append([joint, *("free" if is_free else format_quantity(x, unit) for x in forces)])
+    parts = [_html_table(headings, rows)]
+    if readout.tip is not None:
+        x, y, z = (f"{round(1e3 * value, 1) + 0.0:.1f}" for value in readout.tip)
+        parts.append(_html_table(["tip x [mm]", "y [mm]", "z [mm]"], [[x, y, z]]))
+    if passive := [joint for joint in machine.joints if joint not in machine.active]:
+        rows = [
+            [x, format_coordinate(machine, x, readout.configuration[machine.column(x)])]
+            for x in passive
+        ]
+        parts.append(_html_table(["passive joint", "coordinate"], rows))
+    if readout.gain_joints:
+        passive_joint, active_joint = readout.gain_joints
+        unit = f"{machine.unit(passive_joint)}/{machine.unit(active_joint)}"
+        rows = [
+            [
+                "largest gamma",
+                f"{readout.largest_gain:.3g} {unit}",
+                f"{passive_joint} per {active_joint}",
+            ],
+            [
+                "condition number of J_P",
+                f"{readout.condition_number:.3g}",
+                f"loop {readout.weakest_loop}",
+            ],
+            ["loops closed to", f"{readout.residual:.0e} m", ""],
+        ]
+        parts.append(_html_table([], rows))
+    return "".join(f'<div style="margin:0 1em 0.6em">{part}</div>' for part in parts)
+
+
+def warning_html(text: str) -> str:
+    """Return a message in a box as HTML; empty for an empty text."""
+    return f"{_WARNING_BOX_TAG}{escape(text)}</div>" if text else ""
+
+
+def _html_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    def cells(words: Sequence[str], kind: str) -> str:
+        aligned = ["left"] + ["right"] * (len(words) - 1)
+        return "".join(
+            f'<{kind} style="text-align:{side};font-weight:normal">{escape(text)}</{kind}>'
+            for side, text in zip(aligned, words, strict=True)
+        )
+
+    lines = [f"{_HEADING_ROW_TAG}{cells(headings, 'th')}</tr>"] if headings else []
+    lines += [f"<tr>{cells(row, 'td')}</tr>" for row in rows]
+    return f"{_TABLE_TAG}{''.join(lines)}</table>"
+
 
 _LOAD_KEY, _TIME_KEY, _PLAY_KEY, _HOME_KEY = "load", "time", "play", "home"
 _SLIDER_STEPS = 1000  # of a slider
@@ -21,14 +108,14 @@ _SLIDER_STEPS = 1000  # of a slider
 class LivePage:
     """Widgets on a viser server that act on a session.
 
-    Callbacks of the server only leave a note in a queue; `process_requests` does what the notes
-    say, in the one thread that calls it, the last note of each slider alone.
+    Callbacks of the server put requests into a queue; `process_requests` processes them in one
+    thread, of each slider only the last request.
 
     Args:
         server: A viser server.
-        session: What is shown.
-        playback: A recording to play.
-        requests: The queue, where notes are a widget's key and value.
+        session: Session that is shown.
+        playback: Recording that can be played.
+        requests: Queue of requests: key and value of a widget.
     """
 
     def __init__(
@@ -77,20 +164,20 @@ class LivePage:
             self.process_requests([(_TIME_KEY, playback.start)])
 
     def _aim_camera(self, client: Any) -> None:
-        """Turn the camera of a window that has come to where it sees the machine."""
+        """Set the camera of a new client so that it shows the machine."""
         if client.camera.aspect < 1:
             look_at, position = self._scene.camera_view(client.camera.aspect)
             with client.atomic():
-                client.camera.position = position  # which takes what is looked at along
+                client.camera.position = position  # moves the target along
                 client.camera.look_at = look_at
 
     @property
     def is_playing(self) -> bool:
-        """Whether `advance_playback` moves the machine."""
+        """Whether the recording plays."""
         return self._playing
 
     def process_requests(self, pending_requests: list[tuple[str, float]]) -> None:
-        """Do what notes say: of the sliders only the last of each."""
+        """Process requests; of several requests of one widget only the last."""
         for key, value in dict(pending_requests).items():
             try:
                 readout = self._process_request(key, value)
@@ -100,7 +187,7 @@ class LivePage:
                 self._warning_html.content = warning_html(message)
 
     def advance_playback(self) -> None:
-        """Go on in the recording by the time since the last call."""
+        """Advance the recording by the time since the last call."""
         assert self._playback is not None
         now = time.perf_counter()
         playback_time = self._sliders[_TIME_KEY].value + now - self._last_update
@@ -141,14 +228,14 @@ class LivePage:
         )
 
     def _seek(self, playback_time: float) -> Readout:
-        """The posture at a time [s] of the recording."""
+        """Move to the configuration at a time of the recording [s]."""
         assert self._playback is not None
         q_a, self._recorded_forces = self._playback.interpolate(playback_time)
         self._sliders[_TIME_KEY].value = playback_time
         return self._session.set_active_coordinates(q_a)
 
     def _update_widgets(self, readout: Readout) -> None:
-        """Send a posture: links, sliders that are not there, numbers."""
+        """Send poses, sliders and readout to the clients."""
         machine = self._session.machine
         with self._server.atomic():
             self._scene.update_poses()
@@ -195,14 +282,14 @@ class LivePage:
         return button
 
     def _tip_path(self, playback: Playback) -> Array:
-        """(k, 3) where the tip goes [m], every so many samples."""
+        """Return the path of the tip (k, 3) [m], thinned."""
         return self._session.tip_positions(
             playback.configurations[:: max(len(playback.configurations) // 2000, 1)]
         )
 
 
 def _set_slider(slider: Any, value: float) -> None:
-    """Put a slider at the value in its range that is nearest, if it is not there."""
+    """Set a slider to the nearest value in its range."""
     clipped_value = float(np.clip(value, slider.min, slider.max))
     if abs(slider.value - clipped_value) > 1e-6 * (slider.max - slider.min):
         slider.value = clipped_value

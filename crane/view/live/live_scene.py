@@ -1,4 +1,4 @@
-"""The machine as a live view shows it: shapes that move with their links."""
+"""Scene of a live view: shapes that move with their links."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ from crane.view.page.scene import ground_height
 
 _CAMERA_DIRECTION = np.array(
     [0.55, -1.0, 0.45]
-)  # from what is looked at to the camera, over its size
+)  # from the target to the camera, over the size of the scene
 _FIELD_OF_VIEW = 40.0  # of view, upright [deg]
 _FREE_HEIGHT_SHARE = 0.4  # share of a phone's height that viser's panel leaves free
 _PAYLOAD_DENSITY = 1000.0  # density of the ball that stands for the payload [kg/m3]
@@ -32,7 +32,7 @@ class LiveScene:
 
     Args:
         server: The server.
-        session: What is shown.
+        session: Session that is shown.
     """
 
     def __init__(self, server: Any, session: Session):
@@ -52,7 +52,7 @@ class LiveScene:
         self.update_poses()
 
     def update_poses(self) -> None:
-        """Put all links where the session has them."""
+        """Update the poses of all links from the session."""
         poses = self._session.link_poses(self._links)
         for frame, pose in zip(self._frames, poses, strict=True):
             x, y, z, w = pin.Quaternion(pose[:3, :3]).coeffs()
@@ -60,7 +60,7 @@ class LiveScene:
             frame.wxyz = np.array([w, x, y, z])
 
     def show_payload(self) -> None:
-        """Draw the payload as a ball of water at the tip."""
+        """Draw the payload as a sphere of water at the tip."""
         volume = self._session.payload_mass / _PAYLOAD_DENSITY
         self._server.scene.add_icosphere(
             "/tip/payload",
@@ -79,7 +79,7 @@ class LiveScene:
             )
 
     def _set_view(self, lower: Array, upper: Array, ground_height: float) -> None:
-        """A grid at a height [m], and a camera that has everything in view."""
+        """Add a grid at the ground height [m], and set the camera."""
         scene, camera = self._server.scene, self._server.initial_camera
         self._scene_size = size = float(np.linalg.norm(upper - lower))
         self._scene_centre = centre = (lower + upper) / 2
@@ -100,10 +100,10 @@ class LiveScene:
         camera.look_at, camera.position = self.camera_view()
 
     def camera_view(self, aspect: float = 1.0) -> tuple[Array, Array]:
-        """What a camera looks at and where it stands [m], everything in view.
+        """Return target and position of a camera that shows the whole machine [m].
 
-        In a window that stands upright, as a phone's, the panel covers the lower part: the machine
-        goes into the part above it, and no wider than the window.
+        In a portrait window, such as a phone's, the panel covers the lower part; the machine is
+        shown above it.
 
         Args:
             aspect: Width of the window over its height.
@@ -124,7 +124,6 @@ class LiveScene:
 
 
 def _add_shape(scene: Any, name: str, visual: Visual) -> None:
-    """Put a shape into the group of its link."""
     x, y, z, w = pin.Quaternion(np.array(visual.placement[:3, :3])).coeffs()
     red, green, blue, opacity = (min(max(value, 0.0), 1.0) for value in visual.colour)
     appearance: dict[str, Any] = {
@@ -152,9 +151,9 @@ def _add_shape(scene: Any, name: str, visual: Visual) -> None:
 
 
 def _motion_bounds(visuals: Sequence[Visual], session: Session) -> tuple[Array, Array]:
-    """Lowest and highest corner (3,) of everything, at home and where single joints can take it.
+    """Return the corners (3,) of the space that is reached from home by single joints.
 
-    Joints that swing around by half a turn or more are left at home: all around is too far away.
+    Joints with a range of half a turn or more stay at home, because the space would be too large.
     """
     machine, home_readout = session.machine, session.posture
     points = []
@@ -170,7 +169,7 @@ def _motion_bounds(visuals: Sequence[Visual], session: Session) -> tuple[Array, 
 
 
 def _shape_corners(visuals: Sequence[Visual], session: Session) -> Array:
-    """(k, 3) corners of boxes around all shapes where the session has them."""
+    """Return the corners (k, 3) of boxes around all shapes in the session's configuration."""
     links = list(dict.fromkeys(visual.link for visual in visuals))
     poses = dict(zip(links, session.link_poses(links), strict=True))
     return np.concatenate(

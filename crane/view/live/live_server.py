@@ -1,22 +1,151 @@
-"""Serving a live view until it is interrupted."""
+"""Server of a live view, and the guard of its requests."""
 
+import hmac
 import io
+import ipaddress
+import secrets
 import signal
 import socket
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from queue import Empty, SimpleQueue
 from typing import Any
+from urllib.parse import urlsplit
 
 from crane.common.errors import CraneWarning, InputError, OutputError
 from crane.common.optional_libraries import import_optional_library
-from crane.view.live.access_control import AccessGuard, restrict_widget_updates
 from crane.view.live.live_page import LivePage
-from crane.view.live.live_session import Session
-from crane.view.live.playback import Playback
+from crane.view.live.live_session import Playback, Session
 
-_FIRST_PORT, _PORT_COUNT = 8080, 20  # to choose from where none is given
+_REFUSAL_MESSAGE = (
+    "Refused: open the address that crane live has told, by the number of its host.\n"
+)
+
+
+class AccessGuard:
+    """Check of requests: token, host and origin.
+
+    Args:
+        host: Name or address that is listened on.
+
+    Attributes:
+        host: As given.
+        token: Random first part of the path.
+    """
+
+    def __init__(self, host: str):
+        self.host, self.token = host, secrets.token_urlsafe(16)
+
+    @property
+    def is_local_only(self) -> bool:
+        """Whether only this computer has access."""
+        return self.host.lower() == "localhost" or _is_loopback(self.host)
+
+    def address(self, port: int) -> str:
+        """Return the address to open in a browser."""
+        host_text = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host_text}:{port}/{self.token}/"
+
+    def authorized_path(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
+        """Return the path behind the token; None if the request is refused.
+
+        Args:
+            path: Requested path.
+            hosts: All `Host` headers.
+            origins: All `Origin` headers; only browsers send them.
+        """
+        if len(hosts) != 1 or not self._is_known_host(hosts[0]):
+            return None
+        if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+            return None
+        path_token, slash, inner_path = path.partition("?")[0].removeprefix("/").partition("/")
+        if not hmac.compare_digest(path_token.encode(), self.token.encode()):
+            return None
+        return "/" + inner_path
+
+    def _is_known_host(self, host: str) -> bool:
+        """Return whether a `Host` header names the host that is listened on."""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+            if name in ("localhost", self.host.lower()):
+                return True
+            number = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return number.is_loopback or not self.is_local_only
+
+    @contextmanager
+    def guard_servers(self) -> Iterator[None]:
+        """Guard HTTP and websocket requests of servers that viser starts in this context."""
+        from websockets.asyncio import server
+
+        serve: Any = server.serve
+
+        def guarded_serve(*arguments: Any, process_request: Callable, **options: Any) -> Any:
+            def check_request(connection: Any, request: Any) -> Any:
+                header_values = request.headers.get_all
+                path = self.authorized_path(
+                    request.path, header_values("Host"), header_values("Origin")
+                )
+                if path is None:
+                    return connection.respond(403, _REFUSAL_MESSAGE)
+                request.path = path
+                return process_request(connection, request)
+
+            return serve(*arguments, process_request=check_request, **options)
+
+        server.serve = guarded_serve  # type: ignore[assignment, misc]
+        try:
+            yield
+        finally:
+            server.serve = serve  # type: ignore[misc]
+
+
+def restrict_widget_updates(server: Any) -> None:
+    """Accept from clients only slider values within their ranges and button presses.
+
+    viser would accept any value of any property and send it to all other clients.
+    """
+    from viser._messages import GuiUpdateMessage
+
+    gui = server.gui
+    interface, update = gui._websock_interface, gui._handle_gui_updates
+
+    async def checked(client: Any, message: Any) -> None:
+        widgets, name = gui._gui_input_handle_from_uuid, message.uuid
+        if (
+            isinstance(name, str)
+            and name in widgets
+            and _is_valid_update(widgets[name], message.updates)
+        ):
+            await update(client, message)
+
+    interface.unregister_handler(GuiUpdateMessage, update)
+    interface.register_handler(GuiUpdateMessage, checked)
+
+
+def _is_valid_update(widget: Any, updates: Any) -> bool:
+    """Return whether an update sets a value that the widget can have."""
+    if not isinstance(updates, dict) or set(updates) != {"value"}:
+        return False
+    value = updates["value"]
+    if widget._impl.is_button:
+        return isinstance(value, bool)
+    if type(value) not in (int, float):
+        return False
+    # a browser rounds to whole steps; not a number is within nothing
+    return float(widget.min - widget.step) <= value <= float(widget.max + widget.step)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+_FIRST_PORT, _PORT_COUNT = 8080, 20  # default range of ports
 _FRAME_INTERVAL = 1 / 30  # of a recording that plays [s]
 
 RequestQueue = SimpleQueue[tuple[str, float] | None]
@@ -28,13 +157,13 @@ def serve_live_view(
     host: str = "127.0.0.1",
     port: int | None = None,
 ) -> None:
-    """Serve a live view until SIGINT or SIGTERM, and leave nothing running.
+    """Serve a live view until SIGINT or SIGTERM.
 
     Args:
-        session: What is shown.
-        playback: A recording to play.
-        host: Address to listen on; the default is this computer alone.
-        port: Where; the first free one from 8080 on if not given.
+        session: Session that is shown.
+        playback: Recording that can be played.
+        host: Address to listen on; by default only this computer.
+        port: Port; by default the first free one from 8080.
 
     Raises:
         InputError: viser is not installed, or there is no such host.
@@ -61,7 +190,7 @@ def serve_live_view(
 
 
 def _process_until_end(page: LivePage, requests: RequestQueue) -> None:
-    """Do what is asked for, and play, until the end."""
+    """Process requests and play the recording until the end."""
     while (pending_requests := _take_requests(requests, page.is_playing)) is not None:
         page.process_requests(pending_requests)
         if page.is_playing:
@@ -69,7 +198,7 @@ def _process_until_end(page: LivePage, requests: RequestQueue) -> None:
 
 
 def start_server(guard: AccessGuard, port: int | None) -> Any:
-    """A viser server behind a door, that says nothing and offers no address elsewhere."""
+    """Start a guarded viser server that prints nothing and shares no public address."""
     viser = import_optional_library("viser", "a live view")
     port = _free_port(guard.host, port)
     with redirect_stdout(io.StringIO()), guard.guard_servers():
@@ -81,13 +210,13 @@ def start_server(guard: AccessGuard, port: int | None) -> Any:
 
 
 def stop_server(server: Any) -> None:
-    """End a server and its threads."""
+    """Stop a server and its threads."""
     with redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def _take_requests(requests: RequestQueue, is_playing: bool) -> list[tuple[str, float]] | None:
-    """All notes there are, at least one unless a recording plays; None at the end."""
+    """Return all pending requests; wait for one unless a recording plays; None at the end."""
     pending_requests: list[tuple[str, float]] = []
     try:
         item = requests.get(timeout=_FRAME_INTERVAL if is_playing else None)
@@ -101,7 +230,7 @@ def _take_requests(requests: RequestQueue, is_playing: bool) -> list[tuple[str, 
 
 @contextmanager
 def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
-    """Let SIGINT and SIGTERM put the end into the queue, whose put may interrupt itself."""
+    """Put None into the queue on SIGINT and SIGTERM; `SimpleQueue.put` is reentrant."""
     signal_numbers = (signal.SIGINT, signal.SIGTERM)
     previous_handlers = {
         signal_number: signal.signal(signal_number, lambda *_: requests.put(None))
@@ -115,7 +244,7 @@ def _stop_on_signals(requests: RequestQueue) -> Iterator[None]:
 
 
 def _free_port(host: str, port: int | None) -> int:
-    """A port that can be listened on; viser would try others, or for ever, without a word."""
+    """Return a free port; viser would try other ports, or retry endlessly, silently."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

@@ -1,4 +1,4 @@
-"""What a live view knows: one posture, closed at every move, and its numbers."""
+"""State of a live view: one closed configuration, and playback of a recording."""
 
 from dataclasses import dataclass, replace
 
@@ -6,12 +6,73 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from crane.common.errors import ClosureError, InputError, SingularConfigurationError, suggest_names
+from crane.common.errors import (
+    ClosureError,
+    InputError,
+    RecordingError,
+    SingularConfigurationError,
+    suggest_names,
+)
 from crane.common.samples import Array, as_number
 from crane.dynamics import Dynamics
 from crane.machine import Machine, Payload
 from crane.motion.kinematics import Kinematics
+from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS
+
+
+class Playback:
+    """Active coordinates and forces of a recording, interpolated in time.
+
+    Args:
+        machine: The recorded machine.
+        recording: The recording.
+
+    Attributes:
+        start: Time of the first sample [s].
+        end: Time of the last sample [s].
+        configurations: (N, nq) closed configurations of all samples [m], [rad].
+
+    Raises:
+        RecordingError: The recording lacks an active joint of the machine.
+        ClosureError: The loops cannot be closed at a sample.
+    """
+
+    def __init__(self, machine: Machine, recording: Recording):
+        columns = []
+        for joint in machine.active:
+            if joint not in recording.joints:
+                raise RecordingError(
+                    f"the recording has no joint '{joint}', which drives {machine.name}, "
+                    f"{suggest_names(recording.joints, joint)}"
+                )
+            columns.append(recording.joints.index(joint))
+        self._time = recording.time
+        self._active_count = len(columns)
+        self._coordinates_and_forces = np.hstack(
+            [recording.q[:, columns], recording.tau[:, columns]]
+        )
+        self.start, self.end = float(self._time[0]), float(self._time[-1])
+        self.configurations = machine.closure.solve(
+            self._coordinates_and_forces[:, : self._active_count]
+        )
+
+    def interpolate(self, time: float) -> tuple[Array, Array]:
+        """Return active coordinates (n,) [m], [rad] and forces (n,) [N], [N m] at a time [s].
+
+        Values are interpolated linearly between samples.
+        """
+        next_index = int(
+            np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
+        )
+        adjacent_rows = self._coordinates_and_forces[next_index - 1 : next_index + 1]
+        if len(adjacent_rows) == 1:
+            return adjacent_rows[0, : self._active_count], adjacent_rows[0, self._active_count :]
+        start_time, end_time = self._time[next_index - 1 : next_index + 1]
+        share = np.clip((time - start_time) / (end_time - start_time), 0.0, 1.0)
+        values = adjacent_rows[0] + share * (adjacent_rows[1] - adjacent_rows[0])
+        return values[: self._active_count], values[self._active_count :]
+
 
 _MAX_STEP_SHARE = 1 / 128  # of a move, at most
 _MIN_STEP_SHARE = 1e-11  # of a move, at which it gives up
@@ -27,21 +88,21 @@ _UNLIMITED_ANGLE_RANGE, _UNLIMITED_STROKE_RANGE = (
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """A closed posture and its numbers.
+    """A closed configuration with tip, forces and loop conditions.
 
     Attributes:
         configuration: (nq,) coordinates [m], [rad].
-        q_a: (n,) the active ones.
-        tip: (3,) position of the tip [m], None without one.
-        gravity: (n,) active forces that hold the weight, the payload's too [N], [N m].
+        q_a: (n,) active coordinates [m], [rad].
+        tip: (3,) position of the tip [m]; None without a tip.
+        gravity: (n,) active forces that hold the weight and the payload [N], [N m].
         largest_gain: Entry of gamma with the largest magnitude among the passive joints
             [m/m], [rad/m], [m/rad], [rad/rad]; 0 without any.
-        gain_joints: The passive and the active joint it belongs to, empty without any.
+        gain_joints: Passive and active joint of this entry; empty without any.
         condition_number: Condition number of J_P, the passive columns of the loops' Jacobian in SI
-            units; 1 without loops. It grows without bound at the branch's edge.
-        weakest_loop: The loop that holds the passive joints least, empty without loops.
+            units; 1 without loops. It is infinite at a singular configuration.
+        weakest_loop: Loop that constrains the passive joints least; empty without loops.
         residual: Largest loop equation [m], [rad].
-        refusal: Why the last move went only this far; empty where it went all the way.
+        refusal: Reason why the last move was not completed; empty if it was.
     """
 
     configuration: Array
@@ -64,9 +125,9 @@ class Session:
 
     Attributes:
         machine: The machine without payload.
-        lower: (n,) where sliders begin [m], [rad].
-        upper: (n,) where they end.
-        readout: Where it is.
+        lower: (n,) lower ends of the sliders [m], [rad].
+        upper: (n,) upper ends of the sliders [m], [rad].
+        readout: Configuration with its forces.
         payload_mass: Mass at the tip [kg].
         max_payload: Largest payload that a slider offers [kg]: half of the moving mass, or a
             little more, as a round number.
@@ -91,17 +152,17 @@ class Session:
         self.posture = self._compute_readout(machine.home)
 
     def move(self, joint: str, value: float) -> Readout:
-        """Move one active joint, the others held.
+        """Move one active joint; all others are held.
 
-        Where the loops cannot be closed, the machine goes as far towards the value as they can,
-        and the posture says why it stopped.
+        If the loops cannot be closed at the value, the machine moves as far towards it as
+        possible, and the readout states the reason.
 
         Args:
-            joint: An active joint.
-            value: Its coordinate within its slider's range [m], [rad].
+            joint: Active joint.
+            value: Coordinate within the range of the slider [m], [rad].
 
         Raises:
-            InputError: Unknown joint, or a value that is not finite or out of range.
+            InputError: The joint is unknown, or the value is not finite or out of range.
         """
         active = self.machine.active
         if joint not in active:
@@ -142,9 +203,9 @@ class Session:
         return readout
 
     def set_active_coordinates(self, q_a: ArrayLike) -> Readout:
-        """Put all active joints (n,) where they are told, wherever they were before.
+        """Set all active coordinates (n,).
 
-        The machine stays where it is if the loops cannot be closed there.
+        The machine does not move if the loops cannot be closed there.
         """
         try:
             q = self.machine.closure.solve(q_a, initial_guess=self.posture.configuration)
@@ -154,12 +215,12 @@ class Session:
         return self.posture
 
     def go_home(self) -> Readout:
-        """Go to the home posture."""
+        """Move to the home configuration."""
         self.posture = self._compute_readout(self.machine.home)
         return self.posture
 
     def set_payload(self, mass: float) -> Readout:
-        """Hang a mass [kg] at the tip, in place of what hung there before.
+        """Set the mass of the payload at the tip [kg].
 
         Raises:
             InputError: The machine has no tip, or the mass is negative or not finite.
@@ -175,7 +236,7 @@ class Session:
         return self.posture
 
     def link_poses(self, links: list[str]) -> Array:
-        """(len(links), 4, 4) poses of links in the world."""
+        """Return the poses (len(links), 4, 4) of links in the world."""
         model = self.machine.model
         data = model.createData()
         pinocchio_configuration = self.machine.coordinates.configuration(
@@ -186,17 +247,16 @@ class Session:
         return np.array([data.oMf[i].homogeneous for i in frames]).reshape(-1, 4, 4)
 
     def tip_positions(self, q: Array) -> Array:
-        """(N, 3) positions of the tip [m] at closed postures (N, nq); (0, 3) without one."""
+        """Return tip positions (N, 3) [m] at closed configurations (N, nq); (0, 3) if no tip."""
         if self._kinematics is None:
             return np.empty((0, 3))
         return self._kinematics.positions_at_configurations(q)
 
     def _path_configurations(self, target: Array) -> list[Array] | None:
-        """Postures on the straight way to a target (n,), up to where it leaves the branch.
+        """Return configurations on the straight line to a target (n,), as far as the branch goes.
 
-        Small steps, so that it never jumps to where a longer step would find the branch again,
-        and smaller ones towards its edge and away from it.
-        None where there is no machine code to take them.
+        Steps are small, so that none jumps over a gap of the branch, and smaller near its end.
+        None if the closure is not compiled.
         """
         closure = self.machine.closure
         if not closure.is_compiled:
@@ -220,10 +280,10 @@ class Session:
         return path
 
     def _compute_readout(self, q: Array) -> Readout:
-        """A closed posture (nq,) with its numbers.
+        """Return the readout of a closed configuration (nq,).
 
         Raises:
-            BranchEdgeError: The passive joints are not determined there.
+            SingularConfigurationError: The passive joints are not determined.
         """
         machine, closure = self.machine, self.machine.closure
         gamma = closure.gamma(q)
@@ -251,9 +311,9 @@ class Session:
         )
 
     def _loop_condition(self, q: Array) -> tuple[float, str]:
-        """Condition number of J_P, and the loop that a force of least effect belongs to.
+        """Return the condition number of J_P, and the loop that constrains least.
 
-        In shares of the machine's size, so that metres and radians compare.
+        Lengths are scaled by the characteristic length, to compare metres and radians.
         """
         closure = self.machine.closure
         equations, rows = closure.equations, closure.structure.independent_rows
@@ -268,7 +328,7 @@ class Session:
 
 
 def round_up_to_nice(value: float) -> float:
-    """The next of 1, 2 or 5 times a power of ten that is not below a positive value."""
+    """Round a positive value up to 1, 2 or 5 times a power of ten."""
     power_of_ten = 10.0 ** np.floor(np.log10(value))
     return float(
         next(x for x in (1, 2, 5, 10) if x * power_of_ten >= value * (1 - 1e-9)) * power_of_ten

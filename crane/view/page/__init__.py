@@ -1,4 +1,4 @@
-"""One offline page with the machine, its forces and its numbers."""
+"""Self-contained page with a machine, its motion, forces and plots."""
 
 from crane.view.page.report_page import open_in_browser, report
 from crane.view.page.scene import Scene, build_scene

@@ -1,4 +1,4 @@
-"""A calibration as one self-contained page: numbers, how well it follows, what it lacks."""
+"""Page of a calibration: parameters, fit, residuals, score tests, correlations."""
 
 from html import escape
 from pathlib import Path
@@ -18,23 +18,24 @@ from crane.identification.calibration.residual_dependence import (
 )
 from crane.recordings.recording_summary import result_title
 from crane.view.page.html_document import definition_list, html_table, write_document
+from crane.view.plots.calibration_figure import channel_residual_figure, residual_dependence_figure
 from crane.view.plots.identification_figures import correlation_figure
 from crane.view.plots.image_tags import image_tag
 from crane.view.plots.recording_figure import FIGURE_STYLE
-from crane.view.plots.residual_figures import channel_residual_figure, residual_dependence_figure
 
 _MIN_MATRIX_PARAMETERS = 3  # numbers, whose correlations need no picture
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def write_calibration_report(calibration: Calibration, path: str | Path) -> Path:
-    """Write what a calibration found as one HTML file that needs no network.
+    """Write a calibration as one self-contained HTML file.
 
-    Numbers with their intervals; each channel before and after, fitted and held out; what is left
-    against speed, pressure and direction; what the model lacks; what the recordings cannot tell
-    apart; options that make the same machine.
+    The page has parameters with intervals; each channel before and after the fit, for training and
+    held-out data; residuals against speed, pressure and direction; score tests; correlated
+    parameters; and options that reproduce the machine.
 
     Args:
-        calibration: What was found.
+        calibration: The calibration.
         path: The file to write; replaced if it exists.
 
     Returns:
@@ -44,16 +45,15 @@ def write_calibration_report(calibration: Calibration, path: str | Path) -> Path
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
     dependences = residual_dependences(calibration)
-    with mpl.rc_context(FIGURE_STYLE):
-        parts = [
-            _summary_facts(calibration),
-            "<h2>Numbers</h2>", _parameter_table(calibration),
-            "<h2>How well it follows</h2>", _channel_section(calibration),
-            "<h2>What is left</h2>", _dependence_section(dependences),
-            "<h2>What would help</h2>", _score_test_section(calibration),
-            "<h2>Not told apart</h2>", _correlation_section(calibration),
-            "<h2>The same machine</h2>", _option_text(calibration),
-        ]  # fmt: skip
+    parts = [
+        _summary_facts(calibration),
+        "<h2>Parameters</h2>", _parameter_table(calibration),
+        "<h2>Fit</h2>", _channel_section(calibration),
+        "<h2>Residuals</h2>", _dependence_section(dependences),
+        "<h2>Score tests</h2>", _score_test_section(calibration),
+        "<h2>Correlated parameters</h2>", _correlation_section(calibration),
+        "<h2>Options for this machine</h2>", _option_text(calibration),
+    ]  # fmt: skip
     return write_document(path, result_title(calibration.machine.name, "calibration"), parts)
 
 
@@ -66,7 +66,7 @@ def _summary_facts(calibration: Calibration) -> str:
     ]
     flagged_names = {
         "on a bound": [x.name for x in calibration.parameters if x.at_bound],
-        "not told": [x.name for x in calibration.parameters if x.is_unidentifiable],
+        "not identifiable": [x.name for x in calibration.parameters if x.is_unidentifiable],
     }
     rows = [
         (
@@ -74,8 +74,8 @@ def _summary_facts(calibration: Calibration) -> str:
             f"{calibration.machine.name} ({len(calibration.machine.driven_joints)} drives)",
         ),
         ("fitted to", "; ".join(fitted_windows)),
-        ("held out whole", ", ".join(held_out)),
-        ("numbers", f"{len(calibration.parameters)}, of which {len(identifiable)} are told"),
+        ("held out completely", ", ".join(held_out)),
+        ("parameters", f"{len(calibration.parameters)}, {len(identifiable)} identifiable"),
         *((flag, ", ".join(flagged)) for flag, flagged in flagged_names.items()),
         ("simulations", f"{calibration.simulation_count}"),
     ]
@@ -84,7 +84,7 @@ def _summary_facts(calibration: Calibration) -> str:
 
 def _fitted_window(channel: CalibrationChannel) -> str:
     time = channel.time[channel.train_mask]
-    suffix = "" if channel.train_mask.all() else ", the rest is held out"
+    suffix = "" if channel.train_mask.all() else ", the rest held out"
     return f"{channel.recording}, {time[0]:g} to {time[-1]:g} s{suffix}"
 
 
@@ -107,12 +107,13 @@ def _parameter_table(calibration: Calibration) -> str:
         )
         classes.append("weak" if parameter.at_bound or parameter.is_unidentifiable else "")
     explanation = (
-        "<p>Intervals of 95 %, as if there were no bounds; instants that what is left couples "
-        "count as one. Grey are numbers on a bound, and those that the recordings do not tell: "
-        "they are no result. An interval holds for a model that is right: a number that does the "
-        "work of something that the machine file has not is far off with a narrow one.</p>"
+        "<p>Confidence intervals of 95 %, computed without bounds; correlated residuals reduce "
+        "the number of independent samples. Grey rows are parameters on a bound and parameters "
+        "that the recordings do not determine: they are no result. Intervals hold for a correct "
+        "model. A parameter that compensates an effect which is missing in the machine file may "
+        "be far off with a narrow interval.</p>"
     )
-    heading = ["number*", "unit*", "start", "fitted", "95 %", "in the file", "remark*"]
+    heading = ["parameter*", "unit*", "start", "fitted", "95 %", "in the file", "remark*"]
     if not any(row[5] for row in rows):
         heading, rows = heading[:5] + heading[6:], [row[:5] + row[6:] for row in rows]
     caution_text = "".join(f"<p><b>{escape(caution)}</b></p>" for caution in calibration.cautions)
@@ -125,9 +126,7 @@ def _parameter_remark(parameter: FittedParameter) -> str:
             abs(parameter.value - parameter.initial_value) / parameter.interval_half_width
         )
         return ", ".join(
-            filter(
-                None, (parameter.remark, f"the file's is off by {interval_count:.2g} intervals")
-            )
+            filter(None, (parameter.remark, f"file value off by {interval_count:.2g} intervals"))
         )
     return parameter.remark
 
@@ -152,11 +151,12 @@ def _channel_section(calibration: Calibration) -> str:
         figures.append(image_tag(channel_residual_figure(channel, name), f"{name} over time"))
     heading = ["channel*", "unit*", "before", "fitted", "held out, before", "held out", "noise"]
     explanation = (
-        "<p>Root mean square of simulated less measured, over what was fitted and what was held "
-        "out; last about what the sensor's noise is, by the differences of its samples.</p>"
+        "<p>Root mean square of simulated minus measured values, for training data and held-out "
+        "data. The last column estimates the sensor noise from differences of samples.</p>"
     )
     caption = (
-        "<p>What was held out stands on a darker ground. Below what the fitted one leaves.</p>"
+        "<p>Held-out data have a darker background. The lower plots show the residuals of the "
+        "fit.</p>"
     )
     figure_row = f'<div class="figures">{"".join(figures)}</div>'
     return f"{explanation}{html_table(heading, rows)}{caption}{figure_row}"
@@ -164,22 +164,22 @@ def _channel_section(calibration: Calibration) -> str:
 
 def _dependence_section(dependences: list[ResidualDependence]) -> str:
     if not dependences:
-        return "<p>Nothing is driven by valves.</p>"
+        return "<p>No drive has a valve.</p>"
     rows = [
         [f"<code>{escape(dependence.name)}</code>", escape(dependence.drive),
          *(f"{100 * share:.0f} %" for share in dependence.correlation_ratios.values())]
         for dependence in dependences
     ]  # fmt: skip
     explanation = (
-        "<p>How much of what is left (its variance, where it was fitted) goes with the speed, the "
-        "pressure and the direction of a drive. What goes with the direction is friction or one "
-        "orifice of a valve; with the speed, viscous friction or orifices; with the pressure, "
-        "areas, moduli, leakage or a sensor's scale. Of a few strokes some tens of percent are "
-        "chance.</p>"
+        "<p>Correlation ratios: shares of the variance of the residual (of training data) that "
+        "depend on speed, pressure and direction of a drive. Dependence on the direction points "
+        "to friction or one orifice of a valve; on the speed, to viscous friction or orifices; "
+        "on the pressure, to areas, moduli, leakage or the scale of a sensor. With few strokes, "
+        "some tens of percent may be random.</p>"
     )
     heading = ["channel*", "against*", "speed", "pressure", "direction"]
     images = "".join(
-        image_tag(residual_dependence_figure(one), f"what is left of {one.name}")
+        image_tag(residual_dependence_figure(one), f"residual of {one.name}")
         for one in dependences
     )
     return explanation + html_table(heading, rows) + images
@@ -187,16 +187,18 @@ def _dependence_section(dependences: list[ResidualDependence]) -> str:
 
 def _score_test_section(calibration: Calibration) -> str:
     if not calibration.score_tests:
-        return "<p>No other number of the machine or its sensors would take away much of it.</p>"
+        return (
+            "<p>No other parameter of the machine or its sensors would reduce the cost much.</p>"
+        )
     explanation = (
-        "<p>Numbers that were not fitted, and how much of what is left each would take away, "
-        "alone with those that were; by the derivatives where the search ended.</p>"
+        "<p>Parameters that were not fitted, and the cost reduction by each if it were fitted, "
+        "too (score test at the solution).</p>"
     )
     rows = [
         [f"<code>{escape(x.name)}</code>", f"{x.value:.3g}", f"{100 * x.cost_reduction:.0f} %"]
         for x in calibration.score_tests
     ]
-    return explanation + html_table(["number*", "at about", "takes away"], rows)
+    return explanation + html_table(["parameter*", "value about", "cost reduction"], rows)
 
 
 def _correlation_section(calibration: Calibration) -> str:
@@ -206,7 +208,7 @@ def _correlation_section(calibration: Calibration) -> str:
             [f"<code>{escape(a)}</code>", f"<code>{escape(b)}</code>", f"{r:+.3f}"]
             for a, b, r in calibration.correlated_pairs
         ]
-        parts += ["<p>Of these a combination alone is known:</p>",
+        parts += ["<p>Of these pairs only a combination is identifiable:</p>",
                   html_table(["one*", "other*", "correlation"], rows)]  # fmt: skip
     if calibration.correlated_directions:
         items = "".join(
@@ -214,24 +216,22 @@ def _correlation_section(calibration: Calibration) -> str:
             for x in calibration.correlated_directions
         )
         parts.append(
-            "<p>These changes, made together, the recordings do not tell; they end where the "
-            f"intervals do:</p><ul>{items}</ul>"
+            "<p>The recordings do not determine these simultaneous changes, up to the given "
+            f"sizes:</p><ul>{items}</ul>"
         )
     if not parts:
-        parts.append("<p>The recordings tell all of them apart.</p>")
+        parts.append("<p>All parameters are separately identifiable.</p>")
     if len(calibration.parameters) > _MIN_MATRIX_PARAMETERS:
         figure = correlation_figure(
             calibration.correlation, [parameter.name for parameter in calibration.parameters]
         )
-        image = image_tag(figure, "correlations of the numbers")
+        image = image_tag(figure, "correlations of the parameters")
         parts.append(f'<div class="scroll"><div class="matrix">{image}</div></div>')
     return "".join(parts)
 
 
 def _option_text(calibration: Calibration) -> str:
     lines = [f"--set {name}={value:.8g}" for name, value in calibration.changes.items()]
-    explanation = (
-        "<p>For every command that takes a machine; all digits are in the machine file.</p>"
-    )
+    explanation = "<p>For every command that takes a machine. The machine file has all digits.</p>"
     command = escape(" ".join(lines)).replace(" --", " \\\n--")
     return f"{explanation}<pre>{command}</pre>"

@@ -1,4 +1,4 @@
-"""Rated loads as one page to point at: load, causes, posture, strokes and pressures of a place."""
+"""Interactive page of rated loads: load, limits, strokes and pressures at each position."""
 
 import json
 from html import escape
@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from crane.common.atomic_output import replace_file
-from crane.common.errors import OutputError
 from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.ratings import Capacity
 from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
-from crane.view.page.report_page import PAGE_SUFFIXES
+from crane.view.page.html_document import check_page_suffix, write_page
 from crane.view.plots.capacity_figure import (
     capacity_heading,
     drawing_extent,
@@ -24,7 +22,7 @@ from crane.view.plots.capacity_figure import (
     home_outlines,
     load_contours,
 )
-from crane.view.sketch.machine_outline import MachineOutline, machine_outline
+from crane.view.sketch.mechanism_projection import MachineOutline, machine_outline
 
 _MAX_CELLS = 1500  # per slew angle, at most
 _OUTLINE_RESOLUTION = 4000.0  # of the extent, to which outlines are rounded
@@ -32,10 +30,10 @@ _SIGNIFICANT_DIGITS, _LOAD_DIGITS = 5, 7
 
 
 def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
-    """Write rated loads as one HTML file that needs no network.
+    """Write a load chart as one self-contained HTML file.
 
     Args:
-        chart: What to show; of more than 1500 places per slew angle every second, third ...
+        chart: Load chart; positions are thinned to 1500 per slew angle.
         path: The file to write; replaced if it exists.
 
     Returns:
@@ -44,8 +42,7 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    check_page_suffix(path)
     assets = files("crane.view.page") / "assets"
     style, script, template = (
         (assets / f"capacity.{kind}").read_text(encoding="utf-8") for kind in ("css", "js", "html")
@@ -57,13 +54,11 @@ def write_capacity_page(chart: Capacity, path: str | Path) -> Path:
         script=script,
         data=data.replace("</", "<\\/"),
     )
-    with replace_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return Path(path)
+    return write_page(path, text)
 
 
 def capacity_page_data(chart: Capacity) -> dict[str, Any]:
-    """What the page shows, as JSON has it; lengths of outlines in `unit` metres."""
+    """Return the data of the page for JSON; outlines in multiples of `unit` metres."""
     lower, upper = drawing_extent(chart)
     unit = float((upper - lower).max()) / _OUTLINE_RESOLUTION
     machine, pressures = chart.machine, chart.pressures()
@@ -104,10 +99,10 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
 def _cell_rows(
     chart: Capacity, k: int, pressures: dict[str, Array], unit: float, shapes: dict[str, int]
 ) -> list[list[Any]]:
-    """Of each place at a slew angle what the page tells of it.
+    """Return one row per position at a slew angle.
 
-    Radius, height, load, cause, loads by cause, strokes, pressures by joint, and the number of
-    its outline.
+    Radius, height, load, limiting factor, loads by factor, strokes, pressures by joint, outline
+    index.
     """
     machine, active = chart.machine, chart.machine.closure.active
     stride = _cell_stride(chart)
@@ -143,13 +138,13 @@ def _cell_rows(
 
 
 def _cell_stride(chart: Capacity) -> int:
-    """Of how many places along an axis one is shown."""
+    """Return the stride of the positions that are shown along both axes."""
     max_count = int((~np.isnan(chart.loads)).sum(axis=(1, 2)).max())
     return max(int(np.ceil(np.sqrt(max_count / _MAX_CELLS))), 1)
 
 
 def _contour_rows(chart: Capacity, k: int, unit: float) -> list[list[Any]]:
-    """Of each contour that is there its load in words and its lines."""
+    """Return label and lines of each contour."""
     contour_lines = load_contours(chart, k)
     name, scale = display_unit("kg", max((level for level, _ in contour_lines), default=0.0))
     return [
@@ -165,12 +160,12 @@ def _outline_shape(outline: MachineOutline, unit: float) -> list[Any]:
 
 
 def _round_points(points: Array, unit: float) -> list[int]:
-    """x, y, x, y ... in units."""
+    """Return rounded coordinates x, y, x, y ... in multiples of `unit`."""
     return [int(x) for x in np.rint(points / unit).ravel()]
 
 
 def _reading_unit(unit: str) -> tuple[str, float]:
-    """Degrees and millimetres."""
+    """Return display unit and scale: degrees or millimetres."""
     return display_unit(unit, 0.0)
 
 
@@ -179,10 +174,10 @@ def _smallest_spacing(values: Array) -> float:
 
 
 def _round_to_tenths(value: float) -> float:
-    """Strokes and angles to 0.1 mm or deg, without rounding noise at their limits."""
+    """Round strokes and angles to 0.1 mm or deg."""
     return round(float(value), 1) + 0.0  # no -0.0
 
 
 def _rounded_or_none(value: float, digits: int = _SIGNIFICANT_DIGITS) -> float | None:
-    """A number with few digits, None where there is none."""
+    """Round to some significant digits; None if not finite."""
     return float(f"{value:.{digits}g}") if np.isfinite(value) else None

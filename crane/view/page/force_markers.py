@@ -1,6 +1,6 @@
-"""What a page draws on the machine: forces of its drives and loads, springs between its bodies."""
+"""Markers of a page: forces of drives and loads, springs and dampers."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -8,12 +8,9 @@ from crane.common.samples import Array
 from crane.description.specification import ForceElement, GasSpring
 from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine import Machine
+from crane.recordings.recording import Recording
 from crane.view.page.machine_visuals import largest_body_extent
-from crane.view.page.packed_arrays import pack_base64
-from crane.view.page.page_motion import frame_data
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+from crane.view.page.page_motion import frame_data, pack_base64
 
 _FULL_ARROW_PERCENTILE = (
     99.5  # percentile of the forces that has a full arrow: a single spike does not count
@@ -21,13 +18,13 @@ _FULL_ARROW_PERCENTILE = (
 _MIN_WEIGHT_SHARE = (
     1e-6  # share of the machine's weight that is rounding noise, as a force or torque
 )
-_SAMPLED_CONFIGURATIONS = 300  # postures that tell how short a strut gets
+_SAMPLED_CONFIGURATIONS = 300  # configurations that determine the shortest length
 
 
 def actuator_markers(
-    machine: Machine, recording: "Recording", rows: np.ndarray
+    machine: Machine, recording: Recording, rows: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Where the driven joints act and how strongly, in shares of what has a full arrow."""
+    """Return position and force over time of the driven joints, as shares of a full arrow."""
     model = machine.model
     loop_links = [loop.successor for loop in machine.closure.equations.loops]
     loop_links += [loop.predecessor for loop in machine.closure.equations.loops]
@@ -63,11 +60,11 @@ def actuator_markers(
 
 
 def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, float]:
-    """The force or torque of each driven joint that has a full arrow [N or N m].
+    """Return the force of each driven joint that is drawn as a full arrow [N], [N m].
 
-    In proportion to their limits (`effort`) where all have one, so that arrows tell how hard each
-    works for what it can. Else to forces, torques by the longest body as their lever. The joint
-    that is largest by that has a full arrow at its peak.
+    Forces are scaled by the effort limits if all joints have one, so that arrows show the
+    utilization of each drive. Otherwise torques are divided by the length of the longest body. The
+    joint with the largest scaled force has a full arrow at its peak.
 
     Args:
         machine: The machine.
@@ -90,10 +87,8 @@ def full_arrow_forces(machine: Machine, peaks: dict[str, float]) -> dict[str, fl
     }
 
 
-def load_markers(
-    machine: Machine, recording: "Recording", rows: np.ndarray
-) -> list[dict[str, Any]]:
-    """Where forces from outside act and how strongly, in shares of the largest."""
+def load_markers(machine: Machine, recording: Recording, rows: np.ndarray) -> list[dict[str, Any]]:
+    """Return frame and force over time of external forces, as shares of the largest."""
     known_forces = [
         *machine.external_forces,
         *(x for task in machine.tasks.values() for x in task.loads),
@@ -122,13 +117,13 @@ def load_markers(
 
 
 def spring_markers(machine: Machine, q: Array) -> list[dict[str, Any]]:
-    """What acts between two frames of a machine: where, what it looks like, and its lengths.
+    """Return the force elements between two frames: ends, symbols and lengths.
 
-    A coil where there is a spring, a strut where there is a damper or gas, else a line.
+    Springs are drawn as coils, dampers and gas springs as struts, others as lines.
 
     Args:
         machine: The machine.
-        q: (N, nq) postures that are shown.
+        q: (N, nq) configurations of the page.
     """
     element_pairs = [
         (element, element.between)

@@ -1,4 +1,4 @@
-"""Self-contained pages of text, tables and pictures, that need no network."""
+"""Self-contained HTML documents of text, tables and figures."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -6,7 +6,8 @@ from pathlib import Path
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import OutputError
-from crane.view.page.report_page import PAGE_SUFFIXES
+
+PAGE_SUFFIXES = (".html", ".htm")
 
 _CSS = """
 :root { color: #26292e; background: #fff; font: 15px/1.5 system-ui, "Segoe UI", sans-serif; }
@@ -40,8 +41,8 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
 
     Args:
         path: The file to write; replaced if it exists.
-        heading: What it is called.
-        parts: Its HTML.
+        heading: Heading of the page.
+        parts: HTML of its parts.
 
     Returns:
         The path.
@@ -49,8 +50,7 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+    check_page_suffix(path)
     heading = escape(heading)
     text = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -58,13 +58,32 @@ def write_document(path: str | Path, heading: str, parts: Iterable[str]) -> Path
         f"<title>{heading}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
         f"<h1>{heading}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
     )
+    return write_page(path, text)
+
+
+def check_page_suffix(path: str | Path) -> None:
+    """Check that a file name is that of a page.
+
+    Raises:
+        OutputError: The suffix is not .html or .htm.
+    """
+    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
+        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
+
+
+def write_page(path: str | Path, text: str) -> Path:
+    """Write the HTML text of a page to a file, and return the path.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     with replace_file(path) as part:
         part.write_text(text, encoding="utf-8")
     return Path(path)
 
 
 def definition_list(rows: Iterable[tuple[str, str]]) -> str:
-    """Names with what they are; what is nothing is left out."""
+    """Return a definition list as HTML, without entries of empty text."""
     items = (f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in rows if text)
     return f"<dl>{''.join(items)}</dl>"
 
@@ -72,7 +91,7 @@ def definition_list(rows: Iterable[tuple[str, str]]) -> str:
 def html_table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], classes: Iterable[str] = ()
 ) -> str:
-    """Cells are HTML; those of columns whose head ends in * are text, the others numbers."""
+    """Return an HTML table of HTML cells; a heading that ends in * marks a text column."""
     cell_attributes = ["" if name.endswith("*") else ' class="n"' for name in headings]
     heading_cells = "".join(
         f"<th{k}>{name.rstrip('*')}</th>"

@@ -1,4 +1,4 @@
-"""An identification as one self-contained page: what was found, and how well it predicts."""
+"""Page of an identification: fit, forces, base parameters, correlations."""
 
 import dataclasses
 from html import escape
@@ -26,19 +26,20 @@ _CORRELATION_THRESHOLD = 0.9
 _VALIDATION_COLOUR = "#2a9d6f"
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def identification_report(
     result: Identification, path: str | Path, recording: str = "", validation: str = ""
 ) -> Path:
-    """Write what an identification found as one HTML file that needs no network.
+    """Write an identification as one self-contained HTML file.
 
-    Summary; fit of every actuator; measured and modelled forces, residuals and their spectra;
-    base parameters with intervals; their correlations; what forces cannot tell.
+    The page has a summary; the fit of every actuator; measured and modelled forces, residuals and
+    their spectra; base parameters with intervals; correlations; and unobservable parameters.
 
     Args:
-        result: What was found.
+        result: The identification.
         path: The file to write; replaced if it exists.
-        recording: What it was identified from, in words.
-        validation: What it was judged by.
+        recording: Description of the training data.
+        validation: Description of the validation data.
 
     Returns:
         The path.
@@ -46,16 +47,15 @@ def identification_report(
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    with mpl.rc_context(FIGURE_STYLE):
-        parts = [
-            _summary_facts(result, recording, validation),
-            "<h2>Fit</h2>", _fit_section(result),
-            "<h2>Forces</h2>", _force_section(result),
-            "<h2>Base parameters</h2>", _base_parameter_section(result),
-            *([] if result.parameters is None else ["<h2>Bodies</h2>", _body_section(result)]),
-            "<h2>Correlations</h2>", _correlation_section(result),
-            "<h2>Not told</h2>", _unobservable_section(result),
-        ]  # fmt: skip
+    parts = [
+        _summary_facts(result, recording, validation),
+        "<h2>Fit</h2>", _fit_section(result),
+        "<h2>Forces</h2>", _force_section(result),
+        "<h2>Base parameters</h2>", _base_parameter_section(result),
+        *([] if result.parameters is None else ["<h2>Bodies</h2>", _body_section(result)]),
+        "<h2>Correlations</h2>", _correlation_section(result),
+        "<h2>Unobservable parameters</h2>", _unobservable_section(result),
+    ]  # fmt: skip
     return write_document(
         path, result_title(result.described_machine.name, "identification"), parts
     )
@@ -70,7 +70,7 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
     method_texts["huber"] = "robust (Huber)"
     method = method_texts.get(result.method, result.method)
     if result.feasible:
-        method += ", with bodies that can exist"
+        method += ", with physically feasible bodies"
     elif result.parameters is not None:
         method += ", about a prior"
     step = float(np.median(np.diff(fit.time)))
@@ -79,13 +79,13 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
             "machine",
             f"{machine.name} ({len(machine.driven_joints)} drives, {len(machine.joints)} joints)",
         ),
-        ("its numbers", machine.source),
+        ("source", machine.source),
         ("recording", recording),
         ("validation", validation),
         ("method", method),
         (
             "equations",
-            f"{fit.is_moving.sum()} of {fit.is_moving.size}, those away from standstill, in "
+            f"{fit.is_moving.sum()} of {fit.is_moving.size}, without standstill, in "
             f"{fit.time[-1] - fit.time[0]:.4g} s thinned to {1 / step:.4g} per second",
         ),
         ("rank", f"{result.base.rank} base parameters of {len(result.base.names)} parameters"),
@@ -101,7 +101,7 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
 
 def _unexplained_text(result: Identification) -> str:
     if np.isnan(result.training.overall_relative_error):
-        return "nothing drives it: no force to compare with"
+        return "no drive, no force to compare"
     parts = [f"{100 * result.training.overall_relative_error:.3g} % of the forces"]
     if result.validation is not None:
         parts.append(f"{100 * result.validation.overall_relative_error:.3g} % in validation")
@@ -128,9 +128,7 @@ def _fit_section(result: Identification) -> str:
             row += cells if fit.is_moving[:, i].any() else ["-", "-", "-"]
         rows.append(row)
     headings = ["drive*", "RMS error", "relative", "squared"]
-    explanation = (
-        "Of rows away from standstill: root mean square of measured less modelled force, its "
-    )
+    explanation = "Without standstill: root mean square of measured minus modelled force, its "
     explanation += "ratio to that of the measured force, and the square of this ratio."
     if result.validation is not None:
         headings += ["validation: RMS error", "relative", "squared"]
@@ -139,8 +137,8 @@ def _fit_section(result: Identification) -> str:
 
 def _force_section(result: Identification) -> str:
     parts = [
-        "<p>Both through the same low-pass. The model has gaps where a joint is near standstill, "
-        "which is left out. Spectra are averaged periodograms of the residuals.</p>"
+        "<p>Both forces pass the same low-pass filter. The model has gaps near standstill, which "
+        "is left out. Spectra are averaged periodograms of the residuals.</p>"
     ]
     fits = [("training", result.training, RECORDED_COLOUR)]
     if result.validation is not None:
@@ -184,12 +182,11 @@ def _base_parameter_section(result: Identification) -> str:
         )
         classes.append("weak" if i not in essential_indices else "")
     explanation = (
-        f"<p>{len(essential_indices)} of {len(result.names)} are essential: without the others, "
-        f"which are "
-        "grey, the forces are not explained significantly worse. The intervals cover the truth "
-        "with 95 % confidence. Not determined are those whose deviation exceeds what such a "
-        "machine can have. A base parameter is the one that "
-        "it is named after together with others that act alike.</p>"
+        f"<p>{len(essential_indices)} of {len(result.names)} are essential: without the others "
+        "(grey), the forces are not explained significantly worse. Intervals have a confidence of "
+        "95 %. Parameters are not determined if their standard deviation exceeds the values of "
+        "such machines. A base parameter combines the parameter in its name with others that have "
+        "the same effect.</p>"
     )
     headings = [
         "parameter*", "value", "from", "to", "rel. std", "description", "marks*", "together with*",
@@ -198,7 +195,6 @@ def _base_parameter_section(result: Identification) -> str:
 
 
 def _format_share(numerator: float, denominator: float) -> str:
-    """A share of at most 1000 %."""
     share = abs(numerator / denominator) if denominator else np.inf
     return (
         f"{100 * share:.2g} %"
@@ -210,7 +206,7 @@ def _format_share(numerator: float, denominator: float) -> str:
 
 
 def _format_group(text: str) -> str:
-    """A group in words, the end of long ones to be opened."""
+    """Return a group as HTML; the end of a long one is folded."""
     if len(text) <= _MAX_GROUP_LENGTH:
         return escape(text)
     cut_position = text.rfind(" ", 0, _MAX_GROUP_LENGTH)
@@ -230,8 +226,8 @@ def _body_section(result: Identification) -> str:
             row += [f"{mass:.4g}", ", ".join(f"{1e3 * x / mass:z.1f}" for x in first_moment)]
         rows.append(row)
     headings = ["body*", "mass [kg]", "centre [mm]", "described mass", "described centre"]
-    explanation = "Values of all parameters, of which forces tell the base parameters above; the "
-    return f"<p>{explanation}description says the rest.</p>{html_table(headings, rows)}"
+    explanation = "Values of all parameters. Forces determine the base parameters above, and the "
+    return f"<p>{explanation}description the rest.</p>{html_table(headings, rows)}"
 
 
 def _correlation_section(result: Identification) -> str:
@@ -248,7 +244,7 @@ def _correlation_section(result: Identification) -> str:
         f"<p>{len(strong_pairs)} pairs of estimates are correlated by more than "
         f"{_CORRELATION_THRESHOLD:g}"
     )
-    explanation += ": motions that separate them would tell both better." if strong_pairs else "."
+    explanation += ": motions that separate them would improve both." if strong_pairs else "."
     pair_table = html_table(["one*", "other*", "correlation"], rows) if rows else ""
     image = image_tag(correlation_figure(R, result.names), "correlation matrix")
     return (
@@ -265,7 +261,7 @@ def _unobservable_section(result: Identification) -> str:
     ]
     out = []
     for names, explanation in (
-        (base.unobservable, "Without any effect on the forces, in whatever motion"),
+        (base.unobservable, "Without effect on the forces in any motion"),
         (unexcited, "Without effect in this recording"),
     ):
         if names:

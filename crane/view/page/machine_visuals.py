@@ -1,4 +1,4 @@
-"""What a machine looks like: what its URDFs draw, or a skeleton."""
+"""Visuals of a machine: shapes of its URDFs, or a skeleton."""
 
 import warnings
 from collections.abc import Collection
@@ -25,12 +25,11 @@ _MAX_ROD_STROKE_RATIO = (
 
 
 def read_visuals(machine: Machine) -> list[Visual]:
-    """The visuals of every link, and a skeleton of bodies with mass that have none.
+    """Return the visuals of every link, and a skeleton of bodies with mass that have none.
 
-    Where no URDF has any, the skeleton is of all that there is. A mesh whose file is missing or
-    damaged is a box, and what cannot be drawn is left out, with a warning; where nothing but boxes
-    would be left, the skeleton is there, too. Bodies that slide and have no visuals are rods or
-    blocks.
+    Without any visuals, all bodies are drawn as a skeleton. A mesh with a missing or damaged file
+    is drawn as a box, and shapes that cannot be drawn are left out, with a warning; if only boxes
+    remain, the skeleton is added. Sliding bodies without visuals are drawn as rods or blocks.
     """
     visuals: list[Visual] = []
     missing_meshes: list[str] = []
@@ -66,7 +65,7 @@ def _warn(text: str) -> None:
 
 
 def _largest_joint_distance(machine: Machine) -> float:
-    """Largest distance between two joints on one body [m]; 1 where all are in one place."""
+    """Return the largest distance between two joints on one body [m]; 1 if all are 0."""
     joint_placements = machine.model.jointPlacements
     return (
         max(float(np.linalg.norm(placement.translation)) for placement in joint_placements) or 1.0
@@ -74,7 +73,7 @@ def _largest_joint_distance(machine: Machine) -> float:
 
 
 def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
-    """Of each body, by its joint, where its frames and the next joints are (3,) [m]; names."""
+    """Return parent joint, position (3,) [m] and name of all frames and joints on bodies."""
     model = machine.model
     bodies = (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
     points = [(frame.parentJoint, frame.placement.translation, frame.name) for frame in bodies]
@@ -85,12 +84,12 @@ def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
 
 
 def largest_body_extent(machine: Machine) -> float:
-    """Largest distance from a joint to a frame of the body it moves [m]; 1 where all meet."""
+    """Return the largest distance from a joint to a frame of its body [m]; 1 if all are 0."""
     return max(float(np.linalg.norm(end)) for _, end, _ in _body_points(machine)) or 1.0
 
 
 def _first_links(machine: Machine) -> dict[int, str]:
-    """The first link of the body that each joint moves."""
+    """Return the first link of each body, by joint."""
     links: dict[int, str] = {}
     for frame in machine.model.frames:
         if frame.type == pin.FrameType.BODY:
@@ -99,10 +98,10 @@ def _first_links(machine: Machine) -> dict[int, str]:
 
 
 def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> list[Visual]:
-    """What shows bodies with mass that slide, but for those that are drawn, by joints.
+    """Return rods and blocks for sliding bodies with mass that have no visuals.
 
-    On what moves, a rod as long as the stroke, whose end is in the mouth of the barrel when it is
-    out; on what stands still, or without limits that any barrel has, a block.
+    A body on a moving body is a rod as long as the stroke, whose end is in the mouth of the barrel
+    when extended; a body on the ground, or with a long stroke, is a block.
     """
     model, links, size = machine.model, _first_links(machine), largest_body_extent(machine)
     width, limits = 0.11 * size, machine.coordinates
@@ -126,13 +125,13 @@ def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> lis
 
 
 def skeleton_visuals(machine: Machine, bodies: Collection[int] | None = None) -> list[Visual]:
-    """Bars from each joint to the joints and frames of the body it moves.
+    """Return bars from each joint to the joints and frames of its body.
 
-    Where springs are held by what stands still there is a ball alone: a bar would hide them.
+    Ends of springs on the ground are drawn as spheres only; a bar would hide the springs.
 
     Args:
         machine: The machine.
-        bodies: By the joints that move them; all, and what stands still, if not given.
+        bodies: Joints of the bodies to draw; by default all, and the ground.
     """
     model, links, radius = (
         machine.model,

@@ -1,14 +1,13 @@
-"""A recording's columns as a page plots them: grouped, in units to read, thinned out.
+"""Plot data of a page: columns of a recording, grouped, in display units, thinned.
 
-A column of few samples is kept as it is. Of more, the page has the lowest and highest value in
-each of many spans of time, so that no peak is lost, and the samples at the frames, which are the
-values at the cursor.
+Short columns are complete. Of long columns, the page has the smallest and the largest value in
+each of many time spans, so that no peak is lost, and the samples at the frames, for the cursor.
 """
 
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +20,9 @@ from crane.recordings.recording import (
     REFERENCE_PREFIX,
     VELOCITY_SUFFIX,
     VELOCITY_UNITS,
+    Recording,
 )
-from crane.view.page.packed_arrays import pack_base64
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+from crane.view.page.page_motion import pack_base64
 
 MIN_SPANS = 4000  # of time, in a short recording
 SPANS_PER_SECOND = 15.0  # in a long one
@@ -56,12 +53,12 @@ class PageColumn:
     """One column of a recording, in SI units.
 
     Attributes:
-        name: As in the recording's file.
-        group: Title of the group it is plotted in.
-        label: What the plot calls it.
+        name: Name in the recording.
+        group: Title of its plot group.
+        label: Label in the plot.
         unit: Its unit.
         values: (N,).
-        reference: (N,) what it should be; None if not recorded.
+        reference: (N,) reference; None if not recorded.
         limits: Limits of a coordinate.
     """
 
@@ -76,12 +73,12 @@ class PageColumn:
 
 @dataclass(frozen=True, eq=False)
 class ThinningGrid:
-    """How the samples of one recording are thinned out.
+    """Grid on which the samples of a recording are thinned.
 
     Attributes:
-        time: (N,) of the samples [s].
-        frame_rows: Samples that are frames.
-        span_starts: First sample of each span; None where every sample is kept.
+        time: (N,) times of the samples [s].
+        frame_rows: Rows of the samples that are frames.
+        span_starts: First sample of each span; None if every sample is kept.
     """
 
     time: Array
@@ -90,9 +87,9 @@ class ThinningGrid:
 
     @classmethod
     def from_recording(
-        cls, recording: "Recording", frame_rows: np.ndarray, page_share: float = 1.0
+        cls, recording: Recording, frame_rows: np.ndarray, page_share: float = 1.0
     ) -> "ThinningGrid":
-        """Spans for a recording that takes a share of the page."""
+        """Return a grid for a recording that takes a share of the page."""
         time, columns = recording.time, 1 + 3 * len(recording.joints) + len(recording.channels)
         wanted_spans = max(MIN_SPANS, int(SPANS_PER_SECOND * (time[-1] - time[0])))
         count = max(min(wanted_spans, int(page_share * MAX_SPANS / columns)), 500)
@@ -101,7 +98,7 @@ class ThinningGrid:
         return cls(time, frame_rows, np.arange(count) * len(time) // count)
 
     def time_axis(self) -> dict[str, Any]:
-        """Times of what `thin_out` keeps, and where the frames are among them."""
+        """Return the times of the values of `thin_out`, and the rows of the frames."""
         if self.span_starts is None:
             return {
                 "time": pack_base64(self.time, "f8"),
@@ -114,7 +111,7 @@ class ThinningGrid:
         }
 
     def thin_out(self, values: Array) -> dict[str, str]:
-        """Values (N,) thinned out: lowest and highest of each span, samples at the frames."""
+        """Return smallest and largest of values (N,) in each span, and the values at frames."""
         if self.span_starts is None:
             return {"low": pack_base64(values, "f4"), "high": "", "frames": ""}
         return {
@@ -125,7 +122,6 @@ class ThinningGrid:
 
 
 def _column_series(column: PageColumn, grid: ThinningGrid, scale: float) -> dict[str, Any]:
-    """The values of a column, of its reference and its limits."""
     series_data: dict[str, Any] = {"series": grid.thin_out(scale * column.values)}
     if column.reference is not None:
         series_data["reference"] = grid.thin_out(scale * column.reference)
@@ -136,18 +132,17 @@ def _column_series(column: PageColumn, grid: ThinningGrid, scale: float) -> dict
 
 def plot_groups(
     machine: Machine,
-    recording: "Recording",
+    recording: Recording,
     grid: ThinningGrid,
-    second_recording: "tuple[Recording, ThinningGrid] | None" = None,
+    second_recording: tuple[Recording, ThinningGrid] | None = None,
 ) -> list[dict[str, Any]]:
-    """Everything that a page plots, by group.
+    """Return the plot data of a page by group.
 
     Args:
         machine: The machine.
-        recording: What it did.
-        grid: How its samples are thinned out.
-        second_recording: A second recording, with its grid: its columns of the same names are
-            second lines.
+        recording: Recording of its run.
+        grid: Grid on which its samples are thinned.
+        second_recording: Second recording with its grid; its columns are drawn as second lines.
     """
     columns_by_group: dict[tuple[str, str], list[PageColumn]] = {}
     for column in page_columns(machine, recording):
@@ -197,11 +192,10 @@ def plot_groups(
     return group_data
 
 
-def page_columns(machine: Machine, recording: "Recording") -> Iterator[PageColumn]:
-    """All columns but time, each in its group; references with what they are references of.
+def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]:
+    """Yield all columns except time, with their groups, and references with their columns.
 
-    Beside them what follows from them: errors, references less coordinates, and the sum of
-    kinetic and potential energy.
+    Errors (reference minus coordinate) and the sum of kinetic and potential energy are added.
     """
     channels = recording.channels
     used_references = set()
@@ -278,7 +272,6 @@ def _sum_blockwise(first: Array, second: Array) -> Array:
 
 
 def _group_and_label(machine: Machine, name: str, unit: str) -> tuple[str, str]:
-    """Group and label of a channel."""
     if name in machine.joints:
         return ("Passive strokes" if machine.unit(name) == "m" else "Passive angles"), name
     joint = name.removesuffix(VELOCITY_SUFFIX)
@@ -301,14 +294,14 @@ def _peak_magnitude(values: Array) -> float:
 
 
 def _varies(values: Array) -> bool:
-    """Whether a column is more than a constant and rounding noise."""
+    """Return whether a column varies by more than rounding errors."""
     return float(np.ptp(values)) > 1e-9 * max(1.0, _peak_magnitude(values))
 
 
 def _with_colours(
     machine: Machine, group_columns: list[PageColumn]
 ) -> Iterator[tuple[PageColumn, int, int]]:
-    """Each column with a hue, the same for one joint everywhere, and a shade of it."""
+    """Yield each column with a hue, which is the same in all plots of a joint, and a shade."""
     hue_by_joint: Mapping[str, int] = {joint: i for i, joint in enumerate(machine.active)}
     used_hues: dict[int, int] = {}
     for column in group_columns:

@@ -1,14 +1,7 @@
-"""What a page computes postures from: the tree of joints, and their coordinates per frame.
+"""Motion of a page: joint tree, packed coordinates and frames for its script."""
 
-A page holds no poses. Its script computes them as Pinocchio does, from the root outwards,
-
-    oM_i = oM_parent(i)  placement_i  exp(S_i q_i),
-
-S_i being the joint's unit axis, which it turns about or slides along. A body that floats has six
-coordinates, place and rotation vector.
-"""
-
-from typing import TYPE_CHECKING, Any
+import base64
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,20 +9,48 @@ import pinocchio as pin
 from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.view.page.packed_arrays import pack_base64, quantise
+from crane.recordings.recording import Recording
 
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+_LEVELS = 2**32 - 1
+
+
+def pack_base64(values: np.ndarray, dtype_name: str) -> str:
+    """Return little-endian numbers as base64.
+
+    Args:
+        values: Array of any shape, in row-major order.
+        dtype_name: numpy type, "f4", "f8" or "u4".
+    """
+    return base64.b64encode(
+        np.ascontiguousarray(values, dtype=f"<{dtype_name}").tobytes()
+    ).decode()
+
+
+def quantise(values: Array) -> dict[str, Any]:
+    """Pack coordinates into four bytes each, to 1.2e-10 of their range (float32: 6e-8).
+
+    Args:
+        values: (N,) finite values.
+
+    Returns:
+        low, step and levels with value = low + step * level; no levels if all values are equal.
+    """
+    low = float(values.min())
+    step = (float(values.max()) - low) / _LEVELS
+    if not step:
+        return {"low": low, "step": 0.0, "levels": ""}
+    return {"low": low, "step": step, "levels": pack_base64(np.rint((values - low) / step), "u4")}
+
 
 FRAMES_PER_SECOND = 30.0
 MAX_FRAMES = 36_000  # twenty minutes at full rate; longer recordings get fewer per second
 
 
 def joint_tree(machine: Machine) -> dict[str, Any]:
-    """Joints, bodies' masses and link frames for the script; matrices column by column.
+    """Return joints, masses and link frames for the script; matrices in column-major order.
 
     Returns:
-        joints, each after its parent, with the first of their coordinates; -1 is the world.
+        Joints, each after its parent, with the index of their first coordinate; -1 is the world.
     """
     model = machine.model
     joints = []
@@ -58,19 +79,19 @@ def joint_tree(machine: Machine) -> dict[str, Any]:
 
 
 def frame_data(machine: Machine, link: str) -> dict[str, Any]:
-    """Where a link's frame is: its joint, and its pose in the joint's frame."""
+    """Return the joint of a link's frame, and its pose in the joint's frame."""
     frame = machine.model.frames[machine.frame(link)]
     return {"joint": frame.parentJoint - 1, "placement": column_major_pose(frame.placement)}
 
 
 def column_major_pose(pose: pin.SE3) -> list[float]:
-    """A pose as 16 numbers, column by column."""
+    """Return a pose as 16 numbers, column by column."""
     values: list[float] = pose.homogeneous.ravel("F").tolist()
     return values
 
 
 def payload_frame_data(machine: Machine) -> dict[str, Any] | None:
-    """Where the centre of mass of the machine's payload is; None without one."""
+    """Return the centre of mass of the payload as a frame; None without payload."""
     model = machine.model
     payload_chains = [chain for chain in machine.chains if chain.name == "payload"]
     if not payload_chains:
@@ -97,11 +118,11 @@ def payload_frame_data(machine: Machine) -> dict[str, Any] | None:
 
 
 def frame_rows(time: Array, frame_share: float = 1.0) -> np.ndarray:
-    """Rows of the samples that are frames: 30 per second, of a long recording fewer.
+    """Return the rows of the samples that are frames: 30 per second, fewer of long recordings.
 
     Args:
-        time: (N,) increasing [s].
-        frame_share: Of the frames that a page has at most.
+        time: (N,) increasing times [s].
+        frame_share: Share of the largest number of frames of a page.
     """
     duration = float(time[-1] - time[0])
     return nearest_frame_rows(
@@ -113,10 +134,10 @@ def frame_rows(time: Array, frame_share: float = 1.0) -> np.ndarray:
 
 
 def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
-    """Rows of the samples nearest to the frames of a film, the first and the last among them.
+    """Return the rows of the samples nearest to equidistant frames, first and last included.
 
     Args:
-        time: (N,) increasing [s].
+        time: (N,) increasing times [s].
         fps: Frames per second.
     """
     frame_times = np.arange(time[0], time[-1], 1 / fps)
@@ -125,16 +146,15 @@ def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
 
 
 def motion_data(time: Array, q: Array) -> dict[str, Any]:
-    """Frames for the script: times (N,) [s] and postures (N, nq)."""
+    """Return packed times (N,) [s] and configurations (N, nq) for the script."""
     return {"time": pack_base64(time, "f8"), "q": [quantise(column) for column in q.T]}
 
 
-def check_joints(machine: Machine, recording: "Recording") -> None:
-    """See that a recording is of this machine.
+def check_joints(machine: Machine, recording: Recording) -> None:
+    """Check that a recording is of this machine.
 
     Raises:
-        RecordingError: It lacks an active joint, has one that the machine does not have, or one
-            in another unit.
+        RecordingError: The recording lacks an active joint, or has an unknown joint or unit.
     """
     for joint in machine.active:
         if joint not in recording.joints:
@@ -155,11 +175,11 @@ def check_joints(machine: Machine, recording: "Recording") -> None:
             )
 
 
-def recorded_configurations(machine: Machine, recording: "Recording", rows: np.ndarray) -> Array:
-    """(len(rows), nq) closed postures of some samples of a recording.
+def recorded_configurations(machine: Machine, recording: Recording, rows: np.ndarray) -> Array:
+    """Return closed configurations (len(rows), nq) of some samples of a recording.
 
     Raises:
-        RecordingError: It is of a machine with other joints.
+        RecordingError: The recording is of a machine with other joints.
         ClosureError: The loops cannot be closed.
         InputError: A coordinate is not finite.
     """
@@ -181,7 +201,7 @@ def recorded_configurations(machine: Machine, recording: "Recording", rows: np.n
     return q
 
 
-def _is_recorded(machine: Machine, recording: "Recording", joint: str) -> bool:
-    """Whether the channel of a passive joint is there, in the joint's unit or in none."""
+def _is_recorded(machine: Machine, recording: Recording, joint: str) -> bool:
+    """Return whether a passive joint is recorded, in its unit or without unit."""
     unit = recording.channel_units.get(joint)
     return unit is not None and unit in ("", machine.unit(joint))

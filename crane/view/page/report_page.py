@@ -1,4 +1,4 @@
-"""One self-contained page that shows a machine, its forces and its numbers in any browser."""
+"""Report page of a machine and its run, for any browser without network."""
 
 import json
 import webbrowser
@@ -7,15 +7,15 @@ from importlib.resources import files
 from math import cos, sin
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from crane.common.atomic_output import replace_file
-from crane.common.errors import OutputError, RecordingError
+from crane.common.errors import RecordingError
 from crane.machine import Machine
+from crane.recordings.recording import Recording
 from crane.recordings.recording_differences import clock_shift, joint_differences
 from crane.recordings.recording_summary import label, point_channel, result_title
 from crane.view.page.force_markers import actuator_markers, load_markers, spring_markers
-from crane.view.page.packed_arrays import pack_base64
+from crane.view.page.html_document import check_page_suffix, write_page
 from crane.view.page.page_channels import ThinningGrid, plot_groups
 from crane.view.page.page_motion import (
     check_joints,
@@ -23,16 +23,12 @@ from crane.view.page.page_motion import (
     frame_rows,
     joint_tree,
     motion_data,
+    pack_base64,
     payload_frame_data,
     recorded_configurations,
 )
 from crane.view.page.run_summary import summarize_run
 from crane.view.page.scene import Scene, build_scene
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
-
-PAGE_SUFFIXES = (".html", ".htm")
 
 # Directions from the machine to the camera; x forward (see `Scene.heading`), z up.
 CAMERA_DIRECTIONS = {
@@ -45,21 +41,21 @@ SCRIPT_NAMES = ("data", "kinematics", "timeline", "scene", "marks", "plots", "ch
 
 def report(
     machine: Machine,
-    recording: "Recording | None",
+    recording: Recording | None,
     path: str | Path,
-    second_recording: "Recording | None" = None,
+    second_recording: Recording | None = None,
 ) -> Path:
-    """Write a machine, moving as recorded or in its home posture, as one HTML file.
+    """Write a report of a machine at home or in a recorded run, as one HTML file.
 
-    The page holds the viewer, the motion and all columns of the recording; nothing is loaded from
-    anywhere. Space plays, the arrow keys step, and every recorded instant is shown as recorded.
+    The page contains the viewer, the motion and all columns of the recording and needs no network.
+    The space key plays, and the arrow keys step.
 
     Args:
         machine: The machine.
-        recording: What it did; None for the home posture.
+        recording: Recording of its run; None for the home configuration.
         path: The file to write; replaced if it exists.
-        second_recording: A second recording of the machine: a ghost, and second lines in the
-            plots. Where its times do not overlap with those of the first, both start together.
+        second_recording: Second recording of the machine, shown as a ghost and as second lines. If
+            its times do not overlap with those of the first, both start together.
 
     Returns:
         The path.
@@ -67,30 +63,26 @@ def report(
     Raises:
         RecordingError: A recording is of a machine with other joints.
         ClosureError: The loops cannot be closed at a recorded sample.
-        InputError: A posture is not finite.
+        InputError: A configuration is not finite.
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in PAGE_SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
-    text = report_html(machine, recording, second_recording)
-    with replace_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return Path(path)
+    check_page_suffix(path)
+    return write_page(path, report_html(machine, recording, second_recording))
 
 
 def report_html(
     machine: Machine,
-    recording: "Recording | None",
-    second_recording: "Recording | None" = None,
+    recording: Recording | None,
+    second_recording: Recording | None = None,
     frame_share: float = 1.0,
 ) -> str:
-    """The page of `report`, as HTML.
+    """Return the page of `report` as HTML.
 
     Args:
-        machine: See there.
-        recording: See there.
-        second_recording: See there.
-        frame_share: Of the frames and spans of time that a page has at most.
+        machine: See `report`.
+        recording: See `report`.
+        second_recording: See `report`.
+        frame_share: Share of the largest number of frames and time spans of a page.
     """
     scene = build_scene(machine, recording, frame_share)
     page_data = _machine_data(machine, scene, recording)
@@ -100,12 +92,11 @@ def report_html(
 
 
 def open_in_browser(path: str | Path) -> bool:
-    """Open a page in the user's browser; False where there is none."""
+    """Open a page in the user's browser; return False if there is none."""
     return webbrowser.open(Path(path).resolve().as_uri())
 
 
-def _machine_data(machine: Machine, scene: Scene, recording: "Recording | None") -> dict[str, Any]:
-    """What is known of the machine itself."""
+def _machine_data(machine: Machine, scene: Scene, recording: Recording | None) -> dict[str, Any]:
     return {
         "machine": machine.name,
         "task": "home posture" if recording is None else label(recording),
@@ -135,11 +126,11 @@ def _machine_data(machine: Machine, scene: Scene, recording: "Recording | None")
 def _run_data(
     machine: Machine,
     scene: Scene,
-    recording: "Recording",
-    second_recording: "Recording | None",
+    recording: Recording,
+    second_recording: Recording | None,
     frame_share: float,
 ) -> dict[str, Any]:
-    """What was recorded, once or twice."""
+    """Return the data of one or two recordings."""
     span_share = frame_share * (1.0 if second_recording is None else 0.5)
     grid = ThinningGrid.from_recording(recording, scene.frame_rows, span_share)
     runs: list[dict[str, Any]] = [
@@ -218,5 +209,5 @@ def _rotate_view(direction: tuple[float, float, float], heading: float) -> list[
 
 
 def _script_json(value: Any) -> str:
-    """JSON that may stand inside of a script element."""
+    """Return JSON that is safe inside a script element."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

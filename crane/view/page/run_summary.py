@@ -1,6 +1,6 @@
-"""The few facts and numbers that a page tells of a run in words."""
+"""Summary of a run for its page: facts, forces, limits that were reached."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -8,21 +8,19 @@ from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks
 from crane.common.units import format_number, format_quantity
 from crane.machine import Machine
-from crane.recordings.recording import FORCE_UNITS
+from crane.recordings.recording import FORCE_UNITS, Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS, summarize
-
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
 
 _MAX_LIMIT_SENTENCES = 6  # on limits, at most
 _LIMIT_TOLERANCE = 1e-4  # share of a range that counts as at its end
 
 
-def summarize_run(machine: Machine, recording: "Recording | None") -> dict[str, Any]:
-    """What the page's panel says.
+def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, Any]:
+    """Return the content of the summary panel.
 
     Returns:
-        facts: Pairs of words; forces: rows (joint, range, peak and RMS force); limits: sentences.
+        facts: pairs of name and text; forces: rows (joint, range, peak and RMS force); limits:
+            sentences.
     """
     moving_masses = [inertia.mass for inertia in list(machine.model.inertias)[1:]]
     facts = [("moving mass", format_quantity(sum(moving_masses), "kg", 4))]
@@ -51,12 +49,12 @@ def summarize_run(machine: Machine, recording: "Recording | None") -> dict[str, 
     if count > 1:
         facts.insert(0, ("duration", f"{summary.duration:.4g} s"))
         delivered_work, returned_work = mechanical_work(recording)
-        text = f"{_format_quantity(delivered_work, 'J')} given"
+        text = f"{_format_quantity(delivered_work, 'J')} delivered"
         if returned_work > 1e-3 * delivered_work:
-            text += f", {_format_quantity(returned_work, 'J')} taken back"
-        facts.append(("actuators' work", text))
+            text += f", {_format_quantity(returned_work, 'J')} returned"
+        facts.append(("work of the actuators", text))
     channels = recording.channels
-    for name, label in (("dissipated", "lost to friction"), ("pump_work", "pump's work")):
+    for name, label in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
         if count < 2 or recording.channel_units.get(name) != "J":
             continue
         change = float(channels[name][-1] - channels[name][0])
@@ -88,10 +86,10 @@ def summarize_run(machine: Machine, recording: "Recording | None") -> dict[str, 
     }
 
 
-def mechanical_work(recording: "Recording") -> tuple[float, float]:
-    """Work [J] that the active joints gave to the machine, and that it gave back to them.
+def mechanical_work(recording: Recording) -> tuple[float, float]:
+    """Return the work of the active joints on the machine, and of the machine on them [J].
 
-    The integrals of the positive and of the negative part of sum tau v, by the trapezoidal rule.
+    These are the integrals of the positive and the negative part of sum tau v (trapezoidal rule).
     """
     power = compute_in_blocks(
         lambda part: (recording.tau[part] * recording.v[part]).sum(axis=1, keepdims=True),
@@ -102,8 +100,8 @@ def mechanical_work(recording: "Recording") -> tuple[float, float]:
     return float(delivered), float(returned)
 
 
-def reached_limit_sentences(machine: Machine, recording: "Recording") -> list[str]:
-    """Sentences on active joints that were at or beyond the ends of their ranges."""
+def reached_limit_sentences(machine: Machine, recording: Recording) -> list[str]:
+    """Return sentences about active joints that reached their limits."""
     sentences = []
     for i, joint in enumerate(machine.active):
         q: Array = recording.q[:, recording.joints.index(joint)]

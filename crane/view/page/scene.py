@@ -1,43 +1,130 @@
-"""What a page shows in space: the machine's shapes and surroundings, its frames in time."""
+"""Scene of a page: shapes, surroundings and frames as meshcat commands."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.formats.visuals.urdf_shapes import Visual
+from crane.formats.visuals.urdf_shapes import (
+    BoxShape,
+    CylinderShape,
+    MeshShape,
+    SphereShape,
+    Visual,
+)
 from crane.machine import Machine
+from crane.recordings.recording import Recording
 from crane.view.page.machine_visuals import read_visuals
-from crane.view.page.meshcat_commands import CommandRecorder, draw_surroundings, draw_visuals
 from crane.view.page.page_motion import frame_rows, recorded_configurations
 
-if TYPE_CHECKING:
-    from crane.recordings.recording import Recording
+_TOP_COLOUR, _BOTTOM_COLOUR, _GRID_COLOUR = [0.80, 0.87, 0.93], [0.97, 0.97, 0.95], 0xB4BAC0
+_IDENTIFIED_PARTS = ("geometry", "material", "map", "image")  # that meshcat identifies, too
+_CYLINDER_ROTATION = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
-_SAMPLED_FRAMES = 300  # frames that tell how large the scene is
+
+@dataclass
+class CommandRecorder:
+    """Replacement of meshcat's window that records commands, without server and port.
+
+    Meshcat's identifiers depend on time and computer. Here they are numbers in the order of the
+    commands, so that equal runs give equal pages.
+    """
+
+    commands: list[dict[str, Any]] = field(default_factory=list)
+    _object_count: int = 0
+
+    def send(self, command: Any) -> None:
+        """Record a command."""
+        if hasattr(command, "object"):
+            self._assign_identifier(command.object)
+        self.commands.append(command.lower())
+
+    def _assign_identifier(self, element: Any) -> None:
+        """Number a meshcat object and its parts."""
+        element.uuid, self._object_count = str(self._object_count), self._object_count + 1
+        for part in filter(None, map(vars(element).get, _IDENTIFIED_PARTS)):
+            self._assign_identifier(part)
+
+
+def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
+    """Add the visuals of each link to the group of the link."""
+    import meshcat.geometry as g
+
+    for index, visual in enumerate(visuals):
+        red, green, blue, opacity = (min(max(value, 0.0), 1.0) for value in visual.colour)
+        colour = (round(255 * red) << 16) + (round(255 * green) << 8) + round(255 * blue)
+        placement = visual.placement
+        match visual.shape:
+            case BoxShape(size):
+                geometry = g.Box(list(size))
+            case CylinderShape(radius, length):
+                geometry = g.Cylinder(length, radius)
+                placement = placement @ _CYLINDER_ROTATION  # meshcat's cylinder lies along y
+            case SphereShape(radius):
+                geometry = g.Sphere(radius)
+            case MeshShape(vertices, faces):
+                geometry = g.TriangularMeshGeometry(vertices, faces)
+        shape = viewer[visual.link][f"visual_{index}"]
+        shape.set_object(geometry, g.MeshPhongMaterial(color=colour, opacity=opacity))
+        shape.set_transform(placement)
+
+
+def draw_surroundings(viewer: Any, lower: Array, upper: Array, ground_height: float) -> None:
+    """Add background and a ground grid with round spacing around a box (3,), (3,) [m]."""
+    import meshcat.geometry as g
+
+    viewer["/Background"].set_property("top_color", _TOP_COLOUR)
+    viewer["/Background"].set_property("bottom_color", _BOTTOM_COLOUR)
+    viewer["/Grid"].set_property("visible", False)
+    viewer["/Axes"].set_property("visible", False)
+    size = float(np.linalg.norm(upper - lower))
+    power_of_ten = 10.0 ** np.floor(np.log10(size / 12))
+    spacing = power_of_ten * min(
+        (1, 2, 5, 10), key=lambda step: abs(np.log(12 * step * power_of_ten / size))
+    )
+    count = int(np.ceil(size / spacing))
+    ticks, half_length = np.arange(-count, count + 1) * spacing, count * spacing
+    line_ends = np.array([[(tick, -half_length), (tick, half_length)] for tick in ticks]).reshape(
+        -1, 2
+    )
+    centre = np.round((lower + upper)[:2] / 2 / spacing) * spacing
+    grid_points = np.concatenate([line_ends, line_ends[:, ::-1]]) + centre
+    points = np.column_stack([grid_points, np.full(len(grid_points), ground_height)])
+    viewer.set_object(
+        g.LineSegments(_points_geometry(points), g.LineBasicMaterial(color=_GRID_COLOUR))
+    )
+
+
+def _points_geometry(points: Array) -> Any:
+    import meshcat.geometry as g
+
+    return g.PointsGeometry(np.ascontiguousarray(points.T, dtype=np.float32))
+
+
+_SAMPLED_FRAMES = 300  # frames that determine the size of the scene
 _MIN_SIDE_SHARE = 1e-3  # share of a scene's size that each side has at least
 _MIN_SIZE = 1e-3  # [m], of a scene in which everything is a point
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a page shows in space.
+    """Three-dimensional content of a page.
 
     Attributes:
-        commands: Commands of the meshcat viewer, in their order. Each link that has visuals is
-            the group machine/<link>, its pose in the first frame that group's transform.
-        frame_rows: (N,) samples of the recording that are frames; one 0 for a still posture.
-        time: (N,) their times [s].
-        configurations: (N, nq) their postures.
-        lower: (3,) lowest corner of what is drawn [m].
-        upper: (3,) highest corner [m].
-        ground_height: Height that the machine stands at [m].
-        heading: Angle about z from the x axis to where the tip points in the first frame, seen
-            from the first joint that moves it [rad]; 0 without a tip, or with one on that axis.
+        commands: Commands of the meshcat viewer, in order. Each link with visuals is a group
+            machine/<link>, whose transform is the pose in the first frame.
+        frame_rows: (N,) rows of the recording that are frames; one 0 without a recording.
+        time: (N,) times of the frames [s].
+        configurations: (N, nq) configurations of the frames.
+        lower: (3,) lower corner of the scene [m].
+        upper: (3,) upper corner of the scene [m].
+        ground_height: Height of the ground [m].
+        heading: Angle about z from the x axis to the tip in the first frame, seen from the first
+            joint that moves it [rad]; 0 without a tip.
     """
 
     commands: Sequence[dict[str, Any]]
@@ -51,20 +138,20 @@ class Scene:
 
 
 def build_scene(
-    machine: Machine, recording: "Recording | None" = None, frame_share: float = 1.0
+    machine: Machine, recording: Recording | None = None, frame_share: float = 1.0
 ) -> Scene:
-    """The machine in its home posture, or moving as recorded.
+    """Build the scene of a machine at home, or of a recorded run.
 
     Args:
         machine: The machine.
-        recording: Its motion. Where it lacks the channel of a passive joint, the loops are closed
-            at its active coordinates.
+        recording: Recording of its run. If the channel of a passive joint is missing, the loops
+            are closed at the active coordinates.
         frame_share: See `frame_rows`.
 
     Raises:
         RecordingError: The recording is of a machine with other joints.
         ClosureError: The loops cannot be closed at a recorded sample.
-        InputError: A posture is not finite.
+        InputError: A configuration is not finite.
     """
     import meshcat
 
@@ -107,7 +194,7 @@ def build_scene(
 
 
 def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Array]:
-    """Poses (N, 4, 4) of some links in the world, at postures q (N, nq).
+    """Return the poses (N, 4, 4) of some links in the world, at configurations q (N, nq).
 
     Raises:
         InputError: A pose is not finite.
@@ -127,10 +214,10 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
 
 
 def ground_height(machine: Machine, visuals: Sequence[Visual]) -> float:
-    """Height that the machine stands at [m]: the lowest point of what cannot move.
+    """Return the height of the ground [m]: the lowest point of fixed visuals.
 
-    The origin's height where nothing of what is drawn stands still: how low the tip reaches says
-    nothing about the ground.
+    Without fixed visuals this is the height of the origin, because the reach of the tip does not
+    determine the ground.
     """
     heights = [
         float((frame.placement * corner)[2])
@@ -157,7 +244,7 @@ def _tip_heading(machine: Machine, q: Array, size: float) -> float:
 def _scene_bounds(
     visuals: Sequence[Visual], poses: Mapping[str, Array], element_end_poses: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """Lowest and highest corner of everything in all frames, ends of springs included."""
+    """Return the corners of the bounding box over all frames, ends of springs included."""
     points = [pose[:, :3, 3] for pose in element_end_poses.values()]
     for visual in visuals:
         pose, corners = poses[visual.link], visual.bounding_corners()

@@ -1,54 +1,58 @@
-"""A calibration as one picture: every channel measured, and simulated before and after."""
+"""Figures of simulated and measured channels: calibrations, residuals, comparisons."""
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from crane.common.errors import InputError
+from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.identification.calibration.calibration_result import Calibration, CalibrationChannel
+from crane.identification.calibration.residual_dependence import ResidualDependence, group_samples
 from crane.recordings.recording_summary import result_title
-from crane.view.plots.figure_text import escape_label
+from crane.simulation.recording_replay import Comparison
+from crane.view.plots.figure_text import envelope, escape_label
 from crane.view.plots.recording_figure import (
     DASHED_STYLE,
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_heading,
 )
 
 HELD_OUT_COLOUR = "#f1efe8"
 _MAX_PANELS = 18  # panels
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def calibration_figure(calibration: Calibration) -> Figure:
-    """A panel per channel; instants that were held out stand on a darker ground."""
+    """Return a panel per channel; held-out instants have a darker background."""
     sensors = calibration.channels[:_MAX_PANELS]
-    with mpl.rc_context(FIGURE_STYLE):
-        columns = 2 if len(sensors) > 1 else 1
-        rows = -(-len(sensors) // columns)
-        size = (5.6 * columns, 1.9 * rows + 0.8)
-        figure = Figure(figsize=size, layout="constrained")
-        has_several_recordings = len({sensor.recording for sensor in sensors}) > 1
-        for i, sensor in enumerate(sensors):
-            axes = figure.add_subplot(rows, columns, i + 1)
-            unit = draw_channel(axes, sensor)
-            for start, end in mask_spans(sensor.time, np.logical_not(sensor.train_mask)):
-                axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
-            name = f"{sensor.recording}: {sensor.name}" if has_several_recordings else sensor.name
-            axes.set_title(escape_label(f"{name} [{unit}]"), fontsize=8.5)
-            if i >= len(sensors) - columns:
-                axes.set_xlabel("time [s]")
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3)
-        heading = result_title(calibration.machine.name, "calibration")
-        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    columns = 2 if len(sensors) > 1 else 1
+    rows = -(-len(sensors) // columns)
+    size = (5.6 * columns, 1.9 * rows + 0.8)
+    figure = Figure(figsize=size, layout="constrained")
+    has_several_recordings = len({sensor.recording for sensor in sensors}) > 1
+    for i, sensor in enumerate(sensors):
+        axes = figure.add_subplot(rows, columns, i + 1)
+        unit = draw_channel(axes, sensor)
+        for start, end in mask_spans(sensor.time, np.logical_not(sensor.train_mask)):
+            axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
+        name = f"{sensor.recording}: {sensor.name}" if has_several_recordings else sensor.name
+        axes.set_title(escape_label(f"{name} [{unit}]"), fontsize=8.5)
+        if i >= len(sensors) - columns:
+            axes.set_xlabel("time [s]")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    add_heading(figure, escape_label(result_title(calibration.machine.name, "calibration")))
     return figure
 
 
 def draw_channel(axes: Axes, sensor: CalibrationChannel) -> str:
-    """Draw a channel measured, before and fitted; the unit it is read in.
+    """Draw a channel measured, before and fitted, and return its display unit.
 
-    The axis holds what was measured and what is fitted, whatever was before.
+    The limits of the axis contain the measured and the fitted values only.
     """
     all_values = np.concatenate([sensor.measured, sensor.simulated_after])
     unit, scale = display_unit(sensor.unit, float(np.ptp(all_values)))
@@ -65,7 +69,138 @@ def draw_channel(axes: Axes, sensor: CalibrationChannel) -> str:
 
 
 def mask_spans(time: "np.ndarray", mask: "np.ndarray") -> list[tuple[float, float]]:
-    """Stretches of time over which something holds."""
+    """Return the intervals (start, end) in which a mask (N,) is true."""
     edges = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     return [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
+
+
+_MAX_DOTS = 4000  # of a picture
+_CLOUD_COLOUR, _MEAN_COLOUR = "#9db8d6", str(DASHED_STYLE["color"])
+_DIRECTION_LABELS = {-1: "back", 0: "rest", 1: "out"}
+
+
+def channel_residual_figure(channel: CalibrationChannel, name: str) -> Figure:
+    """Return a channel over time, measured, before and fitted, with the residual below."""
+    figure = Figure(figsize=(5.8, 3.3))
+    grid = {"height_ratios": (2.2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
+    upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
+    unit = draw_channel(upper, channel)
+    residual = channel.simulated_after - channel.measured
+    residual_unit, scale = display_unit(channel.unit, float(np.abs(residual).max()))
+    lower.plot(*envelope(channel.time, scale * residual), color=RECORDED_COLOUR, linewidth=0.7)
+    lower.axhline(0.0, color=INK_COLOUR, linewidth=0.6)
+    for axes in (upper, lower):
+        for start, end in mask_spans(channel.time, np.logical_not(channel.train_mask)):
+            axes.axvspan(start, end, color=HELD_OUT_COLOUR, zorder=-1)
+        axes.yaxis.set_label_coords(-0.125, 0.5)
+    upper.set_ylabel(f"[{unit}]")
+    lower.set(ylabel=f"residual [{residual_unit}]", xlabel="time [s]")
+    upper.margins(x=0.0)
+    upper.set_title(escape_label(name), loc="left", fontsize=8.5)
+    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderpad=0, fontsize=8)
+    return figure
+
+
+def residual_dependence_figure(dependence: ResidualDependence) -> Figure:
+    """Return the residual of a channel against speed, pressure and direction of a drive.
+
+    Dots are instants, the line shows means of groups of equal size; for directions, bars show the
+    central 95 % and dots the means.
+    """
+    figure = Figure(figsize=(11.8, 2.5))
+    grid = {"left": 0.065, "right": 0.993, "top": 0.87, "bottom": 0.19, "wspace": 0.06}
+    panels = figure.subplots(1, 3, sharey=True, gridspec_kw={**grid, "width_ratios": (2, 2, 1)})
+    unit, scale = display_unit(dependence.unit, float(np.abs(dependence.residual).max()))
+    y = scale * dependence.residual
+    units = {"speed": dependence.speed_unit, "pressure": "Pa"}
+    for axes, (cause, x) in zip(panels, dependence.motion.items(), strict=True):
+        axes.axhline(0.0, color=INK_COLOUR, linewidth=0.6)
+        axes.set_title(
+            f"{cause}: {100 * dependence.correlation_ratios[cause]:.0f} %",
+            loc="left",
+            fontsize=8.5,
+        )
+        if cause in units:
+            name, unit_scale = display_unit(units[cause], float(np.abs(x).max()))
+            _draw_cloud_with_means(axes, unit_scale * x, y)
+            source_text = (
+                f"{dependence.drive}, {dependence.chamber.upper()}"
+                if cause == "pressure"
+                else dependence.drive
+            )
+            axes.set_xlabel(escape_label(f"{cause} of {source_text} [{name}]"))
+        else:
+            _draw_by_direction(axes, x, y)
+            axes.set_xlabel(escape_label(f"direction of {dependence.drive}"))
+    panels[0].set_ylabel(escape_label(f"residual of {dependence.name} [{unit}]"))
+    return figure
+
+
+def _draw_cloud_with_means(axes: Axes, x: Array, y: Array) -> None:
+    step = -(-len(x) // _MAX_DOTS)
+    axes.plot(x[::step], y[::step], ".", color=_CLOUD_COLOUR, markersize=2)
+    means = np.array([(x[group].mean(), y[group].mean()) for group in group_samples(x)])
+    axes.plot(*means.T, color=_MEAN_COLOUR, linewidth=1.1, marker="o", markersize=3)
+
+
+def _draw_by_direction(axes: Axes, x: Array, y: Array) -> None:
+    for direction in _DIRECTION_LABELS:
+        direction_values = y[x == direction]
+        if len(direction_values):
+            axes.plot(
+                [direction, direction],
+                np.percentile(direction_values, (2.5, 97.5)),
+                color=_CLOUD_COLOUR,
+                linewidth=6,
+            )
+            axes.plot(
+                [direction],
+                [direction_values.mean()],
+                color=_MEAN_COLOUR,
+                marker="o",
+                markersize=4,
+            )
+    axes.set_xticks(list(_DIRECTION_LABELS), list(_DIRECTION_LABELS.values()))
+    axes.set_xlim(-1.5, 1.5)
+
+
+_MAX_COLUMNS = 3
+_MAX_POINTS = 4000  # instants that a line needs
+
+
+def comparison_figure(comparison: Comparison) -> Figure:
+    """Return the figure of a comparison, a panel per channel.
+
+    Raises:
+        InputError: The comparison has no channel.
+    """
+    if not comparison.channels:
+        raise InputError("the file has no channel that the simulation has too")
+    count = len(comparison.channels)
+    column_count = min(_MAX_COLUMNS, count)
+    rows = -(-count // column_count)
+    figure = Figure(figsize=(3.4 * column_count, 1.9 * rows + 0.4), layout="constrained")
+    panels = figure.subplots(rows, column_count, sharex=True, squeeze=False).ravel()
+    stride = -(-len(comparison.time) // _MAX_POINTS)
+    time = comparison.time[::stride]
+    for axes, channel in zip(panels, comparison.channels, strict=False):
+        channel_values = channel.measured, channel.simulated
+        unit, scale = display_unit(
+            channel.unit, max(float(np.abs(x).max()) for x in channel_values)
+        )
+        axes.plot(
+            time, scale * channel.measured[::stride], color=RECORDED_COLOUR, label="measured"
+        )
+        axes.plot(time, scale * channel.simulated[::stride], label="simulated", **DASHED_STYLE)
+        label = f" [{unit}]" if unit else ""
+        error_text = f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative_rms:.3g} %"
+        axes.set_title(escape_label(f"{channel.name}{label}\n{error_text}"), fontsize=8)
+        axes.margins(x=0.0)
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    for axes in panels[max(count - column_count, 0) : count]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("time [s]")
+    panels[0].legend(loc="best", fontsize=7)
+    return figure

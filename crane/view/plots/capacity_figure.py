@@ -1,4 +1,4 @@
-"""Rated loads over radius and height: contours, coloured by what ends them."""
+"""Load charts over radius and height: contours, coloured by limiting factor."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ from crane.ratings import Capacity
 from crane.ratings.capacity_report import slew_labels
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
-from crane.view.sketch.machine_outline import MachineOutline, machine_outline
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
+from crane.view.sketch.mechanism_projection import MachineOutline, machine_outline
 
 FACTOR_COLOURS = (
     "#a9c8ea", "#f6c08c", "#a6d9b0", "#d5b8e4", "#f0aaa6", "#a5d8df", "#e5d98f", "#c3c7cd",
@@ -44,8 +44,9 @@ _MAX_CONTOURS, _CONTOUR_QUANTILES = (
 _ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def capacity_figure(chart: Capacity) -> Figure:
-    """The figure of rated loads: one panel per slew angle."""
+    """Return the figure of a load chart, a panel per slew angle."""
     lower, upper = drawing_extent(chart)
     panel_count = len(chart.slews)
     columns = min(panel_count, 3)
@@ -53,56 +54,49 @@ def capacity_figure(chart: Capacity) -> Figure:
     content_width, content_height = upper - lower
     height = float(np.clip(8.6 / columns * content_height / content_width, 3.0, 6.5))
     width = float(np.clip(columns * height * content_width / content_height + 1.0, 5.0, 10.0))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
-        panels = figure.subplots(lines, columns, squeeze=False).ravel()
-        for k, axes in enumerate(panels):
-            if k < panel_count:
-                draw_capacity_panel(axes, chart, k)
-                if k % columns:
-                    axes.set_ylabel("")
-            else:
-                axes.set_axis_off()
-        figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
-        figure.suptitle(
-            escape_label(capacity_heading(chart)),
-            x=0.01,
-            ha="left",
-            fontsize=11,
-            fontweight="bold",
-        )
-        figure.legend(
-            handles=legend_patches(chart),
-            loc="outside lower center",
-            ncols=2 if panel_count > 1 else 1,
-        )
+    figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for k, axes in enumerate(panels):
+        if k < panel_count:
+            draw_capacity_panel(axes, chart, k)
+            if k % columns:
+                axes.set_ylabel("")
+        else:
+            axes.set_axis_off()
+    figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
+    add_heading(figure, escape_label(capacity_heading(chart)))
+    figure.legend(
+        handles=legend_patches(chart),
+        loc="outside lower center",
+        ncols=2 if panel_count > 1 else 1,
+    )
     return figure
 
 
 def capacity_heading(chart: Capacity) -> str:
-    """What pictures of a chart are headed with."""
+    """Return the heading of a load chart."""
     rule_text = "" if chart.rule.name == "none" else f" by {chart.rule.name}"
     return result_title(chart.machine.name, f"lifting capacity at {chart.frame}{rule_text}")
 
 
 def factor_colours(chart: Capacity) -> Mapping[int, str]:
-    """Of each cause that ends loads, by its index."""
+    """Return the colour of each active limiting factor, by index."""
     return {k: FACTOR_COLOURS[i % len(FACTOR_COLOURS)] for i, k in enumerate(chart.active_factors)}
 
 
 def legend_patches(chart: Capacity) -> list[Patch]:
-    """The legend: causes in their colours."""
+    """Return the legend: limiting factors in their colours."""
     patches = [
         Patch(color=colour, label=escape_label(str(chart.limiting_factors[k])))
         for k, colour in factor_colours(chart).items()
     ]
     if np.isinf(chart.loads).any():
-        patches.append(Patch(color=_UNLIMITED_COLOUR, label="nothing ends it"))
+        patches.append(Patch(color=_UNLIMITED_COLOUR, label="no limit"))
     return patches
 
 
 def home_outlines(chart: Capacity) -> list[MachineOutline]:
-    """The machine at home, turned to each slew angle."""
+    """Return outlines of the machine at home, turned to each slew angle."""
     outlines, machine = [], chart.machine
     for slew_coordinate in chart.slews:
         q = machine.home.copy()
@@ -113,7 +107,7 @@ def home_outlines(chart: Capacity) -> list[MachineOutline]:
 
 
 def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
-    """Lowest and highest corner (2,) of what is shown [m]."""
+    """Return the lower and upper corner (2,) of the drawing [m]."""
     b, a = np.nonzero(~np.isnan(chart.loads).all(axis=0))
     points = [np.column_stack([chart.radii[a], chart.heights[b]])]
     for home_outline in home_outlines(chart):
@@ -128,7 +122,7 @@ def drawing_extent(chart: Capacity) -> tuple[Array, Array]:
 
 
 def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
-    """Loads at one slew angle."""
+    """Draw the loads at slew angle k."""
     lower, upper = drawing_extent(chart)
     axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal")
     axes.grid(visible=False)
@@ -168,7 +162,7 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
 
 
 def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
-    """Lines (n, 2) of equal load at one slew angle, by their load [kg]; the same at all angles."""
+    """Return contours (n, 2) at slew angle k by load [kg]; levels are equal at all angles."""
     if min(len(chart.radii), len(chart.heights)) < 2:
         return []
     finite_loads = chart.loads[np.isfinite(chart.loads)]
@@ -185,9 +179,9 @@ def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
 
 
 def _continued(loads: Array) -> Array:
-    """Loads (b, a), and around them those that two places beside continue, in a straight line.
+    """Extrapolate loads (b, a) linearly by one cell around the positions that have loads.
 
-    Of cells at the border the contours would miss the outer half else.
+    Otherwise contours would not reach the outer half of cells at the border.
     """
     b, a = loads.shape
     wide = np.pad(loads, 2, constant_values=np.nan)
@@ -202,7 +196,7 @@ def _continued(loads: Array) -> Array:
 
 
 def _parts_within(chart: Capacity, k: int, line: Array) -> list[Array]:
-    """Parts of a line (n, 2) within the cells that have loads."""
+    """Return the parts of a line (n, 2) within cells that have loads."""
     along = np.arange(len(line))
     fine = np.linspace(0.0, len(line) - 1.0, _DENSE * (len(line) - 1) + 1)
     points = np.column_stack([np.interp(fine, along, x) for x in line.T])
@@ -217,7 +211,7 @@ def _parts_within(chart: Capacity, k: int, line: Array) -> list[Array]:
 
 
 def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
-    """Lines of equal load, labelled in kg or t."""
+    """Draw contours, labelled in kg or t."""
     contour_lines = load_contours(chart, k)
     levels = [level for level, lines in contour_lines if lines]
     if not levels:
@@ -250,11 +244,11 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
 def contour_label_positions(
     lines: Sequence[tuple[str, list[Array]]], size: float
 ) -> list[tuple[float, float]]:
-    """Where on lines there is room for their labels: none upon another, few on a bundle of lines.
+    """Return positions of labels on contours that do not overlap.
 
     Args:
-        lines: Words, and lines (n, 2) [m] that they stand on.
-        size: Points of a metre.
+        lines: Labels with their lines (n, 2) [m].
+        size: Points per metre.
     """
     occupied = np.empty((0, 2))
     positions: list[tuple[float, float]] = []
@@ -285,7 +279,7 @@ def contour_label_positions(
 
 
 def _contour_levels(low: float, high: float) -> list[float]:
-    """Round loads, denser where they are small, as the load falls with the radius."""
+    """Return round contour levels, denser at small loads."""
     levels = set()
     for load in np.geomspace(max(low, 1e-3 * high), high, _MAX_CONTOURS):
         power = 10.0 ** np.floor(np.log10(load))

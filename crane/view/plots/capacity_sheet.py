@@ -1,6 +1,7 @@
-"""Rated loads on one page to print: charts, what they hold for, and the table."""
+"""Load charts on one page to print: charts, conditions and load table."""
 
 import textwrap
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -8,8 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from crane.ratings import Capacity
-from crane.ratings.capacity_report import capacity_facts, factor_shares, slew_labels, table_note
-from crane.ratings.load_tables import LoadTable
+from crane.ratings.capacity_report import (
+    LoadTable,
+    capacity_facts,
+    factor_shares,
+    slew_labels,
+    table_note,
+)
 from crane.view.plots.capacity_figure import (
     capacity_heading,
     draw_capacity_panel,
@@ -23,32 +29,32 @@ _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     11.69,
     8.27,
     0.45,
-)  # A4 on its side, and what printers leave white [inch]
+)  # A4 landscape and margin [inch]
 _LINE_HEIGHT = 0.152  # between lines [inch]
 _TEXT_SIZE, _CELL_TEXT_SIZE = 7.5, 7.5  # sizes of letters [points]
-_FACTS_WIDTH = 3.5  # width of what stands beside the charts [inch]
+_FACTS_WIDTH = 3.5  # width of the facts beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def capacity_sheet_figure(chart: Capacity) -> Figure:
-    """The page as a figure."""
+    """Return the page as a figure."""
     table = chart.table
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(_PAGE_WIDTH, _PAGE_HEIGHT))
-        top = _PAGE_HEIGHT - _PAGE_MARGIN
-        figure.text(
-            _PAGE_MARGIN / _PAGE_WIDTH,
-            top / _PAGE_HEIGHT,
-            escape_label(capacity_heading(chart)),
-            va="top",
-            fontsize=13,
-            fontweight="bold",
-        )
-        _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
-        table_bottom = _PAGE_MARGIN + 1.6 * _LINE_HEIGHT
-        table_top = _draw_table(figure, chart, table, table_bottom)
-        charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
-        _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
+    figure = Figure(figsize=(_PAGE_WIDTH, _PAGE_HEIGHT))
+    top = _PAGE_HEIGHT - _PAGE_MARGIN
+    figure.text(
+        _PAGE_MARGIN / _PAGE_WIDTH,
+        top / _PAGE_HEIGHT,
+        escape_label(capacity_heading(chart)),
+        va="top",
+        fontsize=13,
+        fontweight="bold",
+    )
+    _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
+    table_bottom = _PAGE_MARGIN + 1.6 * _LINE_HEIGHT
+    table_top = _draw_table(figure, chart, table, table_bottom)
+    charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
+    _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
     return figure
 
 
@@ -61,19 +67,13 @@ def _write_text(
     size: float = _TEXT_SIZE,
     **options: Any,
 ) -> None:
-    """A line of text at a place [inch]."""
-    escaped_text = escape_text(text)
-    figure.text(
-        x / _PAGE_WIDTH, y / _PAGE_HEIGHT, escaped_text, fontsize=size, color=colour, **options
-    )  # type: ignore[arg-type]
+    """Write a line of text at x, y [inch]."""
+    x, y = x / _PAGE_WIDTH, y / _PAGE_HEIGHT
+    figure.text(x, y, escape_text(text), fontsize=size, color=colour, **options)
 
 
 def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> float:
-    """One panel per slew angle.
-
-    Returns:
-        Where they end on the right [inch].
-    """
+    """Draw one panel per slew angle, and return the right end of the panels [inch]."""
     lower, upper = drawing_extent(chart)
     panel_count, available_width = len(chart.slews), _PAGE_WIDTH - 2 * _PAGE_MARGIN - _FACTS_WIDTH
     aspect = (upper - lower)[1] / (upper - lower)[0]
@@ -105,7 +105,7 @@ def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> 
 
 
 def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> None:
-    """What the loads hold for, and what ends them, in the colours of the charts."""
+    """Write conditions and limiting factors, in the colours of the charts."""
     left, y = left + 0.2, top - 0.1
     line_length = int((_FACTS_WIDTH - 0.2) * 72 / (0.56 * _TEXT_SIZE))
     for name, text in capacity_facts(chart):
@@ -114,7 +114,7 @@ def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> Non
             y -= _LINE_HEIGHT
         y -= 0.05
     y -= 0.1
-    _write_text(figure, left, y, "ended by (of all places)", fontweight="bold")
+    _write_text(figure, left, y, "limited by (of all positions)", fontweight="bold")
     colours_by_factor = {
         str(chart.limiting_factors[k]): tint for k, tint in factor_colours(chart).items()
     }
@@ -128,10 +128,10 @@ def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> Non
 
 
 def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float) -> float:
-    """Rows by height, columns by radius and slew.
+    """Draw the load table: rows by height, columns by radius and slew angle.
 
     Returns:
-        Where it ends above [inch].
+        Top of the table [inch].
     """
     rows, names = table.format_rows(), slew_labels(chart)
     slew_count = len(names)
@@ -182,7 +182,7 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
 
 
 def _draw_row_band(figure: Figure, y: float, right: float) -> None:
-    """A tint behind a row."""
+    """Draw a tinted band behind a row."""
     patch = Rectangle(
         (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
         (right - _PAGE_MARGIN) / _PAGE_WIDTH,

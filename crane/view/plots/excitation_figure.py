@@ -1,4 +1,4 @@
-"""What excites a machine as one figure: a reference and its limits, or signals of valves."""
+"""Figures of excitations: trajectories with their limits, or valve signals."""
 
 from collections.abc import Sequence
 
@@ -24,22 +24,22 @@ from crane.view.plots.recording_figure import (
 _MAX_POINTS = 2000  # instants that a line needs
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def excitation_figure(excitation: Excitation) -> Figure:
-    """The figure of a reference: limits dashed, ways from and to rest shaded."""
+    """Return the figure of a trajectory; limits are dashed, lead times shaded."""
     count = len(excitation.machine.active)
     columns = tuple(x[:: -(-len(x) // _MAX_POINTS)] for x in excitation.motion())
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(2.4 * count + 0.6, 6.0), layout="constrained")
-        grid = figure.subplots(3, count, sharex=True, squeeze=False)
-        for i in range(count):
-            _draw_joint(list(grid[:, i]), excitation, columns, i)
+    figure = Figure(figsize=(2.4 * count + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, count, sharex=True, squeeze=False)
+    for i in range(count):
+        _draw_joint(list(grid[:, i]), excitation, columns, i)
     return figure
 
 
 def _draw_joint(
     joint_axes: Sequence[Axes], excitation: Excitation, motion: tuple[Array, ...], joint_index: int
 ) -> None:
-    """Stroke, velocity and force of an active joint below each other."""
+    """Draw stroke, velocity and force of an active joint."""
     machine, reference, bounds = excitation.machine, excitation.trajectory, excitation.limits
     time, q, v, _, tau = motion
     joint = machine.active[joint_index]
@@ -74,19 +74,19 @@ def _draw_joint(
     joint_axes[-1].set_xlabel("time [s]")
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def signals_figure(excitation: SignalExcitation) -> Figure:
-    """The figure of valve signals: signal, stroke with its ends dashed, pressures."""
+    """Return the figure of valve signals: signal, stroke with dashed limits, pressures."""
     count = len(excitation.signals)
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(3.0 * count + 0.6, 6.0), layout="constrained")
-        grid = figure.subplots(3, count, sharex=True, squeeze=False)
-        for i, joint in enumerate(excitation.signals):
-            _draw_valve(list(grid[:, i]), excitation, joint)
+    figure = Figure(figsize=(3.0 * count + 0.6, 6.0), layout="constrained")
+    grid = figure.subplots(3, count, sharex=True, squeeze=False)
+    for i, joint in enumerate(excitation.signals):
+        _draw_valve(list(grid[:, i]), excitation, joint)
     return figure
 
 
 def _draw_valve(valve_axes: Sequence[Axes], excitation: SignalExcitation, joint: str) -> None:
-    """Signal, stroke and pressures of a cylinder below each other."""
+    """Draw signal, stroke and pressures of a cylinder."""
     run, machine = excitation.run.columns(), excitation.machine
     i = machine.active.index(joint)
     unit, scale = DISPLAY_UNITS[machine.unit(joint)]

@@ -1,17 +1,27 @@
-"""Figures of an identification: forces, residuals, spectra, correlations."""
+"""Figures of identifications: forces, residuals, correlations, cylinder equations."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
+from crane.identification.hydraulics.cylinder_friction import CylinderFriction
+from crane.identification.hydraulics.orifice_equations import EquationSides
+from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_result import Identification
 from crane.recordings.recording import FORCE_UNITS
-from crane.view.plots.curve_thinning import envelope
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import DASHED_STYLE, INK_COLOUR
+from crane.view.plots.figure_text import envelope, escape_label
+from crane.view.plots.recording_figure import (
+    DASHED_STYLE,
+    FIGURE_STYLE,
+    INK_COLOUR,
+    RECORDED_COLOUR,
+)
 
 _SEGMENT_COUNT = 8  # of a recording, whose periodograms are averaged
 
@@ -19,7 +29,7 @@ _SEGMENT_COUNT = 8  # of a recording, whose periodograms are averaged
 def force_time_figure(
     comparison: ForceComparison, drive_index: int, unit: str, name: str
 ) -> Figure:
-    """Measured and modelled force of drive i over time, and their difference below."""
+    """Return measured and modelled force of a drive over time, with the residual below."""
     figure = Figure(figsize=(5.8, 3.3))
     grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
@@ -41,8 +51,7 @@ def force_time_figure(
         color=INK_COLOUR,
         linewidth=0.7,
     )
-    lower.set_ylabel(f"residual [{unit}]")
-    lower.set_xlabel("time [s]")
+    lower.set(ylabel=f"residual [{unit}]", xlabel="time [s]")
     upper.margins(x=0.0)
     for axes in (upper, lower):
         axes.yaxis.set_label_coords(-0.125, 0.5)
@@ -52,14 +61,14 @@ def force_time_figure(
 def residual_spectrum_figure(
     fits: list[tuple[str, ForceComparison, str]], drive_index: int, unit: str
 ) -> Figure:
-    """Spectral densities of the residuals of drive i, averaged (Welch 1967).
+    """Return averaged spectral densities of the residuals of a drive (Welch 1967).
 
-    Rows that are left out count as zero.
+    Samples that are left out count as zero.
 
     Args:
         fits: Name, comparison and colour of each curve.
         drive_index: Column of the drive.
-        unit: Of its force.
+        unit: Unit of its force.
     """
     from scipy.signal import welch
 
@@ -77,8 +86,7 @@ def residual_spectrum_figure(
             moving_residuals, rate, nperseg=-(-len(moving_residuals) // _SEGMENT_COUNT)
         )
         axes.loglog(frequency[1:], np.sqrt(power[1:]), color=color, linewidth=1.1, label=name)
-    axes.set_xlabel("frequency [Hz]")
-    axes.set_ylabel(f"residual [{unit}/√Hz]")
+    axes.set(xlabel="frequency [Hz]", ylabel=f"residual [{unit}/√Hz]")
     axes.set_title("spectrum of the residuals", loc="left", fontsize=8.5)
     axes.margins(x=0.0)
     if len(fits) > 1:
@@ -87,7 +95,7 @@ def residual_spectrum_figure(
 
 
 def correlation_figure(R: Array, names: Sequence[str]) -> Figure:
-    """A correlation matrix (r, r) in colours, columns in the order of the named rows."""
+    """Return a correlation matrix (r, r) in colours, with named rows."""
     names = [escape_label(name) for name in names]
     size = float(np.clip(0.11 * len(names), 4.0, 9.0))
     letter_size = float(np.clip(60 * size / max(len(names), 1), 3.0, 7.5))
@@ -107,10 +115,117 @@ def correlation_figure(R: Array, names: Sequence[str]) -> Figure:
 
 
 def force_figures(result: Identification) -> list[Figure]:
-    """Measured and modelled forces of the training, a figure per drive."""
+    """Return measured and modelled forces of the training data, a figure per drive."""
     return [
         force_time_figure(
             result.training, i, FORCE_UNITS[result.described_machine.unit(joint)], joint
         )
         for i, joint in enumerate(result.training.joints)
     ]
+
+
+_DOT_STYLE: Any = {
+    "linestyle": "",
+    "marker": ".",
+    "markersize": 3.5,
+    "markeredgewidth": 0,
+    "color": "#6f9bca",
+    "alpha": 0.5,
+}
+_MAX_DOTS = 4000  # dots
+
+
+@mpl.rc_context(FIGURE_STYLE)
+def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") -> Figure:
+    """Return both sides of equation (29) over time, a row per recording.
+
+    Args:
+        runs: Both sides of the equation by title.
+        unit: Unit of the cylinder's coordinate, "m" or "rad".
+    """
+    figure = Figure(figsize=(7.2, 0.6 + 1.9 * len(runs)), layout="constrained")
+    rows = figure.subplots(len(runs), 1, squeeze=False)[:, 0]
+    for axes, (title, equation_sides) in zip(rows, runs.items(), strict=True):
+        difference = 1e4 * (equation_sides.measured - equation_sides.predicted)
+        axes.plot(
+            equation_sides.time,
+            difference,
+            color="#b9b9b9",
+            linewidth=0.7,
+            label="10 x difference",
+        )
+        axes.plot(
+            equation_sides.time,
+            1e3 * equation_sides.measured,
+            color=RECORDED_COLOUR,
+            label="measured: right side Y",
+        )
+        axes.plot(
+            equation_sides.time,
+            1e3 * equation_sides.predicted,
+            label="model: left side A X",
+            **DASHED_STYLE,
+        )
+        axes.set_ylabel(r"$10^{-3}$ " + ("m²/s" if unit == "m" else "m³/(rad s)"))
+        error = f"relative error {100 * equation_sides.relative_error:.2g} %"
+        axes.set_title(f"{title}: {error}", loc="left", fontsize=9)
+        axes.margins(x=0.0)
+    rows[-1].set_xlabel("time [s]")
+    handles, labels = rows[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3)
+    return figure
+
+
+@mpl.rc_context(FIGURE_STYLE)
+def _single_figure(draw: Callable[..., None], *values: object) -> Figure:
+    figure = Figure(figsize=(4.6, 3.4), layout="constrained")
+    draw(figure.subplots(), *values)
+    return figure
+
+
+def valve_curve_figure(curve: ValveCurve, unit: str = "m") -> Figure:
+    """Return steady speeds over the valve signal with the fitted curve."""
+    return _single_figure(draw_valve_curve, curve, unit)
+
+
+def draw_valve_curve(axes: Axes, curve: ValveCurve, unit: str = "m") -> None:
+    """Draw `valve_curve_figure` on existing axes."""
+    scale, text = (1e3, "mm/s") if unit == "m" else (1.0, "rad/s")
+    stride = -(-len(curve.signal) // _MAX_DOTS)
+    axes.plot(
+        curve.signal[::stride], scale * curve.speed[::stride], label="steady samples", **_DOT_STYLE
+    )
+    corners = [curve.signal.min(), *sorted(curve.values[:2]), curve.signal.max()]
+    axes.plot(corners, scale * curve.predict(np.array(corners)), label="fit", **DASHED_STYLE)
+    lower, upper = sorted(curve.values[:2])
+    axes.axvspan(lower, upper, color="#eeeeee", zorder=0, label="dead band")
+    axes.axvline(curve.neutral, color="#999999", linewidth=0.7)
+    axes.set(xlabel="signal [V]", ylabel=f"speed [{text}]")
+    axes.legend(markerscale=2)
+
+
+def friction_figure(friction: CylinderFriction, unit: str = "m") -> Figure:
+    """Return measured friction over speed with the fitted law."""
+    return _single_figure(draw_friction, friction, unit)
+
+
+def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> None:
+    """Draw `friction_figure` on existing axes."""
+    scale, text, force = (1e3, "mm/s", "N") if unit == "m" else (1.0, "rad/s", "N m")
+    stride = -(-len(friction.speed) // _MAX_DOTS)
+    axes.plot(
+        scale * friction.speed[::stride],
+        friction.force[::stride],
+        label="steady samples",
+        **_DOT_STYLE,
+    )
+    extreme_speeds = friction.speed.min(), friction.speed.max()
+    lowest_speed = np.abs(friction.speed).min()
+    for direction, extreme_speed in zip((-1, 1), extreme_speeds, strict=True):
+        v = direction * np.geomspace(
+            lowest_speed, max(abs(extreme_speed), 1.01 * lowest_speed), 200
+        )
+        label = "fit" if direction > 0 else None
+        axes.plot(scale * v, friction.predict(v), label=label, **DASHED_STYLE)
+    axes.set(xlabel=f"speed [{text}]", ylabel=f"friction [{force}]")
+    axes.legend(loc="upper left", markerscale=2)

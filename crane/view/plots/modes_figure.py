@@ -1,4 +1,4 @@
-"""Linear models as pictures: poles and frequency responses, and modes over strokes and loads."""
+"""Figures of linear models and sensitivities."""
 
 from collections.abc import Sequence
 
@@ -9,13 +9,17 @@ from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
 from crane.common.samples import Array
+from crane.common.units import display_unit
+from crane.description.machine_lookup import CHANGES_SEPARATOR
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
 from crane.simulation.linear import LinearModel, Mode
+from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_heading,
 )
 
 _CURVE_COLOURS = (
@@ -34,8 +38,9 @@ _MIN_MODAL_ASSURANCE = 0.2  # modal assurance of a mode that goes on
 _MIN_RESPONSE_SHARE = 1e-6  # share of the largest response that is not drawn
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def modes_figure(model: LinearModel) -> Figure:
-    """Poles, each with what it moves most, and a panel of responses per input that has any."""
+    """Return poles with dominant states, and a panel of frequency responses per input."""
     frequencies = _frequency_grid(model)
     responses = np.abs(model.response(frequencies))
     responding_inputs = [
@@ -43,52 +48,46 @@ def modes_figure(model: LinearModel) -> Figure:
         for j in range(len(model.inputs))
         if responses[:, _position_outputs(model), j].max(initial=0) > 0
     ][:_MAX_INPUT_PANELS]
-    with mpl.rc_context(FIGURE_STYLE):
-        columns = 1 + min(len(responding_inputs), 3)
-        rows = max(1, -(-len(responding_inputs) // 3))
-        figure = Figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5), layout="constrained")
-        grid = figure.add_gridspec(rows, columns)
-        _draw_poles(figure.add_subplot(grid[:, 0]), model)
-        for i, j in enumerate(responding_inputs):
-            axes = figure.add_subplot(grid[i // 3, 1 + i % 3])
-            _draw_response(axes, model, frequencies, responses[:, :, j], j)
-        heading = result_title(model.machine.name, "small motions")
-        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    columns = 1 + min(len(responding_inputs), 3)
+    rows = max(1, -(-len(responding_inputs) // 3))
+    figure = Figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5), layout="constrained")
+    grid = figure.add_gridspec(rows, columns)
+    _draw_poles(figure.add_subplot(grid[:, 0]), model)
+    for i, j in enumerate(responding_inputs):
+        axes = figure.add_subplot(grid[i // 3, 1 + i % 3])
+        _draw_response(axes, model, frequencies, responses[:, :, j], j)
+    add_heading(figure, escape_label(result_title(model.machine.name, "small motions")))
     return figure
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]]) -> Figure:
-    """Above frequencies, below damping, over the first name; a colour per value of the others."""
+    """Return frequency and damping over the first parameter; colours for the others."""
     names = list(models[0][0])
     families: dict[tuple[float, ...], list[tuple[float, LinearModel]]] = {}
     for values, model in models:
         first_value, other_values = next(iter(values.values())), tuple(values.values())[1:]
         families.setdefault(other_values, []).append((first_value, model))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(6.4, 5.6), layout="constrained")
-        upper, lower = figure.subplots(2, 1, sharex=True)
-        for color, (family_values, family) in zip(
-            _cycle_colours(len(families)), families.items(), strict=True
-        ):
-            pairs = zip(names[1:], family_values, strict=True)
-            label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
-            family.sort(key=lambda pair: pair[0])
-            for k, (x, frequency, damping) in enumerate(_track_modes(family)):
-                label = escape_label(label_text) if label_text and not k else "_"
-                upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
-                lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
-        upper.set_yscale("log")
-        upper.set_ylabel("frequency [Hz]")
-        lower.set_ylabel("damping [%]")
-        machine = models[0][1].machine
-        unit = machine.unit(names[0]) if names[0] in machine.active else ""
-        lower.set_xlabel(escape_label(f"{names[0]} [{unit}]" if unit else names[0]))
-        if len(families) > 1:
-            figure.legend(loc="outside lower center", ncols=min(len(families), 5))
-        label_text = result_title(machine.name, "what rings")
-        figure.suptitle(
-            escape_label(label_text), x=0.01, ha="left", fontsize=11, fontweight="bold"
-        )
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for color, (family_values, family) in zip(
+        _cycle_colours(len(families)), families.items(), strict=True
+    ):
+        pairs = zip(names[1:], family_values, strict=True)
+        label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
+        family.sort(key=lambda pair: pair[0])
+        for k, (x, frequency, damping) in enumerate(_track_modes(family)):
+            label = escape_label(label_text) if label_text and not k else "_"
+            upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
+            lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
+    upper.set(yscale="log", ylabel="frequency [Hz]")
+    lower.set_ylabel("damping [%]")
+    machine = models[0][1].machine
+    unit = machine.unit(names[0]) if names[0] in machine.active else ""
+    lower.set_xlabel(escape_label(f"{names[0]} [{unit}]" if unit else names[0]))
+    if len(families) > 1:
+        figure.legend(loc="outside lower center", ncols=min(len(families), 5))
+    add_heading(figure, escape_label(result_title(machine.name, "oscillatory modes")))
     return figure
 
 
@@ -97,7 +96,7 @@ def _cycle_colours(count: int) -> list[str]:
 
 
 def _track_modes(family: Sequence[tuple[float, LinearModel]]) -> list[tuple[Array, Array, Array]]:
-    """Of the modes that ring, each followed by its shape: places, frequencies, damping."""
+    """Track oscillatory modes by their shapes; return parameter, frequency, damping of each."""
     branches: list[list[tuple[float, Mode]]] = []
     for x, model in family:
         modes = [mode for mode in model.modes if mode.is_oscillatory]
@@ -126,7 +125,7 @@ def _track_modes(family: Sequence[tuple[float, LinearModel]]) -> list[tuple[Arra
 
 
 def _modal_assurance(model: LinearModel, first: Mode, second: Mode) -> float:
-    """The modal assurance criterion of two shapes, 1 where they are the same."""
+    """Return the modal assurance criterion of two mode shapes, 1 for equal shapes."""
     units = model.machine.closure.units
     a, b = first.shape / units, second.shape / units
     product = np.linalg.norm(a) * np.linalg.norm(b)
@@ -134,7 +133,7 @@ def _modal_assurance(model: LinearModel, first: Mode, second: Mode) -> float:
 
 
 def _frequency_grid(model: LinearModel) -> Array:
-    """Frequencies [Hz] around what rings, or all poles, close at the former."""
+    """Return frequencies [Hz] around all poles, dense around oscillatory modes."""
     oscillating_frequencies = [mode.frequency for mode in model.modes if mode.is_oscillatory]
     used_frequencies = (
         oscillating_frequencies
@@ -154,7 +153,7 @@ def _frequency_grid(model: LinearModel) -> Array:
 
 
 def _draw_poles(axes: Axes, model: LinearModel) -> None:
-    """Over frequency and damping, which show slow and fast poles alike."""
+    """Draw poles over frequency and damping."""
     drawn_modes = [mode for mode in model.modes if mode.frequency > 0]
     axes.axhline(0.0, color=INK_COLOUR, lw=0.6)
     for mode in drawn_modes:
@@ -175,8 +174,7 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
     powers = np.log10([mode.frequency for mode in drawn_modes] or [1.0])
     axes.set_xlim(10 ** np.floor(powers.min()), 10 ** (np.floor(powers.max()) + 1))
     axes.set_yscale("symlog", linthresh=1.0)
-    axes.set_xlabel("frequency [Hz]")
-    axes.set_ylabel("damping [%]")
+    axes.set(xlabel="frequency [Hz]", ylabel="damping [%]")
     lowest = min((100 * mode.damping for mode in drawn_modes), default=0.0)
     axes.set_ylim(min(0.0, 1.5 * lowest), 200.0)
     zero_count = sum(mode.frequency == 0 for mode in model.modes)
@@ -184,7 +182,7 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
 
 
 def _position_outputs(model: LinearModel) -> list[int]:
-    """Outputs that are coordinates of active joints."""
+    """Return the outputs that are coordinates of active joints."""
     return [i for i, name in enumerate(model.outputs) if name in model.machine.active]
 
 
@@ -198,6 +196,44 @@ def _draw_response(
         if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():
             label = escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]")
             axes.loglog(frequencies, factor * response[:, i], color=color, lw=1.1, label=label)
-    axes.set_title(escape_label(f"per {model.inputs[input_index]}"))
-    axes.set_xlabel("frequency [Hz]")
+    axes.set(title=escape_label(f"per {model.inputs[input_index]}"), xlabel="frequency [Hz]")
     axes.legend(fontsize=6.5)
+
+
+_MAX_PANELS = 18  # panels
+
+
+@mpl.rc_context(FIGURE_STYLE)
+def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
+    """Return a panel per output with nonzero sensitivities, a line per parameter."""
+    effects = sensitivities.derivatives * sensitivities.typical_changes
+    panels = []
+    for k, output in enumerate(sensitivities.outputs):
+        largest = float(np.abs(effects[:, k]).max())
+        unit, scale = display_unit(sensitivities.unit(output), largest)
+        if scale * largest > ZERO_TOLERANCE:
+            panels.append((output, unit, scale * effects[:, k]))
+    panels = panels[:_MAX_PANELS]
+    columns = 2 if len(panels) > 1 else 1
+    rows = max(1, -(-len(panels) // columns))
+    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.9), layout="constrained")
+    for k, (output, unit, values) in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        for i, name in enumerate(sensitivities.parameters):
+            label = escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}")
+            axes.plot(sensitivities.recording.time, values[:, i], linewidth=1.0, label=label)
+        axes.set_title(escape_label(f"{output} [{unit}]"), fontsize=8.5)
+        if k >= len(panels) - columns:
+            axes.set_xlabel("time [s]")
+    if panels:
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    add_heading(
+        figure,
+        escape_label(
+            result_title(
+                sensitivities.recording.machine.partition(CHANGES_SEPARATOR)[0], "sensitivities"
+            )
+        ),
+    )
+    return figure

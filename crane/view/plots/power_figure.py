@@ -1,4 +1,4 @@
-"""The power account of a run over time: what goes where, stacked under what the shafts give."""
+"""Figures of power balances: power over time of one run, energies of several runs."""
 
 from collections.abc import Mapping
 
@@ -8,18 +8,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
-from crane.common.units import display_unit
+from crane.common.units import display_unit, format_number
 from crane.hydraulics.power_balance import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
-from crane.studies.hydraulic_power_balance import (
+from crane.studies.power_balance_result import (
     POWER_CLASSES,
     PowerBalance,
+    PowerComparison,
     part_class,
     part_kind,
     part_owner,
 )
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
 
 _CLASS_PALETTE = (
     "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
@@ -39,10 +40,11 @@ _OWNER_COLOURS = (
 _MAX_POINTS = 1500  # points of a stack
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def power_figure(balance: PowerBalance) -> Figure:
-    """Two stacks over time under the power of the shafts: by what it goes into, and by joint.
+    """Return the power of the shafts over time, stacked by class and by joint.
 
-    What is negative, as a load that drives its cylinder, is stacked below zero.
+    Negative powers, such as of a load that drives its cylinder, are stacked below zero.
     """
     by_class = {name: np.zeros_like(balance.time) for name in CLASS_COLOURS}
     by_owner: dict[str, Array] = {}
@@ -58,19 +60,18 @@ def power_figure(balance: PowerBalance) -> Figure:
     colors = dict(
         zip(order, _OWNER_COLOURS * (1 + len(order) // len(_OWNER_COLOURS)), strict=False)
     )
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(8.6, 6.4), layout="constrained")
-        upper_axes, lower_axes = figure.subplots(2, 1, sharex=True)
-        _draw_stack(upper_axes, balance, by_class, CLASS_COLOURS, scale)
-        _draw_stack(lower_axes, balance, {x: by_owner[x] for x in order}, colors, scale)
-        upper_axes.set_title("by what it goes into", loc="left", fontsize=9)
-        lower_axes.set_title("by joint", loc="left", fontsize=9)
-        lower_axes.set_xlabel("time [s]")
-        for axes in (upper_axes, lower_axes):
-            axes.set_ylabel(f"power [{unit}]")
-            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
-        heading = result_title(balance.machine_name, f"{balance.task_name} power".strip())
-        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    figure = Figure(figsize=(8.6, 6.4), layout="constrained")
+    upper_axes, lower_axes = figure.subplots(2, 1, sharex=True)
+    _draw_stack(upper_axes, balance, by_class, CLASS_COLOURS, scale)
+    _draw_stack(lower_axes, balance, {x: by_owner[x] for x in order}, colors, scale)
+    upper_axes.set_title("by class", loc="left", fontsize=9)
+    lower_axes.set_title("by joint", loc="left", fontsize=9)
+    lower_axes.set_xlabel("time [s]")
+    for axes in (upper_axes, lower_axes):
+        axes.set_ylabel(f"power [{unit}]")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
+    heading = result_title(balance.machine_name, f"{balance.task_name} power".strip())
+    add_heading(figure, escape_label(heading))
     return figure
 
 
@@ -81,7 +82,7 @@ def _draw_stack(
     colors: Mapping[str, str],
     scale: float,
 ) -> None:
-    """Layers (N,) upwards where they are positive, downwards where negative."""
+    """Stack layers (N,) upwards where positive, downwards where negative."""
     time, shaft = _block_means(balance.time), scale * _block_means(balance.shaft_power)
     positive_sum, negative_sum = np.zeros_like(time), np.zeros_like(time)
     min_power = 1e-3 * max(float(np.abs(balance.shaft_power).max()), 1e-9)
@@ -105,14 +106,79 @@ def _draw_stack(
 
 
 def _axis_end(stack_edge: Array, shaft: Array) -> float:
-    """How far an axis goes: a line that fills or empties within a sample may leave it."""
+    """Return the limit of an axis, which may cut single samples of filling lines."""
     stack_end = min(float(stack_edge.max()), 1.5 * float(np.quantile(stack_edge, 0.998)))
     return 1.06 * max(stack_end, float(shaft.max()), 0.02 * float(np.abs(shaft).max()), 1e-3)
 
 
 def _block_means(values: Array) -> Array:
-    """Means of so many neighbours that a picture can show them."""
+    """Return means over blocks of samples."""
     block_size = -(-len(values) // _MAX_POINTS)
     return np.add.reduceat(values, starts := np.arange(0, len(values), block_size)) / np.diff(
         [*starts, len(values)]
     )
+
+
+_RUN_COLOURS = (
+    "#1f5fa8",
+    "#e0701a",
+    "#2a8c4a",
+    "#8a5fb0",
+    "#b04a7a",
+    "#3f8f9f",
+    "#9a6b3f",
+    "#7a7a7a",
+)
+_BAR_HEIGHT, _GROUP_GAP = 0.14, 0.12  # of a bar, between groups of them [inch]
+_MIN_BAR_SHARE = 1e-3  # share of the largest run's energy that has a bar
+
+
+@mpl.rc_context(FIGURE_STYLE)
+def power_comparison_figure(comparison: PowerComparison) -> Figure:
+    """Return shaft power over time, and energy by class with a bar per run."""
+    runs = list(comparison.balances)
+    energies = {run: comparison.energy_by_class(run) for run in runs}
+    totals = {run: comparison.balances[run].totals[SHAFT_POWER] for run in runs}
+    largest_total = max(map(abs, totals.values()))
+    classes = [
+        energy_class
+        for energy_class in POWER_CLASSES
+        if max(abs(energies[x][energy_class]) for x in runs) > _MIN_BAR_SHARE * largest_total
+    ]
+    unit, scale = display_unit("J", largest_total)
+    group_height = len(runs) * _BAR_HEIGHT + _GROUP_GAP
+    bars_height = max(group_height * len(classes), 1.0)
+    figure = Figure(figsize=(8.6, 3.6 + bars_height), layout="constrained")
+    time_axes, bar_axes = figure.subplots(2, 1, height_ratios=(2.4, bars_height))
+    peaks = [float(np.abs(balance.shaft_power).max()) for balance in comparison.balances.values()]
+    power_unit, power_scale = display_unit("W", max(peaks))
+    for run, color in zip(runs, _run_colours(len(runs)), strict=True):
+        time, power = comparison.shaft_power_over_time(run)
+        label = (
+            f"{run}: {format_number(scale * totals[run])} {unit} in {format_number(time[-1])} s"
+        )
+        time_axes.plot(
+            time, power_scale * power, color=color, linewidth=1.1, label=escape_label(label)
+        )
+    time_axes.set(xlabel="time [s]", ylabel=f"power of the shafts [{power_unit}]")
+    time_axes.margins(x=0.0)
+    time_axes.set_ylim(bottom=min(0.0, time_axes.get_ylim()[0]))
+    figure.legend(loc="outside upper left", ncols=2)
+    for i, (run, color) in enumerate(zip(runs, _run_colours(len(runs)), strict=True)):
+        bar_positions = [group_height * k + _BAR_HEIGHT * i for k in range(len(classes))]
+        values = [scale * energies[run][kind] for kind in classes]
+        bars = bar_axes.barh(bar_positions, values, height=0.92 * _BAR_HEIGHT, color=color)
+        bar_axes.bar_label(bars, [format_number(x) for x in values], padding=2, fontsize=6.5)
+    group_centre = 0.5 * _BAR_HEIGHT * (len(runs) - 1)
+    bar_axes.set_yticks([group_height * k + group_centre for k in range(len(classes))], classes)
+    bar_axes.tick_params(axis="y", length=0)
+    bar_axes.grid(visible=False, axis="y")
+    bar_axes.invert_yaxis()
+    bar_axes.axvline(0.0, color=INK_COLOUR, linewidth=0.6)
+    bar_axes.margins(x=0.08, y=0.02)
+    bar_axes.set_xlabel(f"energy [{unit}]")
+    return figure
+
+
+def _run_colours(count: int) -> list[str]:
+    return [_RUN_COLOURS[i % len(_RUN_COLOURS)] for i in range(count)]

@@ -1,4 +1,4 @@
-"""A recording as one figure: displacements, velocities and forces, and the path of the tip."""
+"""Figures of recordings, and the style of all figures."""
 
 import itertools
 import re
@@ -24,10 +24,9 @@ from crane.common.scratch_arrays import release_pages
 from crane.common.units import display_unit
 from crane.recordings.recording import FORCE_UNITS, Recording
 from crane.recordings.recording_summary import heading, point_channel, tip_error
-from crane.view.plots.curve_thinning import envelope, thin_path
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_text import envelope, escape_label, thin_path
 
-FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
+FIGURE_FORMATS: dict[str, dict[str, None] | None] = {  # metadata without dates
     "png": None,
     "svg": {"Date": None},
     "pdf": {"CreationDate": None},
@@ -62,7 +61,7 @@ FIGURE_STYLE: Any = {
 }
 # Distances of words from the axes of a box [points], of which matplotlib adds the last by itself.
 TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
-_FLATNESS_TOLERANCE = 0.01  # of a path's size, what it may leave a plane by
+_FLATNESS_TOLERANCE = 0.01  # distance from a plane, as a share of the size of a path
 MAX_COLUMNS = 5  # joints beside each other
 _LETTER_WIDTH, _LEGEND_ENTRY_WIDTH = 0.11, 1.0  # [in] of a title, and of an entry of a legend
 # Least height of an axis [SI], so that rounding noise of a joint at rest looks like rest.
@@ -70,7 +69,7 @@ MIN_AXIS_SPAN = {
     "rad": 3e-3, "m": 2e-4, "rad/s": 3e-3, "m/s": 2e-4, "N m": 0.02, "N": 0.2, "Pa": 1e4,
     "m3/s": 1e-7, "V": 0.01,
 }  # fmt: skip
-# Rows of a hydraulic machine: quantity, unit, channels of a joint by what a line is called.
+# rows of a hydraulic machine: quantity, unit, channel of a joint by label
 HYDRAULIC_ROWS = (
     ("pressure", "Pa", {"A": "pressure_{}_a", "B": "pressure_{}_b", "supply": "pressure_supply"}),
     ("flow", "m3/s", {"A": "flow_{}_a", "B": "flow_{}_b"}),
@@ -87,10 +86,10 @@ LINE_STYLES: Mapping[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class _TimePanel:
-    """One quantity of one joint over time [SI]: lines (N,) by what they are called.
+    """One quantity of one joint over time: lines (N,) by label, in SI units.
 
-    With what they should be, errors to that: computed as they are drawn, as a long recording is
-    more than memory has room for.
+    With a reference, the lines are errors, which are computed while they are drawn, because long
+    recordings exceed the memory.
     """
 
     quantity: str
@@ -99,14 +98,18 @@ class _TimePanel:
     reference: Array | None = None
 
     def drawn_lines(self) -> Iterator[tuple[str, Array]]:
-        """Each line with its values (N,)."""
+        """Yield each line with its values (N,)."""
         for label, values in self.lines.items():
             release_pages()
             yield label, values if self.reference is None else self.reference - values
 
 
 def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
-    """Draw a figure into a file; its suffix .png, .svg or .pdf chooses the format.
+    """Draw a figure and write it to a file.
+
+    Args:
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
+        draw: Function that draws the figure.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -120,16 +123,21 @@ def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
         figure.savefig(part, format=file_format, dpi=200, metadata=FIGURE_FORMATS[file_format])
 
 
-def recording_figure(recording: Recording) -> Figure:
-    """The figure of a recording.
+def add_heading(figure: Figure, text: str) -> None:
+    """Add a bold heading at the upper left."""
+    figure.suptitle(text, x=0.01, ha="left", fontsize=11, fontweight="bold")
 
-    One column per active joint with its displacement, velocity and force over time, in the units
-    that the page of a run has, many joints in several bands below each other; of cylinders with
-    valves also pressures, flows and signals. Where the channels tip_x, tip_y, tip_z exist, the
-    path of the tip is beside them, in space, or in the plane of two coordinates where the third
-    hardly changes. References (channels reference_<joint>,
-    reference_velocity_<joint>, reference_tip_x, ...) are dashed; errors (references less
-    displacements) have a row of their own, and the tip its distance from its reference.
+
+@mpl.rc_context(FIGURE_STYLE)
+def recording_figure(recording: Recording) -> Figure:
+    """Return the figure of a recording.
+
+    There is one column per active joint with displacement, velocity and force over time; for
+    cylinders with valves also pressures, flows and signals. Many joints are drawn in several
+    bands. With the channels tip_x, tip_y, tip_z, the path of the tip is drawn in space, or in a
+    plane if one coordinate hardly changes. References (channels reference_<joint>,
+    reference_velocity_<joint>, reference_tip_x, ...) are dashed; errors (reference minus
+    displacement) have a separate row, and the tip its distance from the reference.
     """
     tip, joints = point_channel(recording, "tip"), recording.joints
     path_plane = (
@@ -141,31 +149,28 @@ def recording_figure(recording: Recording) -> Figure:
     ]
     panels = [[column[row] for column in panels_by_joint] for row in used_rows]
     rows = len(used_rows)
-    with mpl.rc_context(FIGURE_STYLE):
-        bands = -(-len(joints) // MAX_COLUMNS)
-        columns = -(-len(joints) // bands)
-        is_spatial = tip is not None and path_plane is None
-        widths = [1.0] * columns + [1.6 if is_spatial else 1.0] * (tip is not None)
-        width = 2.4 * sum(widths) + 0.3
-        margin = 0.3 if is_spatial else 0.0  # the layout overlooks the label of the z axis
-        layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
-        figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
-        grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
-        letters = iter(ascii_lowercase)
-        for band, row in itertools.product(range(bands), range(rows)):
-            joints_in_band = range(band * columns, min((band + 1) * columns, len(joints)))
-            grid_cells = {
-                i: grid[rows * band + row, i - joints_in_band.start] for i in joints_in_band
-            }
-            _draw_row(figure, grid_cells, recording, panels, row, letters)
-        if tip is not None:
-            _draw_tip_path(figure, grid, recording, tip, path_plane, letters)
-        _add_caption(figure, recording)
+    bands = -(-len(joints) // MAX_COLUMNS)
+    columns = -(-len(joints) // bands)
+    is_spatial = tip is not None and path_plane is None
+    widths = [1.0] * columns + [1.6 if is_spatial else 1.0] * (tip is not None)
+    width = 2.4 * sum(widths) + 0.3
+    margin = 0.3 if is_spatial else 0.0  # the layout overlooks the label of the z axis
+    layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
+    figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
+    grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
+    letters = iter(ascii_lowercase)
+    for band, row in itertools.product(range(bands), range(rows)):
+        joints_in_band = range(band * columns, min((band + 1) * columns, len(joints)))
+        grid_cells = {i: grid[rows * band + row, i - joints_in_band.start] for i in joints_in_band}
+        _draw_row(figure, grid_cells, recording, panels, row, letters)
+    if tip is not None:
+        _draw_tip_path(figure, grid, recording, tip, path_plane, letters)
+    _add_caption(figure, recording)
     return figure
 
 
 def _joint_panels(recording: Recording, column: int) -> list[_TimePanel]:
-    """Displacement, velocity, force and error of an active joint, its cylinder's; some empty."""
+    """Return the panels of an active joint and its cylinder; some without lines."""
     name, channels = recording.joints[column], recording.channels
     unit = recording.units[name]
     is_revolute, reference_name = unit == "rad", f"reference_{name}"
@@ -213,7 +218,7 @@ def _joint_panels(recording: Recording, column: int) -> list[_TimePanel]:
 
 
 def _row_scales(panels: Sequence[_TimePanel]) -> dict[str, tuple[str, float]]:
-    """The unit that panels of a row are read in, and its scale, the same for equal units."""
+    """Return display unit and scale by unit, the same for all panels of a row."""
     peaks: dict[str, float] = {}
     for panel in panels:
         for _, values in panel.drawn_lines():
@@ -244,7 +249,7 @@ def _draw_row(
     row: int,
     letters: Iterator[str],
 ) -> None:
-    """A row of panels at the places of some joints; `panels` has those of all, row by row."""
+    """Draw a row of panels of some joints; `panels` has all panels by row."""
     scales = _row_scales(panels[row])
     for index, grid_cell in grid_cells.items():
         panel = panels[row][index]
@@ -265,7 +270,7 @@ def _draw_tip_path(
     figure: Figure, grid: GridSpec, recording: Recording, tip: Array,
     path_plane: tuple[int, int] | None, letters: Iterator[str],
 ) -> None:  # fmt: skip
-    """The path of the tip in the last column, and its distance from a reference below it."""
+    """Draw the path of the tip and its distance from a reference, in the last column."""
     reference, distance = point_channel(recording, "reference_tip"), tip_error(recording)
     grid_rows = slice(3) if reference is None else slice(2)
     if path_plane is None:
@@ -286,9 +291,9 @@ def _draw_tip_path(
 
 
 def _path_plane(tip: Array, reference: Array | None) -> tuple[int, int] | None:
-    """The two coordinates that a path lies in the plane of, but for 1 % of its size; else None.
+    """Return the two coordinates of the plane of a path, to 1 % of its size; None if not plane.
 
-    Of a straight path upright planes go first, that of x and z before that of y and z.
+    For a straight path the plane of x and z is preferred, then that of y and z.
     """
     lower, upper = _path_bounds(tip, reference)
     is_flat = upper - lower <= _FLATNESS_TOLERANCE * (upper - lower).max()
@@ -297,14 +302,14 @@ def _path_plane(tip: Array, reference: Array | None) -> tuple[int, int] | None:
 
 
 def _path_bounds(tip: Array, reference: Array | None) -> tuple[Array, Array]:
-    """Lowest and highest corner (3,) of a path and its reference [m]."""
+    """Return the lower and upper corner (3,) of a path and its reference [m]."""
     paths = [tip] if reference is None else [tip, reference]
     lower, upper = zip(*((x.min(axis=0), x.max(axis=0)) for x in paths), strict=True)
     return np.min(lower, axis=0), np.max(upper, axis=0)
 
 
 def _drawing_box(tip: Array, reference: Array | None) -> tuple[Array, Array]:
-    """Corners (3,) of a box around them that is nowhere flat [m]."""
+    """Return the corners (3,) of a box around a path that is not flat [m]."""
     lower, upper = _path_bounds(tip, reference)
     span = np.maximum(upper - lower, 0.4 * max(float((upper - lower).max()), 1e-2)) * 1.1
     return (lower + upper - span) / 2, (lower + upper + span) / 2
@@ -313,7 +318,7 @@ def _drawing_box(tip: Array, reference: Array | None) -> tuple[Array, Array]:
 def _draw_plane_path(
     axes: Axes, tip: Array, reference: Array | None, plane: tuple[int, int]
 ) -> None:
-    """The path of the tip [m] in a plane, to scale."""
+    """Draw the path of the tip [m] in a plane, to scale."""
     i, j = plane
     x, y = thin_path(tip)[:, plane].T
     axes.plot(x, y, color=RECORDED_COLOUR, label="recording")
@@ -334,7 +339,7 @@ def _draw_plane_path(
 
 
 def _draw_space_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
-    """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
+    """Draw the path of the tip [m] in space, to scale, with its shadow."""
     tip, reference = thin_path(tip), None if reference is None else thin_path(reference)
     lower, upper = _drawing_box(tip, reference)
     span = upper - lower
@@ -356,8 +361,15 @@ def _draw_space_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
             label=name,
         )
         axes.text(*end_point, f" {name}", fontsize=7.5, va="bottom")
-    axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="path of the tip")
+    axes.set(
+        xlim=(lower[0], upper[0]),
+        ylim=(lower[1], upper[1]),
+        zlim=(lower[2], upper[2]),
+        xlabel="x [m]",
+        ylabel="y [m]",
+        zlabel="z [m]",
+        title="path of the tip",
+    )
     axes.set_box_aspect(span, zoom=0.88)
     axes.view_init(elev=24, azim=-60)
     for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
@@ -372,7 +384,7 @@ def _draw_space_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
 
 
 def _inner_ticks(lower: float, upper: float, axis_share: float) -> list[float]:
-    """Round values away from the ends, where other axes begin; few on a short axis."""
+    """Return round values away from the ends of an axis; few on a short axis."""
     margin = 0.12 * (upper - lower)
     lower, upper = lower + margin, upper - margin
     min_count, max_count = (2, 3) if axis_share > 0.5 else (1, 2)
@@ -388,18 +400,16 @@ def _inner_ticks(lower: float, upper: float, axis_share: float) -> list[float]:
 
 
 def _add_panel_letter(axes: Axes, letters: Iterator[str]) -> None:
-    """(a), (b), ... as panels are referred to in a text."""
+    """Label a panel (a), (b), ... for references in a text."""
     if letter := next(letters, ""):
         axes.annotate(f"({letter})", (0, 1), (-28, 7), "axes fraction", "offset points")
 
 
 def _add_caption(figure: Figure, recording: Recording) -> None:
-    """What is shown, and which line is what."""
+    """Add heading and legend."""
     heading_text = heading(recording)
     if heading_text:
-        figure.suptitle(
-            escape_label(heading_text), x=0.01, ha="left", fontsize=11, fontweight="bold"
-        )
+        add_heading(figure, escape_label(heading_text))
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
     if legend_lines := [
         lines[label] for label in LINE_STYLES if label in lines and label != "recording"
@@ -416,7 +426,7 @@ def _add_caption(figure: Figure, recording: Recording) -> None:
 
 
 def joint_symbol(name: str) -> str:
-    """A joint's name as mathematics where it is a letter and a number, q1 as q with index 1."""
+    """Return a joint's name as a label; q1 is set as q with index 1."""
     if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
         return f"${match[1]}_{{{match[2]}}}$"
     return escape_label(name)

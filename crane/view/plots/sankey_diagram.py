@@ -1,4 +1,4 @@
-"""Where a run's energy went, as ribbons as wide as it is much: a Sankey diagram."""
+"""Sankey diagram of the energy of a hydraulic run."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from matplotlib.patheffects import withStroke
 from crane.common.units import format_number
 from crane.hydraulics.power_balance import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
-from crane.studies.hydraulic_power_balance import (
+from crane.studies.power_balance_result import (
     LOAD,
     PowerBalance,
     part_class,
@@ -47,13 +47,13 @@ _NEUTRAL_COLOUR = "#8c9aa8"
 
 @dataclass
 class _SankeyRibbon:
-    """A ribbon on the right.
+    """One ribbon on the right.
 
     Attributes:
-        label: What it is.
+        label: Label of the ribbon.
         energy: [J].
         color: Its colour.
-        centre: Of its middle [inch].
+        centre: Height of its middle [inch].
     """
 
     label: str
@@ -64,13 +64,13 @@ class _SankeyRibbon:
 
 @dataclass
 class _SankeyGroup:
-    """What one owner's energy goes into.
+    """Energy of one owner, by ribbon.
 
     Attributes:
-        label: Whose it is.
-        ribbons: Into what.
-        returned_energy: That it gets from elsewhere than the pumps [J].
-        top: Of its top [inch].
+        label: Name of the owner.
+        ribbons: Ribbons of the owner's energy.
+        returned_energy: Energy that does not come from the pumps [J].
+        top: Height of its top [inch].
     """
 
     label: str
@@ -80,26 +80,26 @@ class _SankeyGroup:
 
     @property
     def total_energy(self) -> float:
-        """Energy of all its items [J]."""
+        """Energy of all ribbons [J]."""
         return sum(item.energy for item in self.ribbons)
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def sankey_figure(balance: PowerBalance) -> Figure:
-    """Energies from the shafts by pump and joint into what they go into, in kJ and %.
+    """Return the energies from the shafts by pump and joint to losses and loads, in kJ and %.
 
-    What a load gives back while it drives its cylinder enters its joint from the left.
-    What has less than 0.4 % is drawn as others, less than 0.1 % not at all. Percentages are of
-    what the shafts give.
+    Energy that a load returns while it drives its cylinder enters its joint from the left.
+    Energies of less than 0.4 % are summed as others, which are left out below 0.1 %. Percentages
+    are of the energy of the shafts.
     """
-    with mpl.rc_context(FIGURE_STYLE):
-        return _SankeyDiagram(balance).figure
+    return _SankeyDiagram(balance).figure
 
 
 class _SankeyDiagram:
     """The drawing.
 
     Args:
-        balance: What to show.
+        balance: The power balance.
     """
 
     def __init__(self, balance: PowerBalance):
@@ -124,7 +124,7 @@ class _SankeyDiagram:
         ]
         circuit_names = [x for x in names if part_owner(x) not in balance.joints]
         groups.append(self._create_group("circuit", circuit_names))
-        # what gives more than it takes feeds the others
+        # groups that return more than they receive become sources
         self._returning_groups: dict[str, float] = {}
         for group in groups:
             if group.returned_energy > group.total_energy:
@@ -180,8 +180,7 @@ class _SankeyDiagram:
         figure_height = self._place_groups(groups, scale)
         figure = Figure(figsize=(_FIGURE_WIDTH, figure_height))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        axes.set_xlim(0.0, _FIGURE_WIDTH)
-        axes.set_ylim(-figure_height, 0.0)
+        axes.set(xlim=(0.0, _FIGURE_WIDTH), ylim=(-figure_height, 0.0))
         axes.axis("off")
         self._axes, self._scale = axes, scale
         heading = result_title(
@@ -189,7 +188,7 @@ class _SankeyDiagram:
         )
         axes.text(0.1, -0.1, escape_label(heading), fontsize=11, fontweight="bold", va="top")
         if not self._total_energy > 0 or not self._owner_groups:
-            axes.text(0.1, -0.6, "nothing is driven", va="top")
+            axes.text(0.1, -0.6, "no energy", va="top")
             return figure
         self._draw_sources(self._draw_hydraulic_bar(groups))
         for group in groups:
@@ -197,7 +196,7 @@ class _SankeyDiagram:
         return figure
 
     def _place_groups(self, groups: list[_SankeyGroup], scale: float) -> float:
-        """Place all from above downwards; the height of the figure [inch]."""
+        """Place all groups downwards, and return the height of the figure [inch]."""
         y = -_TOP_MARGIN
         for group in groups:
             y -= _GROUP_GAP
@@ -211,7 +210,7 @@ class _SankeyDiagram:
         return max(_BOTTOM_MARGIN - y, _TOP_MARGIN + _TOTAL_HEIGHT + 1.2)
 
     def _draw_hydraulic_bar(self, groups: list[_SankeyGroup]) -> float:
-        """Draw the bar that feeds the groups, and its ribbons; its top [inch]."""
+        """Draw the hydraulic bar and its ribbons, and return its top [inch]."""
         scale, (_, x, target_x, _) = self._scale, _COLUMN_POSITIONS
         first_centre, last_centre = (
             self._owner_groups[0].ribbons[0].centre,
@@ -233,7 +232,6 @@ class _SankeyDiagram:
         return top
 
     def _draw_sources(self, bar_top: float) -> None:
-        """Draw what gives, on the left, beside the bar at a height."""
         scale, (x, bar_x, group_x, _) = self._scale, _COLUMN_POSITIONS
         target_top, loss_top = bar_top, self._pump_group.top
         sources = {f"{escape_label(pump)}\nshaft": (energy, self._pump_losses[pump])
@@ -330,7 +328,7 @@ class _SankeyDiagram:
     def _draw_ribbon(
         self, start: tuple[float, float], end: tuple[float, float], size: float, color: str
     ) -> None:
-        """From one top edge to another."""
+        """Draw a ribbon between two top edges."""
         self._axes.add_patch(_ribbon_patch(start, end, size, color))
 
     _axes: Axes

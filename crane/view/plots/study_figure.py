@@ -1,4 +1,4 @@
-"""A design study as one picture: curves, maps, or scatter plots with rank correlations."""
+"""Figures of design studies: curves, maps, or scatter plots with rank correlations."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +18,7 @@ from crane.view.plots.recording_figure import (
     DASHED_STYLE,
     FIGURE_STYLE,
     RECORDED_COLOUR,
+    add_heading,
 )
 
 _MAX_PANELS = 12  # measures of one picture
@@ -27,21 +28,21 @@ _TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
 _INFEASIBLE_COLOUR = "#d9d9d9"
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def study_figure(study: Study) -> Figure:
-    """The figure of a study, a panel per measure; measures that do not change are left out.
+    """Return the figure of a study, a panel per measure that varies.
 
-    Of one parameter curves, of a grid of two maps with the best variant marked; of anything else
-    points over each parameter with their rank correlation.
+    One parameter gives curves, a grid of two gives maps with the best variant; otherwise points
+    are drawn over each parameter with their rank correlation.
     """
     shown_measures = [name for name in study.measures if _is_varying(study.columns[name])]
     shown_measures = (shown_measures or list(study.measures))[:_MAX_PANELS]
-    with mpl.rc_context(FIGURE_STYLE):
-        if not study.grid_shape or len(study.parameters) > 2:
-            figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
-        else:
-            figure = _draw_panels(study, shown_measures)
-        heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
-        figure.suptitle(escape_label(heading), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    if not study.grid_shape or len(study.parameters) > 2:
+        figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
+    else:
+        figure = _draw_panels(study, shown_measures)
+    heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
+    add_heading(figure, escape_label(heading))
     return figure
 
 
@@ -69,8 +70,9 @@ def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
             _draw_curves(axes, study, name)
         else:
             _draw_map(figure, axes, study, name)
-        axes.set_title(_column_label(study, name))
-        axes.set_xlabel(_column_label(study, study.parameters[0]))
+        axes.set(
+            title=_column_label(study, name), xlabel=_column_label(study, study.parameters[0])
+        )
     lines = {
         line.get_label(): line
         for axes in figure.axes
@@ -84,7 +86,7 @@ def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
 
 
 def _draw_curves(axes: Axes, study: Study, name: str) -> None:
-    """One measure over one parameter, the values of each task below that of all together."""
+    """Draw one measure over one parameter, over all tasks and by task."""
     x = study.columns[study.parameters[0]]
     order = np.argsort(x)
     x = x[order]
@@ -137,7 +139,7 @@ def _draw_curves(axes: Axes, study: Study, name: str) -> None:
 
 
 def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
-    """One measure over a grid of two parameters, hatched where it cannot be measured."""
+    """Draw one measure over a grid of two parameters; grey where it is not possible."""
     first_values, second_values = (
         study.columns[name].reshape(study.grid_shape) for name in study.parameters
     )
@@ -176,7 +178,7 @@ def _draw_map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
 
 
 def _draw_cloud(axes: Axes, x: Array, values: Array, best_variant: Sequence[int]) -> None:
-    """A measure over a parameter, ticks where it is missing, and how well their ranks agree."""
+    """Draw a measure over a parameter with ticks for missing values and rank correlation."""
     is_finite = np.isfinite(values)
     axes.plot(x[is_finite], values[is_finite], "o", ms=3, color=RECORDED_COLOUR, alpha=0.7)
     axes.plot(x[best_variant], values[best_variant], "*", ms=11, color=DASHED_STYLE["color"])
@@ -188,7 +190,7 @@ def _draw_cloud(axes: Axes, x: Array, values: Array, best_variant: Sequence[int]
 
 
 def _draw_scatter(study: Study, shown_measures: list[str]) -> Figure:
-    """Measures over parameters, all other parameters varying too."""
+    """Draw measures over each parameter, while all parameters vary."""
     size = (2.5 * len(study.parameters) + 0.8, 2.0 * len(shown_measures) + 0.6)
     figure = Figure(figsize=(max(4.5, size[0]), size[1]), layout="constrained")
     panels = figure.subplots(

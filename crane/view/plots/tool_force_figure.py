@@ -1,4 +1,4 @@
-"""Tool forces over the reach: how large, which way, and what ends them."""
+"""Figures of tool forces: magnitude, direction and limiting factors."""
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +12,7 @@ from crane.common.samples import Array
 from crane.ratings.tool_forces import ToolForce
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
+from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
 
 _FACTOR_COLOURS = (
     "#1f5fa8",
@@ -31,75 +31,74 @@ _FACTOR_COLOURS = (
 _MAX_ARROWS = 12  # along the larger side
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def tool_force_figure(chart: ToolForce) -> Figure:
-    """The figure: a row per slew, forces with arrows on the left, causes on the right."""
+    """Return a row per slew angle: forces with arrows, and limiting factors."""
     count = len(chart.slews)
     radius_range, height_range = float(np.ptp(chart.radii)), float(np.ptp(chart.heights))
     directions = chart.section_directions()
     largest_force = (
         float(np.nanmax(np.where(np.isfinite(chart.forces), chart.forces, np.nan))) / 1e3
     )
-    with mpl.rc_context(FIGURE_STYLE):
-        height = np.clip(4.2 * height_range / max(radius_range, 1e-9), 2.6, 6.5) * count + 2.0
-        figure = Figure(figsize=(9.6, float(height)), layout="constrained")
-        grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
-        active_factors = chart.active_factors
-        colors = {
-            k: _FACTOR_COLOURS[j % len(_FACTOR_COLOURS)] for j, k in enumerate(active_factors)
-        }
-        for s, (left, right) in enumerate(grid):
-            forces = chart.forces[s] / 1e3
-            masked_forces = np.ma.masked_invalid(forces)
-            mesh = left.pcolormesh(
-                chart.radii,
-                chart.heights,
-                masked_forces,
-                shading="nearest",
-                cmap="viridis",
-                vmin=0.0,
-                vmax=largest_force,
-                rasterized=True,
-            )
-            if np.ptp(masked_forces.compressed()) > 0 and min(masked_forces.shape) > 1:
-                lines = left.contour(chart.radii, chart.heights, masked_forces,
-                                     levels=MaxNLocator(8).tick_values(0, largest_force),
-                                     colors="white", linewidths=0.7)  # fmt: skip
-                left.clabel(lines, fmt="%g", fontsize=7)
-            _draw_arrows(left, chart, forces, directions[s], largest_force)
-            colour_bar = figure.colorbar(
-                mesh, cax=left.inset_axes((1.03, 0.03, 0.04, 0.94)), label="force [kN]"
-            )
-            colour_bar.outline.set_visible(False)
-            factor_index = np.full(forces.shape, np.nan)
-            for j, k in enumerate(active_factors):
-                factor_index[chart.limiting_factor_index[s] == k] = j
-            palette = ListedColormap([colors[k] for k in active_factors] or [INK_COLOUR])
-            right.pcolormesh(chart.radii, chart.heights, np.ma.masked_invalid(factor_index),
-                             shading="nearest", cmap=palette, vmin=-0.5,
-                             vmax=max(len(active_factors), 1) - 0.5, rasterized=True)  # fmt: skip
-            slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
-            left.set_title(f"largest force{slew_text}")
-            right.set_title("what ends it")
-            left.set_ylabel(f"{chart.section.coordinate_names[1]} [m]")
-            for axes in (left, right):
-                axes.set_aspect("equal")
-                axes.grid(False)
-                if s == count - 1:
-                    axes.set_xlabel(f"{chart.section.coordinate_names[0]} [m]")
-        handles = [
-            Swatch(color=colors[k], label=escape_label(str(chart.limiting_factors[k])))
-            for k in active_factors
-        ]
-        figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
-        heading = escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
-        figure.suptitle(heading, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    height = np.clip(4.2 * height_range / max(radius_range, 1e-9), 2.6, 6.5) * count + 2.0
+    figure = Figure(figsize=(9.6, float(height)), layout="constrained")
+    grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
+    active_factors = chart.active_factors
+    colors = {k: _FACTOR_COLOURS[j % len(_FACTOR_COLOURS)] for j, k in enumerate(active_factors)}
+    for s, (left, right) in enumerate(grid):
+        forces = chart.forces[s] / 1e3
+        masked_forces = np.ma.masked_invalid(forces)
+        mesh = left.pcolormesh(
+            chart.radii,
+            chart.heights,
+            masked_forces,
+            shading="nearest",
+            cmap="viridis",
+            vmin=0.0,
+            vmax=largest_force,
+            rasterized=True,
+        )
+        if np.ptp(masked_forces.compressed()) > 0 and min(masked_forces.shape) > 1:
+            lines = left.contour(chart.radii, chart.heights, masked_forces,
+                                 levels=MaxNLocator(8).tick_values(0, largest_force),
+                                 colors="white", linewidths=0.7)  # fmt: skip
+            left.clabel(lines, fmt="%g", fontsize=7)
+        _draw_arrows(left, chart, forces, directions[s], largest_force)
+        colour_bar = figure.colorbar(
+            mesh, cax=left.inset_axes((1.03, 0.03, 0.04, 0.94)), label="force [kN]"
+        )
+        colour_bar.outline.set_visible(False)
+        factor_index = np.full(forces.shape, np.nan)
+        for j, k in enumerate(active_factors):
+            factor_index[chart.limiting_factor_index[s] == k] = j
+        palette = ListedColormap([colors[k] for k in active_factors] or [INK_COLOUR])
+        right.pcolormesh(chart.radii, chart.heights, np.ma.masked_invalid(factor_index),
+                         shading="nearest", cmap=palette, vmin=-0.5,
+                         vmax=max(len(active_factors), 1) - 0.5, rasterized=True)  # fmt: skip
+        slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
+        left.set_title(f"largest force{slew_text}")
+        right.set_title("limiting factor")
+        left.set_ylabel(f"{chart.section.coordinate_names[1]} [m]")
+        for axes in (left, right):
+            axes.set_aspect("equal")
+            axes.grid(False)
+            if s == count - 1:
+                axes.set_xlabel(f"{chart.section.coordinate_names[0]} [m]")
+    handles = [
+        Swatch(color=colors[k], label=escape_label(str(chart.limiting_factors[k])))
+        for k in active_factors
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
+    add_heading(
+        figure, escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
+    )
     return figure
 
 
 def _draw_arrows(
     axes: Axes, chart: ToolForce, forces: Array, directions: Array, largest_force: float
 ) -> None:
-    """Which way the tool pushes, at some places, as long as the force is large."""
+    """Draw the direction of the force at some positions; the length shows the magnitude."""
     step = max(1, max(forces.shape) // _MAX_ARROWS)
     rows, columns = (np.arange(n % step // 2, n, step) for n in forces.shape)
     b, a = np.meshgrid(rows, columns, indexing="ij")

@@ -1,4 +1,4 @@
-"""A workspace as one picture: what the tip reaches, and which strokes close."""
+"""Figures of workspaces: reach of the tip, and map of the strokes."""
 
 import matplotlib as mpl
 import numpy as np
@@ -20,6 +20,7 @@ from crane.view.plots.recording_figure import (
     FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
+    add_heading,
     joint_symbol,
 )
 
@@ -40,48 +41,49 @@ _CONDITION_TICKS = (1, 1.1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7, 10, 15, 20, 30)
 _GRID_LINE_COUNT = 10  # of the grid, per stroke
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def workspace_figure(reachable_space: Workspace) -> Figure:
-    """The figure of a workspace.
+    """Return the figure of a workspace.
 
-    Left what the tip covers in the section, the images of even steps of the two strokes that
-    move it most, and the machine at home; right over these two strokes the condition of the drive
-    and the least singular value of the tip's slopes, grey where the loops do not close.
+    On the left are the reach of the tip in the section, images of grid lines of the two strokes
+    that move it most, and the machine at home. On the right, over these two strokes, are the
+    condition number of the drive and the smallest singular value of the tip's Jacobian, grey where
+    the loops do not close.
     """
-    with mpl.rc_context(FIGURE_STYLE):
-        lower, upper = (
-            reachable_space.section_positions.min(axis=0),
-            reachable_space.section_positions.max(axis=0),
-        )
-        skeleton = skeleton_lines(reachable_space)
-        lower = np.minimum(lower, skeleton.reshape(-1, 2).min(axis=0))
-        upper = np.maximum(upper, skeleton.reshape(-1, 2).max(axis=0))
-        aspect = np.clip((upper - lower)[1] / max((upper - lower)[0], 1e-9), 0.45, 1.5)
-        has_condition_panel = (
-            float(np.nanmax(reachable_space.stroke_map.condition)) > _MIN_SHOWN_CONDITION
-        )
-        height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
-        figure = Figure(figsize=(9.6, height), layout="constrained")
-        grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
-        _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, (lower, upper))
-        right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
-        if has_condition_panel:
-            _draw_stroke_map(
-                right[0],
-                reachable_space,
-                reachable_space.stroke_map.condition,
-                "condition of the drive",
-            )
-            right[0].sharex(right[1])
-            right[0].tick_params(labelbottom=False)
-            right[0].set_xlabel("")
+    lower, upper = (
+        reachable_space.section_positions.min(axis=0),
+        reachable_space.section_positions.max(axis=0),
+    )
+    skeleton = skeleton_lines(reachable_space)
+    lower = np.minimum(lower, skeleton.reshape(-1, 2).min(axis=0))
+    upper = np.maximum(upper, skeleton.reshape(-1, 2).max(axis=0))
+    aspect = np.clip((upper - lower)[1] / max((upper - lower)[0], 1e-9), 0.45, 1.5)
+    has_condition_panel = (
+        float(np.nanmax(reachable_space.stroke_map.condition)) > _MIN_SHOWN_CONDITION
+    )
+    height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
+    figure = Figure(figsize=(9.6, height), layout="constrained")
+    grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
+    _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, (lower, upper))
+    right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
+    if has_condition_panel:
         _draw_stroke_map(
-            right[-1],
+            right[0],
             reachable_space,
-            reachable_space.stroke_map.least_singular_value,
-            "tip, least singular [m]",
+            reachable_space.stroke_map.condition,
+            "condition number of the drive",
         )
-        right[0].set_title(_stroke_title(reachable_space))
-        _add_caption(figure, reachable_space)
+        right[0].sharex(right[1])
+        right[0].tick_params(labelbottom=False)
+        right[0].set_xlabel("")
+    _draw_stroke_map(
+        right[-1],
+        reachable_space,
+        reachable_space.stroke_map.least_singular_value,
+        "smallest singular value, tip [m]",
+    )
+    right[0].set_title(_stroke_title(reachable_space))
+    _add_caption(figure, reachable_space)
     return figure
 
 
@@ -125,9 +127,11 @@ def _draw_section(
     axes.plot(*home_position, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3, zorder=6)
     axes.set_aspect("equal")
     margin = 0.05 * float((limits[1] - limits[0]).max())
-    axes.set_xlim(limits[0][0] - margin, limits[1][0] + margin)
-    axes.set_ylim(limits[0][1] - margin, limits[1][1] + margin)
-    axes.set_anchor("N")
+    axes.set(
+        xlim=(limits[0][0] - margin, limits[1][0] + margin),
+        ylim=(limits[0][1] - margin, limits[1][1] + margin),
+        anchor="N",
+    )
     u, w = reachable_space.section.coordinate_names
     axes.set(
         xlabel=f"{u} [m]",
@@ -139,7 +143,7 @@ def _draw_section(
 
 
 def _grid_images(reachable_space: Workspace) -> list[Array]:
-    """Images (k, 2) of even steps of the two strokes of the map."""
+    """Return images (k, 2) in the section of grid lines of the two strokes."""
     patch = reachable_space.stroke_map.patch
     section_positions = np.full((*patch.is_closed.shape, 2), np.nan)
     tip_positions = [
@@ -175,7 +179,7 @@ def _home_tip(reachable_space: Workspace) -> Array:
 
 
 def skeleton_lines(reachable_space: Workspace) -> Array:
-    """Lines (k, 2, 2) between the joints of the machine at home, in the section."""
+    """Return lines (k, 2, 2) between the joints of the machine at home, in the section."""
     machine, model = reachable_space.machine, reachable_space.machine.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
@@ -200,7 +204,7 @@ def skeleton_lines(reachable_space: Workspace) -> Array:
 
 
 def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, label: str) -> None:
-    """A number (a, b) over the two strokes of the map, or over the only one."""
+    """Draw values (a, b) over the two strokes of the map, or over the single stroke."""
     machine, stroke_map = reachable_space.machine, reachable_space.stroke_map
     patch = stroke_map.patch
     names = [machine.active[i] for i in patch.stroke_pair]
@@ -209,8 +213,7 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
     labels = [f"{joint_symbol(n)} [{u}]" for n, (u, _) in zip(names, units, strict=True)]
     home = machine.home[machine.closure.active][list(patch.stroke_pair)] * factors
     x = patch.axes[0] * factors[0]
-    axes.set_xlabel(labels[0])
-    axes.set_anchor("N")
+    axes.set(xlabel=labels[0], anchor="N")
     if patch.stroke_pair[0] == patch.stroke_pair[1]:
         axes.plot(x, values[:, 0], color=RECORDED_COLOUR)
         for curve in stroke_map.curves:
@@ -278,7 +281,7 @@ def _add_caption(figure: Figure, reachable_space: Workspace) -> None:
             f", turned by {joint_symbol(reachable_space.slewing_joint_name)} from "
             f"{slewing_range[0]:.4g}° to {slewing_range[1]:.4g}°"
         )
-    figure.suptitle(heading, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    add_heading(figure, heading)
     handles: list[Line2D | Swatch] = [
         Line2D([], [], marker="o", ls="", color=INK_COLOUR, mfc="white", mew=1.3, label="home")
     ]

@@ -1,4 +1,4 @@
-"""Drawings of a machine: its mechanism with dimensions, its hydraulic circuit."""
+"""Drawings of a machine: sketch of its mechanism, and its hydraulic circuit."""
 
 from crane.view.sketch.circuit.circuit_drawing import sketch_circuit
 from crane.view.sketch.sketch_figure import sketch

@@ -1,4 +1,4 @@
-"""Where labels go: beside what they name, on nothing else."""
+"""Placement of labels beside their points, clear of lines and symbols."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crane.common.samples import Array
 from crane.view.sketch.sketch_canvas import GREY, SketchCanvas
 
-_RING_GAPS = (2.0, 5.0, 9.0, 15.0, 23.0, 33.0, 45.0, 60.0)  # gaps to what is named [points]
+_RING_GAPS = (2.0, 5.0, 9.0, 15.0, 23.0, 33.0, 45.0, 60.0)  # gaps to the symbol [points]
 _LEADER_LINE_GAP = 12.0  # gap from which a thin line leads to the label [points]
 _ANGLES = np.linspace(0, 2 * np.pi, 32, endpoint=False) + np.pi / 4
 _MAX_SWEEPS = 6
@@ -21,13 +21,13 @@ _MAX_SWEEPS = 6
 
 @dataclass(frozen=True, eq=False)
 class SketchLabel:
-    """Words beside a point.
+    """A label beside a point.
 
     Attributes:
-        text: The words.
-        position: (2,) what they name [m].
-        radius: Of the symbol there [points].
-        gid: The text's name in the figure.
+        text: Text.
+        position: (2,) labelled point [m].
+        radius: Radius of the symbol at the point [points].
+        gid: Identifier of the text in the figure.
     """
 
     text: str
@@ -37,11 +37,11 @@ class SketchLabel:
 
 
 def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
-    """Put labels beside what they name, clear of each other and of all lines and symbols.
+    """Place labels beside their points, clear of each other and of all lines and symbols.
 
-    Candidates stand in rings around each point; each costs what it covers, its distance, and
-    nearness to other symbols. The label with the dearest best place chooses first, then all choose
-    again in turn.
+    Candidates lie on rings around each point. The cost of a candidate depends on what it covers,
+    on its distance, and on the distance to other symbols. The label with the most expensive best
+    candidate is placed first, then all are placed again in turn.
     """
     axes, point = canvas.axes, canvas.point_size
     figure = axes.figure
@@ -80,7 +80,7 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
 
 
 def _candidates(label: SketchLabel, half_size: Array, point_size: float) -> tuple[Array, Array]:
-    """Boxes (k, 2, 2) as lowest and highest corners [m], and their gaps (k,) [points]."""
+    """Return boxes (k, 2, 2) as lower and upper corners [m], and their gaps (k,) [points]."""
     directions = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
     # a box whose nearest point lies in that direction: corners for slanted ones, sides for others
     corner_directions = np.clip(1.6 * directions, -1, 1)
@@ -92,7 +92,7 @@ def _candidates(label: SketchLabel, half_size: Array, point_size: float) -> tupl
 
 
 def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gaps: Array) -> Array:
-    """(k,) what a label would cover and how far it would be, without other labels."""
+    """Return costs (k,) of what a label covers and of its distance, without other labels."""
     point = canvas.point_size
     lower, upper = boxes[:, 0] - 1.2 * point, boxes[:, 1] + 1.2 * point
     cost = 0.14 * gaps
@@ -104,7 +104,7 @@ def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gap
         cost = cost + np.where(distance < radius, 60.0, 0)
         if (
             np.abs(centre - label.position).max() > 1e-6 * point
-        ):  # nearer to another symbol than to its own
+        ):  # closer to another symbol than to its own
             cost = cost + np.where(distance - radius < gaps + 2.0, 5.0, 0)
     limits = np.array([canvas.axes.get_xlim(), canvas.axes.get_ylim()])
     outside = (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1)
@@ -114,7 +114,7 @@ def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gap
 def _costs_with_labels(
     other_boxes: Sequence[Array], boxes: Array, cost: Array, point_size: float
 ) -> Array:
-    """Costs (k,) of the boxes (k, 2, 2) of a label with other labels in their boxes (2, 2)."""
+    """Return costs (k,) of boxes (k, 2, 2) of a label, with other labels in boxes (2, 2)."""
     for lower, upper in other_boxes:
         box_gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
         cost = cost + np.where(box_gap < 4 * point_size, 1000.0, 0)
@@ -124,7 +124,7 @@ def _costs_with_labels(
 def _choose_candidates(
     boxes: Sequence[Array], costs: Sequence[Array], point_size: float
 ) -> list[int]:
-    """Index of the candidate of each label."""
+    """Return the index of the chosen candidate of each label."""
     order = sorted(range(len(boxes)), key=lambda i: -float(costs[i].min()))
     chosen: dict[int, int] = {}
     for sweep in range(_MAX_SWEEPS):
@@ -140,7 +140,7 @@ def _choose_candidates(
 
 
 def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
-    """(k,) length of a line (2, 2) within boxes (k, 2), (k, 2)."""
+    """Return the length (k,) of a line (2, 2) within boxes (k, 2), (k, 2)."""
     start, direction = segment[0], segment[1] - segment[0]
     with np.errstate(divide="ignore", invalid="ignore"):
         first_parameters, second_parameters = (
@@ -166,7 +166,7 @@ def _nonzero_length(vector: Array) -> float:
 def find_clear_point(
     polygon: Array, segments: Sequence[Array], excluded_polygons: Sequence[Array]
 ) -> tuple[Array, float]:
-    """A point (2,) within corners (k, 2), outside of others, and its distance to all lines [m]."""
+    """Find a point (2,) in a polygon, outside of others, and its distance to all lines [m]."""
     lower, upper = polygon.min(axis=0), polygon.max(axis=0)
     grid = np.stack(np.meshgrid(*np.linspace(lower, upper, 41).T), axis=-1).reshape(-1, 2)
     grid = grid[_is_within_polygon(grid, polygon)]
@@ -188,7 +188,7 @@ def find_clear_point(
 
 
 def _is_within_polygon(points: Array, corners: Array) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 2) lie within a polygon (k, 2)."""
+    """Return whether points (n, 2) lie within a polygon (k, 2)."""
     inside = np.zeros(len(points), dtype=bool)
     x, y = points.T
     for (a, b), (c, d) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

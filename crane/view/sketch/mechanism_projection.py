@@ -1,22 +1,27 @@
-"""A closed posture as pins, slides, bodies and loops in a plane."""
+"""Projection of a machine onto a plane: its mechanism and its outline."""
 
+import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.view.sketch.drawing_plane import DrawingPlane, joint_axes
+from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
+from crane.view.sketch.sketch_canvas import convex_hull
 from crane.view.sketch.sketch_elements import (
+    DrawingPlane,
     SketchBody,
     SketchCollar,
     SketchMechanism,
     SketchPin,
     SketchSlide,
+    joint_axes,
 )
 
-COINCIDENCE_TOLERANCE = 1e-9  # share of the drawing's size that is none
+COINCIDENCE_TOLERANCE = 1e-9  # share of the drawing's size between coincident points
 _COLLAR_DISTANCE_SHARE = (
     0.04  # share of the drawing's size within which a collar would hide beside a pin
 )
@@ -25,12 +30,12 @@ _MIN_PIN_COSINE = 0.7  # cosine to the plane's normal above which an axis is dra
 
 
 def project_mechanism(machine: Machine, q: Array, plane: DrawingPlane) -> SketchMechanism:
-    """The mechanism of a machine in a closed posture q (nq,), as a plane shows it."""
+    """Project the mechanism of a machine in a closed configuration q (nq,) onto a plane."""
     return _MechanismProjection(machine, q, plane).mechanism()
 
 
 class _MechanismProjection:
-    """Collects what a plane shows of a machine in one posture."""
+    """Projection of a machine in one configuration."""
 
     def __init__(self, machine: Machine, q: Array, plane: DrawingPlane):
         self.machine, self.plane, self.q = machine, plane, q
@@ -96,7 +101,7 @@ class _MechanismProjection:
         return self.plane.project((self.data.oMi[joint] * placement).translation)
 
     def _find_outer_points(self) -> list[list[Array]]:
-        """By body, where others hang on it: origins of joints, loops, the tip."""
+        """Return the points of each body at which others are attached: joints, loops, tip."""
         outer_points: list[list[Array]] = [[] for _ in self.parents]
         outer_points[0].append(
             self.plane.project(np.zeros(3)) if self._has_base() else self.origins[1]
@@ -111,14 +116,14 @@ class _MechanismProjection:
         return outer_points
 
     def _farthest_point(self, joint: int) -> Array:
-        """The point of a body that lies farthest from its joint."""
+        """Return the point of a body that is farthest from its joint."""
         position = self.origins[joint]
         return max(
             self.outer[joint], key=lambda x: float(np.abs(x - position).max()), default=position
         )
 
     def _has_base(self) -> bool:
-        """Whether the world's origin is where the machine stands: a turning axis goes through."""
+        """Return whether the first joint axis goes through the world's origin."""
         first = self.origins[1]
         axis = self.axes[1]
         axis_offset = first - (first @ axis) * axis
@@ -145,7 +150,7 @@ class _MechanismProjection:
         return pins, collars
 
     def _collar_position(self, joint: int, axis: Array) -> Array:
-        """The origin of a joint, or halfway along its axis where that hides beside a pin."""
+        """Return the origin of a joint, or the middle of its axis if a pin would hide it."""
         position, parent = self.origins[joint], self.parents[joint]
         pins = [*self.outer[joint], *([self.origins[parent]] if parent else [])]
         previous_origin = self.origins[parent] if parent else self.outer[0][0]
@@ -162,7 +167,7 @@ class _MechanismProjection:
         return position + (float((previous_origin - position) @ axis) + length / 2) * axis
 
     def _create_slide(self, joint: int) -> SketchSlide:
-        """A prismatic joint between the inner end of its parent and the far end of its body."""
+        """Return a prismatic joint between its parent's origin and the far end of its body."""
         parent, position = self.parents[joint], self.origins[joint]
         axis = self.axes[joint] / max(float(np.linalg.norm(self.axes[joint])), 1e-9)
         outer = self.outer[joint] or [position]
@@ -172,7 +177,7 @@ class _MechanismProjection:
         value = float(self.q[column])
         chains = (self.chains[parent], self.chains[joint])
         carries_tip, name = joint in self.tip_supports, self.model.names[joint]
-        if self.axis_cosines[joint] > _MIN_PIN_COSINE:  # it moves towards whoever looks
+        if self.axis_cosines[joint] > _MIN_PIN_COSINE:  # it moves towards the viewer
             self.points[parent].append(position)
             self.points[joint].append(position)
             return SketchSlide(
@@ -235,7 +240,7 @@ class _MechanismProjection:
         )
 
     def _regions(self) -> dict[int, Array]:
-        """Corners of what each loop encloses: its pin, then the pins on both ways back."""
+        """Return the corners that each loop encloses: its pin and those of both branches."""
         regions = {}
         for number in range(1, len(self.loop_frames) // 2 + 1):
             (first_joint, position), (second_joint, _) = self.loop_frames[
@@ -255,7 +260,7 @@ class _MechanismProjection:
 
 
 def _distinct_points(points: Sequence[Array], size: float) -> Array:
-    """Points (k, 2) of a mechanism of some size without those that repeat an earlier one."""
+    """Return points (k, 2) without those that repeat an earlier one."""
     distinct: list[Array] = []
     for point in points:
         if not any(
@@ -263,3 +268,86 @@ def _distinct_points(points: Sequence[Array], size: float) -> Array:
         ):
             distinct.append(point)
     return np.array(distinct).reshape(-1, 2)
+
+
+class MachineOutline(NamedTuple):
+    """Outline of a machine in one configuration, in the coordinates of a section [m].
+
+    Attributes:
+        bodies: Hulls (k, 2) of bodies between their pins, those that carry the tip last.
+        cylinders: (c, 3, 2) closed end, mouth and rod's end.
+        stationary_hull: (k, 2) hull of the stationary parts; empty without supports.
+    """
+
+    bodies: list[Array]
+    cylinders: Array
+    stationary_hull: Array
+
+
+def machine_outline(
+    machine: Machine, frame: str, section: WorkspaceSection, q: Array
+) -> MachineOutline:
+    """Compute the outline of a machine in the plane through its slewing axis.
+
+    Args:
+        machine: The machine.
+        frame: Frame of the section.
+        section: The section; its plane turns with the slewing joint.
+        q: (nq,) closed configuration.
+    """
+    if machine.tip is None:
+        machine = dataclasses.replace(machine, tip=frame)
+    model, data = machine.model, machine.model.createData()
+    pin.framesForwardKinematics(model, data, machine.coordinates.configuration(q))
+    plane = DrawingPlane(
+        _forward_direction(machine, frame, section, data),
+        section.second_direction,
+        section.coordinate_names,
+    )
+    origin = plane.project(section.origin)
+    mechanism = project_mechanism(machine, q, plane)
+    bodies = [
+        convex_hull(body.points) - origin
+        for body in sorted(mechanism.bodies, key=lambda x: x.carries_tip)
+        if len(body.points) > 1
+    ]
+    slides = [
+        np.array([x.start, x.mouth, x.rod_outer_end]) - origin
+        for x in mechanism.slides
+        if not x.is_rail
+    ]
+    support_points = [
+        plane.project(data.oMf[machine.frame(x)].translation) for x in machine.supports
+    ]
+    stationary_hull = np.zeros((0, 2))
+    if support_points:
+        stationary_hull = (
+            convex_hull(
+                np.array([*support_points, *(position for position, _ in mechanism.ground)])
+            )
+            - origin
+        )
+    return MachineOutline(bodies, np.array(slides).reshape(-1, 3, 2), stationary_hull)
+
+
+def _forward_direction(
+    machine: Machine, frame: str, section: WorkspaceSection, data: pin.Data
+) -> Array:
+    """Return the direction (3,) of the section's first coordinate."""
+    if section.is_radial:
+        offset = data.oMf[machine.frame(frame)].translation - section.origin
+        offset = offset - (offset @ section.second_direction) * section.second_direction
+        length = float(np.linalg.norm(offset))
+        if length > 0:
+            return np.asarray(offset / length)
+        lateral = np.cross(section.second_direction, up_direction(machine))
+        return np.asarray(lateral if lateral.any() else np.eye(3)[0])
+    if section.slewing_joint is None:
+        return section.first_direction
+    home_data = machine.model.createData()
+    pin.forwardKinematics(
+        machine.model, home_data, machine.coordinates.configuration(machine.home)
+    )
+    joint = machine.model.getJointId(machine.active[section.slewing_joint])
+    slew_rotation = data.oMi[joint].rotation @ home_data.oMi[joint].rotation.T
+    return np.asarray(slew_rotation @ section.first_direction)

@@ -1,15 +1,24 @@
-"""Lines and symbols of kinematic diagrams, in sizes that do not depend on the machine's."""
+"""Canvas of a sketch: lines and symbols of kinematic diagrams, layout of the figure."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.path import Path
+from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
+from crane.machine import Machine
+from crane.recordings.recording_summary import DISPLAY_UNITS
+from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import INK_COLOUR
+from crane.view.sketch.sketch_elements import DrawingPlane, SketchMechanism
 
 HullCorner = tuple[float, ...]
 
@@ -26,7 +35,7 @@ TIP_MARKER: Any = {"marker": "+", "markersize": 17.0, "markeredgewidth": 1.3}
 
 
 class SketchCanvas:
-    """Draws onto axes in metres, with widths in points; remembers what labels must not cover.
+    """Draws on axes in metres, with widths in points, and collects what labels must not cover.
 
     Args:
         axes: Axes of equal scales.
@@ -43,7 +52,7 @@ class SketchCanvas:
         self.occupied_discs: list[tuple[Array, float]] = []
 
     def draw_line(self, points: Array, colour: str, width: float, **options: Any) -> None:
-        """A line through points (k, 2) [m], its width in points."""
+        """Draw a line through points (k, 2) [m], its width in points."""
         options = {"solid_capstyle": "round", "solid_joinstyle": "round"} | options
         self.axes.plot(*points.T, color=colour, linewidth=width, **options)
         self.occupied_segments += list(np.stack([points[:-1], points[1:]], axis=1))
@@ -51,7 +60,7 @@ class SketchCanvas:
     def draw_polygon(
         self, points: Array, colour: str, width: float, fill_opacity: float, z_order: float
     ) -> None:
-        """A closed line around corners (k, 2) [m], filled with a tint of its colour."""
+        """Draw a polygon with corners (k, 2) [m], filled with a tint of its colour."""
         closed = np.vstack([points, points[:1]])
         self.axes.add_patch(
             Polygon(points, facecolor=colour, alpha=fill_opacity, linewidth=0, zorder=z_order)
@@ -61,7 +70,7 @@ class SketchCanvas:
     def draw_box(
         self, start: Array, end: Array, width: float, colour: str, z_order: float
     ) -> None:
-        """A white rectangle about the line from start to end [m], its width in points."""
+        """Draw a white rectangle about the line from start to end [m], its width in points."""
         axis = (end - start) / max(float(np.linalg.norm(end - start)), 1e-12)
         half_width = np.array([-axis[1], axis[0]]) * width / 2 * self.point_size
         corners = np.array(
@@ -81,18 +90,18 @@ class SketchCanvas:
         self.occupied_segments += list(np.stack([closed[:-1], closed[1:]], axis=1))
 
     def draw_joint(self, name: str, position: Array) -> None:
-        """A pin of the tree."""
+        """Draw a revolute joint of the tree."""
         self._draw_marker(position, 6.0, f"joint {name}", JOINT_MARKER)
         self.occupied_discs.append((position, 4.0))
 
     def draw_loop(self, name: str, position: Array, mate: Array) -> None:
-        """A pin that closes a loop: a ring where its first body has it, a dot for its second."""
+        """Draw a loop joint: a ring on its first body, a dot on its second."""
         self._draw_marker(position, 5.5, f"loop {name}", LOOP_MARKER)
         self._draw_marker(mate, 6.5, f"loop {name} mate", DOT_MARKER)
         self.occupied_discs.append((position, 6.0))
 
     def draw_collar(self, name: str, position: Array, axis: Array) -> None:
-        """A joint that turns about a line in the plane, drawn with that line."""
+        """Draw a revolute joint whose axis lies in the plane."""
         axis_point = axis * self.point_size
         self.draw_box(position - 7 * axis_point, position + 7 * axis_point, 11.0, INK_COLOUR, 4.5)
         axis_line = np.array([position - 20 * axis_point, position + 20 * axis_point])
@@ -106,7 +115,7 @@ class SketchCanvas:
     def draw_ground(
         self, position: Array, down_direction: Array, ground_gap: float | None
     ) -> None:
-        """What stands still: a support under a pin, or a hatched line below, so many points."""
+        """Draw the ground: a support under a pin, or a hatched line below a point [points]."""
         lateral = np.array([-down_direction[1], down_direction[0]])
         ground_point = (
             position
@@ -126,7 +135,7 @@ class SketchCanvas:
         )
 
     def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
-        """A line from start to end [m], hatched on the side of the unit vector down."""
+        """Draw a line from start to end [m], hatched on the side of a unit vector."""
         self.draw_line(np.array([start, end]), INK_COLOUR, 1.2, zorder=2)
         direction = (end - start) / np.linalg.norm(end - start)
         count = max(int(np.linalg.norm(end - start) / (5 * self.point_size)), 2)
@@ -141,18 +150,18 @@ class SketchCanvas:
         self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
 
     def draw_centre_of_mass(self, position: Array) -> None:
-        """A circle with two black quarters."""
+        """Draw a centre of mass."""
         for z_order, style in zip((5.2, 5.3, 5.3), (CENTRE_MARKER, *QUARTER_MARKERS), strict=True):
             self._draw_marker(position, z_order, "centre of mass", style)
         self.occupied_discs.append((position, 4.5))
 
     def draw_tip(self, position: Array) -> None:
-        """A cross whose arms stick out of whatever pin is there."""
+        """Draw the tip as a cross that is larger than a pin."""
         self._draw_marker(position, 5.4, "tip", TIP_MARKER)
         self.occupied_discs.append((position, 6.0))
 
     def draw_number(self, number: int, position: Array) -> None:
-        """The number of a loop, within what it encloses."""
+        """Draw the number of a loop in its region."""
         self.axes.text(
             float(position[0]),
             float(position[1]),
@@ -177,7 +186,7 @@ class SketchCanvas:
 
 
 def marker_options(style: dict[str, Any]) -> dict[str, Any]:
-    """Options of a line that shows a symbol alone."""
+    """Return options of a line that shows only its marker."""
     default_style = {
         "linestyle": "none",
         "color": INK_COLOUR,
@@ -188,7 +197,7 @@ def marker_options(style: dict[str, Any]) -> dict[str, Any]:
 
 
 def convex_hull(points: Array) -> Array:
-    """Corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
+    """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
     ordered = sorted(map(tuple, points.tolist()))
 
     def turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
@@ -204,3 +213,117 @@ def convex_hull(points: Array) -> Array:
         return chain[:-1]
 
     return np.array(half(ordered) + half(ordered[::-1]) or ordered)
+
+
+_MAX_WIDTH, _MAX_HEIGHT, _MIN_WIDTH = 454.0, 353.0, 331.0  # of the axes [points]
+_MARGIN = 36.0  # around the mechanism [points]
+_LEFT_MARGIN, _RIGHT_MARGIN, _BOTTOM_MARGIN = 46.0, 12.0, 38.0  # around the axes [points]
+_LINE_HEIGHT = 12.5  # height of a line of words [points]
+
+
+def format_joint_symbol(name: str) -> str:
+    """Return a joint's name as a label: q1 as q with index 1, X_lift as X with index lift."""
+    if match := re.fullmatch(r"([A-Za-z])(\d+|_[A-Za-z]+)", name):
+        return f"${match[1]}_{{\\mathrm{{{match[2].removeprefix('_')}}}}}$"
+    return escape_label(name)
+
+
+def create_sketch_layout(
+    mechanism: SketchMechanism,
+    plane: DrawingPlane,
+    machine: Machine,
+    q: Array,
+    legend: Sequence[tuple[Line2D, ...]],
+    other_mechanisms: Sequence[SketchMechanism] = (),
+) -> tuple[Figure, SketchCanvas]:
+    """Return a figure with axes for the mechanism, and the canvas of the axes.
+
+    Args:
+        mechanism: Mechanism that has to fit.
+        plane: Plane with the labels of its coordinates.
+        machine: Machine for the heading.
+        q: (nq,) configuration.
+        legend: Entries of the legend, each of superposed lines.
+        other_mechanisms: Further mechanisms that have to fit.
+    """
+    corners = np.array([_mechanism_bounds(fitted) for fitted in (mechanism, *other_mechanisms)])
+    lower, upper = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    span = np.maximum(upper - lower, 0.05 * mechanism.size)
+    available = np.array([_MAX_WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN
+    point_size = float((span / available).max())  # [m]
+    axes_width, axes_height = np.maximum(span / point_size + 2 * _MARGIN, [_MIN_WIDTH, 0.0])
+    coordinate_lines = _coordinate_lines(machine, q, int((axes_width + _LEFT_MARGIN) / 5.2))
+    columns = max(int((axes_width + _LEFT_MARGIN) / 92), 1)
+    heading_height = 30.0 + _LINE_HEIGHT * (len(coordinate_lines) + -(-len(legend) // columns))
+    width, height = (
+        axes_width + _LEFT_MARGIN + _RIGHT_MARGIN,
+        axes_height + _BOTTOM_MARGIN + heading_height,
+    )
+    figure = Figure(figsize=(width / 72, height / 72))
+    axes = figure.add_axes(
+        (_LEFT_MARGIN / width, _BOTTOM_MARGIN / height, axes_width / width, axes_height / height)
+    )
+    (x, y), centre = np.array([axes_width, axes_height]) / 2 * point_size, (lower + upper) / 2
+    axes.set(
+        xlim=(centre[0] - x, centre[0] + x),
+        ylim=(centre[1] - y, centre[1] + y),
+        xlabel=f"{plane.labels[0]} [m]",
+        ylabel=f"{plane.labels[1]} [m]",
+        aspect="equal",
+    )
+    axes.grid(visible=False)
+    for axis, length in ((axes.xaxis, axes_width), (axes.yaxis, axes_height)):
+        axis.set_major_locator(MaxNLocator(max(int(length / 55), 2), steps=[1, 2, 5, 10]))
+    left = 12 / width
+    name = escape_label(machine.name.replace("_", " "))
+    figure.text(left, 1 - 8 / height, name, va="top", fontsize=11, fontweight="bold")
+    for row, line in enumerate(coordinate_lines):
+        line_y = 1 - (23 + _LINE_HEIGHT * row) / height
+        figure.text(left, line_y, line, va="top", fontsize=8, color="#555555")
+    figure.legend(
+        handles=list(legend),
+        labels=[str(entry[0].get_label()) for entry in legend],
+        handler_map={tuple: HandlerTuple(ndivide=1, pad=0.0)},
+        loc="upper left",
+        bbox_to_anchor=(left, 1 - (25 + _LINE_HEIGHT * len(coordinate_lines)) / height),
+        ncols=columns,
+        fontsize=8,
+        borderaxespad=0.0,
+        borderpad=0.0,
+        handlelength=1.6,
+        columnspacing=1.4,
+    )
+    return figure, SketchCanvas(axes, point_size)
+
+
+def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
+    """Return the lower and upper corner (2,) of all points [m]."""
+    points = [drawn_pin.position for drawn_pin in mechanism.pins] + [
+        item.position for item in mechanism.collars
+    ]
+    points += [end for x in mechanism.slides for end in (x.start, x.mouth, x.rod_outer_end)]
+    points += [corner for body in mechanism.bodies for corner in body.points]
+    points += [position for position, _ in mechanism.ground]
+    return np.min(points, axis=0), np.max(points, axis=0)
+
+
+def _coordinate_lines(machine: Machine, q: Array, line_length: int) -> list[str]:
+    """Return the active coordinates as lines of limited length."""
+    lines: list[str] = []
+    length = line_length
+    for joint, value in zip(machine.active, q[machine.closure.active], strict=True):
+        unit, scale = DISPLAY_UNITS[machine.unit(joint)]
+        number = f"{scale * value:.1f}".removesuffix(".0").replace("-", "\u2212")
+        number = "0" if number == "\u22120" else number
+        coordinate_text = (
+            f"{format_joint_symbol(joint)} = "
+            f"{number}{'°' if unit == 'deg' else chr(0x2009) + unit}"
+        )
+        text_length = len(joint) + len(number) + 8
+        if length + text_length > line_length:
+            lines.append(coordinate_text)
+            length = text_length
+        else:
+            lines[-1] += f",   {coordinate_text}"
+            length += text_length
+    return lines

@@ -1,4 +1,4 @@
-"""The mechanism of a machine as a figure: what every text on it begins with."""
+"""Sketch of a mechanism as a figure."""
 
 import re
 from collections.abc import Sequence
@@ -17,7 +17,6 @@ from crane.common.samples import Array
 from crane.machine import Machine
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
-from crane.view.sketch.drawing_plane import find_plane
 from crane.view.sketch.label_placement import SketchLabel, find_clear_point, place_labels
 from crane.view.sketch.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
 from crane.view.sketch.sketch_canvas import (
@@ -28,10 +27,17 @@ from crane.view.sketch.sketch_canvas import (
     QUARTER_MARKERS,
     SketchCanvas,
     convex_hull,
+    create_sketch_layout,
+    format_joint_symbol,
     marker_options,
 )
-from crane.view.sketch.sketch_elements import SketchBody, SketchMechanism, SketchPin, SketchSlide
-from crane.view.sketch.sketch_layout import create_sketch_layout, format_joint_symbol
+from crane.view.sketch.sketch_elements import (
+    SketchBody,
+    SketchMechanism,
+    SketchPin,
+    SketchSlide,
+    find_plane,
+)
 
 CHAIN_COLOURS = (
     "#1f5fa8", "#d0661c", "#2f8050", "#8a4a9c", "#b03a48", "#2b8c9c", "#8c7a1e", "#5a5f66",
@@ -49,7 +55,7 @@ REGION_COLOURS = (
 GROUND_COLOUR, GHOST_COLOUR = "#777777", "#9a4d6f"
 _GHOST_DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 4)))
 _MIN_POLYGON_WIDTH = 7.0  # width below which a polygon is drawn as a line [points]
-_NUMBER_CLEARANCE = 9.0  # what the number of a loop needs around it [points]
+_NUMBER_CLEARANCE = 9.0  # clearance around the number of a loop [points]
 
 
 def sketch(
@@ -64,17 +70,18 @@ def sketch(
 
     Args:
         machine: The machine.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
-        q_a: (n,) active coordinates within their limits [m], [rad]; home if not given.
-        plane: "xy", "xz" or "yz" to look along an axis of the world; the plane that the machine
-            moves in if not given.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
+        q_a: (n,) active coordinates within their limits [m], [rad]; home by default.
+        plane: "xy", "xz" or "yz" for a view along an axis of the world; by default the plane in
+            which the machine moves.
         show_centres_of_mass: Whether to mark the centres of mass.
-        other_configurations: Postures (nq,) to be drawn dashed behind it, such as other
-            assemblies.
+        other_configurations: Configurations (nq,) that are drawn dashed, such as other assembly
+            modes.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
-        InputError: Wrong shape or not finite, unknown view, or a machine that moves in no plane.
+        InputError: A value has the wrong shape or is not finite, the view is unknown, or the
+            machine does not move in a plane.
         LimitError: A coordinate lies outside of its limits.
         ClosureError: The loops cannot be closed there.
     """
@@ -84,6 +91,7 @@ def sketch(
     )
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def sketch_figure(
     machine: Machine,
     q_a: ArrayLike | None = None,
@@ -91,12 +99,12 @@ def sketch_figure(
     show_centres_of_mass: bool = False,
     other_configurations: Sequence[Array] = (),
 ) -> Figure:
-    """The figure of a mechanism; see `sketch`.
+    """Return the figure of a mechanism; see `sketch`.
 
-    Bodies are lines and polygons between their pins in the colours of the sub-chains, those that
-    carry the tip with wider lines. Pins of the tree are circles, pins that close a loop are rings
-    with a dot, joints about a line in the plane are boxes on that line, prismatic joints are
-    cylinders. Each loop has a number and a tint. Axes are equal, in metres.
+    Bodies are lines and polygons between their pins in the colours of the sub-chains, with wider
+    lines if they carry the tip. Revolute joints of the tree are circles, loop joints are rings
+    with a dot, revolute joints about a line in the plane are boxes on that line, prismatic joints
+    are cylinders. Each loop has a number and a tint. Axes are equal, in metres.
     """
     if machine.coordinates.floating_base_columns:
         columns = [at + i for at in machine.coordinates.floating_base_columns for i in range(6)]
@@ -110,36 +118,35 @@ def sketch_figure(
     drawing_plane = find_plane(machine, q, plane)
     mechanism = project_mechanism(machine, q, drawing_plane)
     ghosts = [project_mechanism(machine, other, drawing_plane) for other in other_configurations]
-    with mpl.rc_context(FIGURE_STYLE):
-        legend = _legend(machine, show_centres_of_mass) + [
-            (_ghost_line(i),) for i in range(len(ghosts))
-        ]
-        figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
-        _draw_regions(canvas, mechanism)
-        for i, ghost in enumerate(ghosts):
-            _draw_ghost(canvas, ghost, mechanism, i)
-        for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
-            _draw_body(canvas, body)
-        for slide in mechanism.slides:
-            _draw_slide(canvas, slide)
-        for position, down_direction in mechanism.ground:
-            canvas.draw_ground(
-                position, down_direction, _ground_gap(mechanism, position, down_direction)
-            )
-        for item in mechanism.collars:
-            canvas.draw_collar(item.name, item.position, item.axis)
-        if show_centres_of_mass:
-            _draw_centres(canvas, mechanism)
-        if mechanism.tip is not None:
-            canvas.draw_tip(mechanism.tip)
-        _draw_pins(canvas, mechanism)
-        _number_regions(canvas, mechanism)
-        place_labels(canvas, _create_labels(mechanism))
+    legend = _legend(machine, show_centres_of_mass) + [
+        (_ghost_line(i),) for i in range(len(ghosts))
+    ]
+    figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
+    _draw_regions(canvas, mechanism)
+    for i, ghost in enumerate(ghosts):
+        _draw_ghost(canvas, ghost, mechanism, i)
+    for body in sorted(mechanism.bodies, key=lambda body: body.carries_tip):
+        _draw_body(canvas, body)
+    for slide in mechanism.slides:
+        _draw_slide(canvas, slide)
+    for position, down_direction in mechanism.ground:
+        canvas.draw_ground(
+            position, down_direction, _ground_gap(mechanism, position, down_direction)
+        )
+    for item in mechanism.collars:
+        canvas.draw_collar(item.name, item.position, item.axis)
+    if show_centres_of_mass:
+        _draw_centres(canvas, mechanism)
+    if mechanism.tip is not None:
+        canvas.draw_tip(mechanism.tip)
+    _draw_pins(canvas, mechanism)
+    _number_regions(canvas, mechanism)
+    place_labels(canvas, _create_labels(mechanism))
     return figure
 
 
 def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, ...]]:
-    """One entry per sub-chain and per kind of symbol, each of lines on top of each other."""
+    """Return one entry per sub-chain and kind of symbol, each of superposed lines."""
     entries: list[tuple[Line2D, ...]] = []
     for i, chain in enumerate(machine.chains):
         if not chain.joints:
@@ -160,7 +167,7 @@ def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, 
 
 
 def _ghost_line(index: int, points: Array | None = None) -> Line2D:
-    """A dashed line in the look of another assembly, without points that of the legend."""
+    """Return a dashed line of another assembly mode; without points for the legend."""
     x, y = np.zeros((2, 0)) if points is None else points.T
     label = f"other assembly {index + 1}"
     style = _GHOST_DASHES[index % len(_GHOST_DASHES)]
@@ -172,7 +179,7 @@ def _ghost_line(index: int, points: Array | None = None) -> Line2D:
 def _draw_ghost(
     canvas: SketchCanvas, ghost: SketchMechanism, home_mechanism: SketchMechanism, index: int
 ) -> None:
-    """The lines of another assembly, of what is elsewhere than at home."""
+    """Draw the parts of another assembly mode that are not at home."""
     outlines = [
         (x.points, y.points) for x, y in zip(ghost.bodies, home_mechanism.bodies, strict=True)
     ]
@@ -198,7 +205,7 @@ def _draw_ghost(
 
 
 def _draw_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
-    """A tint in what each loop encloses, the small ones above the large."""
+    """Tint the region of each loop, small regions above large ones."""
     for number, corners in sorted(
         mechanism.regions.items(), key=lambda item: -_polygon_area(item[1])
     ):
@@ -225,7 +232,7 @@ def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
 def _ground_gap(
     mechanism: SketchMechanism, position: Array, down_direction: Array
 ) -> float | None:
-    """How far below a point the ground is [points]; None for a pin, which has a support."""
+    """Return the distance from a point down to the ground [points]; None for a pin."""
     tolerance = COINCIDENCE_TOLERANCE * mechanism.size
     if any(
         np.abs(drawn_pin.position - position).max() < tolerance for drawn_pin in mechanism.pins
@@ -272,7 +279,7 @@ def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
         CHAIN_COLOURS[i % len(CHAIN_COLOURS)] for i in (slide.barrel_chain, slide.rod_chain)
     )
     point, barrel = canvas.point_size, slide.mouth - slide.start
-    if not barrel.any():  # seen along its axis
+    if not barrel.any():  # the axis points towards the viewer
         half_width = np.array([5.0, 0.0]) * point
         canvas.draw_box(slide.start - half_width, slide.start + half_width, 10.0, rod_colour, 3)
         return
@@ -307,7 +314,7 @@ def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
 
 
 def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
-    """One label per joint, loop and tip; joints at the same pin share one."""
+    """Return one label per joint, loop and tip; joints at the same pin share one."""
     labels = []
     remaining = [shown for shown in mechanism.pins if not shown.loop_number]
     while remaining:
@@ -348,7 +355,7 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
 
 
 def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
-    """Names with their numbers in order, q2 before q10."""
+    """Return names in natural order, q2 before q10."""
     return sorted(
         (drawn_pin.name for drawn_pin in pins),
         key=lambda name: [(x.isdigit(), x.zfill(9)) for x in re.split(r"(\d+)", name)],
@@ -356,7 +363,7 @@ def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
 
 
 def _extent_across(points: Array) -> float:
-    """Extent (m) of points (k, 2) across the line through them."""
+    """Return the extent [m] of points (k, 2) across the line through them."""
     normal = np.linalg.svd(points - points.mean(axis=0))[2][-1]
     return float(np.ptp(points @ normal))
 

@@ -139,10 +139,10 @@ function show() {
   byId("load").replaceChildren(load, " ", make("small", {}, place));
   byId("why").textContent = data.causes[here[CAUSE]] ?? "";
   const order = here[EACH].map((x, k) => [x, k]).filter(([x]) => x !== null).sort((a, b) => a[0] - b[0]);
-  byId("causes").replaceChildren(make("table", {}, row("th", "cause", "kg"), ...order.map(([x, k]) =>
+  byId("causes").replaceChildren(make("table", {}, row("th", "limiting factor", "kg"), ...order.map(([x, k]) =>
     row("td", [make("i", { style: `background:${tint(k)}` }), data.causes[k]], kg(x)))));
   const pressed = here[PRESSURES].some((x) => x.length);
-  const head = ["drive", "at", ...(pressed ? ["A [bar]", "B [bar]", "at most"] : [])];
+  const head = ["drive", "stroke", ...(pressed ? ["A [bar]", "B [bar]", "limit"] : [])];
   byId("drives").replaceChildren(make("table", {}, row("th", ...head), ...data.drives.map((one, i) =>
     row("td", one.joint, `${number(here[STROKES][i], 5)} ${one.unit}`,
       ...(pressed ? pressures(here[PRESSURES][i], one.limits) : [])))));

@@ -1,4 +1,4 @@
-"""The hydraulic circuit as a drawing of graphic symbols (ISO 1219-1)."""
+"""Drawings of hydraulic circuits with graphic symbols (ISO 1219-1)."""
 
 from crane.view.sketch.circuit.circuit_drawing import circuit_figure, sketch_circuit
 

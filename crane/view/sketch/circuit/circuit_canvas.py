@@ -1,4 +1,4 @@
-"""What a circuit is drawn with: wires that belong to nets, ports, lines, words, in points."""
+"""Canvas of a circuit drawing: wires of nets, ports, lines and texts, in points."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,6 @@ SMALL_TEXT_SIZE, NAME_TEXT_SIZE, MIN_TEXT_SIZE = 6.3, 8.0, 5.2  # sizes of words
 
 
 def _fit_text(text: str, size: float, available_width: float, weight: str) -> tuple[str, float]:
-    """A text and its size, so that it is no wider than its room."""
     font = FontProperties(family="DejaVu Sans", weight=weight)
 
     def measure_width(text: str) -> float:
@@ -42,13 +41,13 @@ def _fit_text(text: str, size: float, available_width: float, weight: str) -> tu
 
 @dataclass(frozen=True)
 class SymbolPose:
-    """Where a symbol stands, drawn about the origin with its flow upwards.
+    """Pose of a symbol, which is drawn about the origin with its flow upwards.
 
     Attributes:
         x: To the right [points].
         y: Upwards [points].
         quarter_turns: Quarter turns counterclockwise.
-        is_mirrored: Whether left and right are changed before.
+        is_mirrored: Whether the symbol is mirrored left to right before it is turned.
     """
 
     x: float
@@ -57,7 +56,7 @@ class SymbolPose:
     is_mirrored: bool = False
 
     def __call__(self, *points: SheetPoint) -> list[SheetPoint]:
-        """Points on the sheet."""
+        """Transform points to the sheet."""
         out = []
         for x, y in points:
             x, y = (-x if self.is_mirrored else x), y
@@ -67,16 +66,16 @@ class SymbolPose:
         return out
 
     def transform_point(self, x: float, y: float) -> SheetPoint:
-        """One point on the sheet."""
+        """Transform one point to the sheet."""
         return self((x, y))[0]
 
 
 @dataclass(frozen=True)
 class CircuitWire:
-    """A straight piece of a line.
+    """A straight segment of a line.
 
     Attributes:
-        net: What it belongs to; pieces of two nets are not joined, even where they cross.
+        net: Net of the segment; segments of different nets are not connected, even if they cross.
         start: [points]
         end: [points]
     """
@@ -86,7 +85,7 @@ class CircuitWire:
     end: SheetPoint
 
     def contains(self, point: SheetPoint) -> bool:
-        """Whether a point lies on it."""
+        """Return whether a point lies on the wire."""
         (a, b), (c, d), (x, y) = self.start, self.end, point
         is_within = min(a, c) - _COORDINATE_TOLERANCE <= x <= max(a, c) + _COORDINATE_TOLERANCE
         is_within = (
@@ -100,7 +99,7 @@ class CircuitWire:
 
 @dataclass(frozen=True)
 class SymbolPort:
-    """Where a symbol is joined to a net.
+    """Connection of a symbol to a net.
 
     Attributes:
         component: The symbol's name.
@@ -114,14 +113,14 @@ class SymbolPort:
 
 
 class CircuitCanvas:
-    """Draws onto axes whose coordinates are points.
+    """Draws on axes whose coordinates are points.
 
     Args:
         axes: Axes of equal scales.
 
     Attributes:
-        wires: All pieces of wires.
-        ports: Of all symbols.
+        wires: Segments of all wires.
+        ports: Ports of all symbols.
     """
 
     def __init__(self, axes: Axes):
@@ -130,7 +129,7 @@ class CircuitCanvas:
         self.ports: list[SymbolPort] = []
 
     def draw_wire(self, net: str, *points: SheetPoint, is_signal: bool = False) -> None:
-        """A line of a net through points; of a signal it is dashed."""
+        """Draw a line of a net through points; dashed for a signal."""
         distinct_points = [points[0]]
         distinct_points += [b for a, b in zip(points, points[1:], strict=False) if a != b]
         if len(distinct_points) < 2:
@@ -145,11 +144,11 @@ class CircuitCanvas:
         self.draw_line(distinct_points, zorder=2.0, gid=f"wire {net}", **style)
 
     def add_port(self, component: str, net: str, position: SheetPoint) -> None:
-        """Note where a symbol is joined."""
+        """Add a port of a symbol."""
         self.ports.append(SymbolPort(component, net, position))
 
     def draw_line(self, points: Sequence[SheetPoint], **options: Any) -> None:
-        """A line of a symbol."""
+        """Draw a line of a symbol."""
         style: dict[str, Any] = {
             "color": INK_COLOUR, "linewidth": 0.8, "zorder": 3.2, "solid_capstyle": "round",
             "solid_joinstyle": "round",
@@ -159,7 +158,7 @@ class CircuitCanvas:
     def draw_shape(
         self, points: Sequence[SheetPoint], is_filled: bool = False, **options: Any
     ) -> None:
-        """A closed outline, white or filled."""
+        """Draw a closed outline, white or filled."""
         style = {
             "facecolor": INK_COLOUR if is_filled else "white",
             "edgecolor": INK_COLOUR,
@@ -170,7 +169,7 @@ class CircuitCanvas:
         self.axes.add_patch(Polygon(np.array(points, dtype=float), closed=True, **style))
 
     def draw_circle(self, position: SheetPoint, radius: float, **options: Any) -> None:
-        """A circle, white unless told otherwise."""
+        """Draw a circle, white by default."""
         style = {
             "facecolor": "white",
             "edgecolor": INK_COLOUR,
@@ -182,7 +181,7 @@ class CircuitCanvas:
     def draw_arrow(
         self, start: SheetPoint, end: SheetPoint, *, size: float = 3.2, **options: Any
     ) -> None:
-        """A line with a filled head at its end."""
+        """Draw a line with a filled head at its end."""
         first, second = np.array(start), np.array(end)
         direction = (second - first) / float(np.linalg.norm(second - first))
         normal = np.array([-direction[1], direction[0]])
@@ -195,7 +194,7 @@ class CircuitCanvas:
         self.draw_shape(corners, is_filled=True, linewidth=0.0, zorder=3.3)
 
     def draw_spring(self, start: SheetPoint, end: SheetPoint, *, half_width: float = 2.2) -> None:
-        """A zigzag."""
+        """Draw a spring."""
         first, second = np.array(start), np.array(end)
         direction = second - first
         normal = (
@@ -210,7 +209,7 @@ class CircuitCanvas:
         self, x: float, y: float, text: str, gid: str, size: float = SMALL_TEXT_SIZE,
         available_width: float = math.inf, **options: Any,
     ) -> None:  # fmt: skip
-        """A line of words, its middle at y; smaller and cut where it would not fit its room."""
+        """Write a line of text centred at y; reduced and cut if it does not fit the width."""
         if len(text) * size > available_width:  # no letter is wider than its height
             text, size = _fit_text(text, size, available_width, options.get("weight", "normal"))
         style: dict[str, Any] = {"ha": "center", "va": "center", "zorder": 9} | options
@@ -218,7 +217,7 @@ class CircuitCanvas:
         self.axes.text(x, y, text, fontsize=size, gid=gid, path_effects=halo, **style)
 
     def draw_junctions(self) -> None:
-        """Mark where three pieces of a net or more meet."""
+        """Mark points where three or more wires of a net meet."""
         ends = sorted({(w.net, at) for w in self.wires for at in (w.start, w.end)})
         for net, position in ends:
             if any(

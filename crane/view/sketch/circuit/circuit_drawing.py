@@ -1,4 +1,4 @@
-"""The circuit of a machine as a figure: rails, functions above them, pumps and the rest below."""
+"""Drawing of a hydraulic circuit: rails, functions above, pumps and other items below."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,13 +15,17 @@ from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
 from crane.view.sketch.circuit import circuit_section
 from crane.view.sketch.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
-from crane.view.sketch.circuit.circuit_section import CircuitFunction, CircuitSection
-from crane.view.sketch.circuit.open_centre_lines import OpenCentreLines
-from crane.view.sketch.circuit.spool_symbol import SPOOL_HEIGHT
+from crane.view.sketch.circuit.circuit_functions import (
+    CircuitFunction,
+    OpenCentreLines,
+    valve_rows,
+)
+from crane.view.sketch.circuit.circuit_section import CircuitSection
 from crane.view.sketch.circuit.supply_items import SupplyItem, create_supply_items
+from crane.view.sketch.circuit.valve_symbols import SPOOL_HEIGHT
 
 _FUNCTIONS_PER_ROW = 4  # functions beside each other
-_RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest to what hangs on it
+_RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest rail to items
 _MARGIN, _HEADING_HEIGHT = 10.0, 26.0  # around all of it
 _MIN_WIRE_DISTANCE = 3.0  # least distance of wires
 _MAX_LABEL_LENGTH = 24  # letters of a rail's name
@@ -32,7 +36,7 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
 
     Args:
         machine: A machine with hydraulics.
-        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+        path: File to write; the suffix .png, .svg or .pdf determines the format.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -41,11 +45,12 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
     write_figure(path, lambda: circuit_figure(machine)[0])
 
 
+@mpl.rc_context(FIGURE_STYLE)
 def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
-    """The figure of a circuit, and what it was drawn with; see `sketch_circuit`.
+    """Return the figure of a circuit and its canvas; see `sketch_circuit`.
 
     Functions stand side by side in the order of the active joints, at most four in a row, each
-    over the rails that it is joined to; pumps, tank, accumulators and elements hang below the
+    above the rails that it is connected to; pumps, tank, accumulators and elements are below the
     lowest rails. Coordinates are points.
     """
     hydraulics = machine.hydraulics
@@ -53,12 +58,11 @@ def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
         raise InputError(
             f"'{machine.name}' has no hydraulic circuit, sketch its mechanism or add 'hydraulics'"
         )
-    with mpl.rc_context(FIGURE_STYLE):
-        return _CircuitDrawing(machine, hydraulics).draw()
+    return _CircuitDrawing(machine, hydraulics).draw()
 
 
 class _CircuitDrawing:
-    """A circuit as it is laid out."""
+    """Layout of a circuit."""
 
     def __init__(self, machine: Machine, hydraulics: Hydraulics):
         self._machine, self._hydraulics = machine, hydraulics
@@ -108,7 +112,7 @@ class _CircuitDrawing:
         return figure, canvas
 
     def _used_nets(self) -> list[list[str]]:
-        """Nets that have a rail, by row; the last row of functions is the first that hangs."""
+        """Return the nets with a rail by row; items hang below the last row of functions."""
         rows: list[set[str]] = []
         for k, functions in enumerate(self._function_rows):
             row = {net for x in functions for net in x.rails.values()}
@@ -131,16 +135,16 @@ class _CircuitDrawing:
         )
 
     def _valve_height(self, row: int) -> float:
-        """Height of the valves above the highest rail."""
+        """Return the height of the valves above the highest rail."""
         functions = self._function_rows[row]
         text_height = 4 + 7.6 * max(len(x.valve_texts) for x in functions)
         required_height = 12 + max(max(x.height_below for x in functions), text_height)
         return required_height + 4.0 * self._open_centres.line_count(row) + 2
 
     def _actuator_height(self, row: int) -> float:
-        """Height of the actuators' middle above the valves."""
+        """Return the height of the actuators' middle above the valves."""
         functions = self._function_rows[row]
-        rows = max(sum(h for _, h in circuit_section.valve_rows(x)) for x in functions)
+        rows = max(sum(h for _, h in valve_rows(x)) for x in functions)
         return rows + 20 + (6 if self._open_centres.line_count(row) else 0)
 
     def _row_height(self, row: int, rail_count: int) -> float:
@@ -253,7 +257,7 @@ def _circuit_functions(machine: Machine, hydraulics: Hydraulics) -> list[Circuit
 def _split_into_rows(
     functions: Sequence[CircuitFunction], count: int
 ) -> list[list[CircuitFunction]]:
-    """Rows of nearly equal length, the longer ones first, with the nets of open centres."""
+    """Split functions into rows of similar length, with the nets of open centres."""
     nets: dict[str, int] = {}
     rows: list[list[CircuitFunction]] = []
     remaining = iter(functions)
@@ -272,7 +276,7 @@ def _split_into_rows(
 
 
 def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[SupplyItem]]:
-    """Items in rows that are at most so wide; what must stay together is in the first."""
+    """Pack items into rows of limited width; items with `stays_in_row` stay together."""
     rows: list[list[SupplyItem]] = [[]]
     for item in items:
         used_width = sum(x.width for x in rows[-1])
@@ -285,7 +289,7 @@ def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[Supp
 def _rail_nets(
     hydraulics: Hydraulics, functions: Sequence[CircuitFunction], centres: OpenCentreLines
 ) -> list[str]:
-    """All nets that may have a rail, from the top."""
+    """Return all nets that may have a rail, from the top."""
     signals = [f"LS {name}" for name in hydraulics.pumps]
     signals += [f"N {name}" for name in hydraulics.pumps]
     nodes = [TANK_NODE, *hydraulics.pumps, *hydraulics.lines, *hydraulics.accumulators]
@@ -294,7 +298,6 @@ def _rail_nets(
 
 
 def _rail_label(hydraulics: Hydraulics, net: str) -> str:
-    """What a rail is called."""
     kind, _, name = net.partition(" ")
     is_single_pump = len(hydraulics.pumps) == 1
     label = net

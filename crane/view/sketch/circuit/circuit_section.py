@@ -1,10 +1,9 @@
-"""One function of a circuit: its valve above the rails, and its actuator on top."""
+"""Section of a circuit drawing: the valve of one function above the rails, and its actuator."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-from crane.hydraulics.circuit_elements import TANK_NODE, Supply
-from crane.hydraulics.components import CounterbalanceValve, Cylinder, Valve
+from crane.hydraulics.circuit_elements import TANK_NODE
+from crane.hydraulics.components import CounterbalanceValve
 from crane.view.plots.figure_text import escape_label
 from crane.view.sketch.circuit import machine_symbols, valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import (
@@ -13,144 +12,36 @@ from crane.view.sketch.circuit.circuit_canvas import (
     SheetPoint,
     SymbolPose,
 )
-from crane.view.sketch.circuit.format_quantities import (
+from crane.view.sketch.circuit.circuit_functions import CircuitFunction, port_lane, valve_rows
+from crane.view.sketch.circuit.valve_symbols import (
+    SPOOL_HEIGHT,
+    SpoolSymbol,
     format_area,
     format_displacement,
     format_flow,
     format_number,
     format_pressure,
 )
-from crane.view.sketch.circuit.spool_symbol import SPOOL_HEIGHT, SpoolSymbol
-from crane.view.sketch.sketch_layout import format_joint_symbol
+from crane.view.sketch.sketch_canvas import format_joint_symbol
 
 SECTION_WIDTH = 122.0
 CHAMBER_LANE = 14.0  # of chambers, from the section's middle
 _TAP_LANE = 55.0  # of chambers that something else is joined to, from the middle
 _LINE_HEIGHT = 7.6  # height of a line of words
-_PORT_LANES = {"Ta": -26.0, "LS": -20.0, "P": 0.0, "T": 12.0}
 _PORT_BENDS = {"Ta": 3.0, "LS": 5.0, "P": 7.0, "T": 4.0}  # below the valve
-_SUPPLY_LANE_BESIDE_CENTRE = -7.0  # lane of P beside an open centre
-_COMPENSATOR_HEIGHT, _METERING_HEIGHT = 28.0, 48.0  # what they need below the valve
-_ORIFICE_DROP = 1.0e6  # [Pa] at which flows of plain valves are told
-
-
-@dataclass(frozen=True)
-class CircuitFunction:
-    """A cylinder or motor with its valve.
-
-    Attributes:
-        joint: What it drives.
-        cylinder: The actuator.
-        valve: Its valve.
-        supply: The pump that feeds it.
-        is_revolute: Whether its joint is a revolute one.
-        stroke: Between the joint's limits [m], [rad]; infinite without.
-        tapped_chambers: Chambers, of "a" and "b", that something else is joined to.
-        has_load_sensing: Whether its load is told to a pump or to other valves.
-        shares_load_sensing: Whether others tell theirs to the same.
-        centre_nets: Nets before and behind its open centre, None where it is closed.
-    """
-
-    joint: str
-    cylinder: Cylinder
-    valve: Valve
-    supply: Supply
-    is_revolute: bool
-    stroke: float
-    tapped_chambers: frozenset[str] = frozenset()
-    has_load_sensing: bool = False
-    shares_load_sensing: bool = False
-    centre_nets: tuple[str, str] | None = None
-
-    @property
-    def ports(self) -> list[str]:
-        """Ports of its valve below, from the left."""
-        has_separate_returns = self.valve.return_a != self.valve.return_b
-        availability = {
-            "Ta": has_separate_returns,
-            "LS": self.has_load_sensing,
-            "P": True,
-            "C": self.centre_nets is not None,
-            "T": True,
-        }
-        return [name for name, is_present in availability.items() if is_present]
-
-    @property
-    def rails(self) -> dict[str, str]:
-        """Nets that lead down to rails, by port of the valve or chamber."""
-        valve = self.valve
-        nets = {"P": valve.supply, "T": valve.return_b}
-        if "Ta" in self.ports:
-            nets["Ta"] = valve.return_a
-        if self.has_load_sensing:
-            nets["LS"] = f"LS {valve.supply}"
-        return nets | {side: f"{self.joint}.{side}" for side in sorted(self.tapped_chambers)}
-
-    @property
-    def height_below(self) -> float:
-        """Height of what stands below the valve."""
-        if self.valve.sharing:
-            return _METERING_HEIGHT
-        return _COMPENSATOR_HEIGHT if self.valve.margin > 0 else 8.0
-
-    @property
-    def valve_texts(self) -> list[str]:
-        """Words about the valve."""
-        valve = self.valve
-        margin = valve.margin or (self.supply.margin if valve.sharing else 0.0)
-        root_pressure_drop = (margin or _ORIFICE_DROP) ** 0.5
-        flow_in, flow_out = (
-            format_flow(valve.c1 * root_pressure_drop),
-            format_flow(valve.c4 * root_pressure_drop),
-        )
-        texts = (
-            [f"{flow_in} l/min"] if flow_in == flow_out else [f"{flow_in} | {flow_out}", "l/min"]
-        )
-        if valve.spool_b:
-            texts.insert(0, "2 spools: A, B")
-        if valve.margin > 0:
-            return [*texts, f"Δp {format_pressure(valve.margin)}"]
-        return [*texts, "sharing"] if margin else [*texts, f"at {format_pressure(_ORIFICE_DROP)}"]
-
-
-def port_lane(function: CircuitFunction, port: str) -> float:
-    """Where a port of the valve goes down to its rail, from the section's middle."""
-    if port == "P" and function.centre_nets is not None:
-        return _SUPPLY_LANE_BESIDE_CENTRE
-    return _PORT_LANES[port]
-
-
-def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
-    """What stands between the valve and the actuator, upwards, with heights."""
-    cylinder, valve = function.cylinder, function.valve
-    rows: list[tuple[str, float]] = []
-    for side in "ab":
-        if getattr(cylinder, f"counterbalance_{side}") is not None:
-            rows.append((f"counterbalance_{side}", 32.0))
-    if cylinder.rupture_a or cylinder.rupture_b:
-        rows.append(("rupture", 22.0))
-    if cylinder.relief or cylinder.refill:
-        rows.append(("port", 44.0 if cylinder.relief else 34.0))
-    if cylinder.cross_relief:
-        rows.append(("cross", 48.0))
-    if valve.regeneration:
-        rows.append(("regeneration", 24.0))
-    if function.tapped_chambers:
-        rows.append(("tap", 8.0))
-    return rows
 
 
 class CircuitSection:
-    """Draws a function.
+    """Draws one function of a circuit.
 
     Args:
-        canvas: What it is drawn with.
-        function: What is drawn.
-        x: Its middle.
+        canvas: Canvas of the drawing.
+        function: The function.
+        x: Middle of the section.
         valve_bottom: Lower edge of the valve.
-        actuator_middle: Middle of the actuator.
-        rail_heights: Heights by net.
-        line_heights: Heights at which open centres are handed on, by pump.
+        actuator_middle: Height of the middle of the actuator.
+        rail_heights: Heights of the rails by net.
+        line_heights: Heights of the open-centre lines by pump.
     """
 
     def __init__(
@@ -176,7 +67,7 @@ class CircuitSection:
         self._chamber_nets = {side: f"{function.joint}.{side}" for side in "ab"}
 
     def draw(self) -> tuple[SheetPoint, SheetPoint] | None:
-        """Draw it; where its open centre begins and ends, if it has one."""
+        """Draw the section, and return the ends of its open centre if it has one."""
         function, canvas, x = self._function, self._canvas, self._x
         upper_ports = ["A", "C", "B"] if function.centre_nets else ["A", "B"]
         spool = SpoolSymbol(
@@ -220,7 +111,7 @@ class CircuitSection:
         return spool.port_positions["C"], spool.port_positions["C'"]
 
     def _valve_side_net(self, side: str) -> str:
-        """Net of a chamber's line at the valve."""
+        """Return the net of a chamber's line at the valve."""
         cylinder, net = self._function.cylinder, self._chamber_nets[side]
         has_counterbalance = getattr(cylinder, f"counterbalance_{side}") is not None
         has_rupture_valve = getattr(cylinder, f"rupture_{side}") > 0
@@ -234,7 +125,7 @@ class CircuitSection:
             self._canvas.draw_wire(current_nets[side], (position, start), (position, end))
 
     def _draw_port_line(self, spool: SpoolSymbol, port: str, net: str, component: str) -> None:
-        """From a port of the valve to its rail, through a compensator where there is one."""
+        """Draw the line from a port to its rail, with a compensator if there is one."""
         canvas, function, x = self._canvas, self._function, self._x
         lane, (position, y), rail_height = (
             x + port_lane(function, port),
@@ -368,7 +259,7 @@ class CircuitSection:
         )
 
     def _draw_port_valves(self, side: str, sign: int, y: float, height: float) -> None:
-        """Relief and suction valves of a chamber, each with the tank."""
+        """Draw relief and suction valve of a chamber, each with a tank."""
         canvas, cylinder, net = self._canvas, self._function.cylinder, self._chamber_nets[side]
         lane, top = self._x + sign * CHAMBER_LANE, y + height - (12 if cylinder.relief else 6)
         if cylinder.relief:
@@ -418,7 +309,7 @@ class CircuitSection:
     def _draw_counterbalance_valve(
         self, side: str, y: float, height: float, current_nets: dict[str, str]
     ) -> None:
-        """A counterbalance valve: free inflow, outflow when the other chamber's line opens it."""
+        """Draw a counterbalance valve, piloted by the line of the other chamber."""
         canvas, sign = self._canvas, (-1 if side == "a" else 1)
         other_chamber = "b" if side == "a" else "a"
         lane, other_lane = self._x + sign * CHAMBER_LANE, self._x - sign * CHAMBER_LANE
@@ -499,7 +390,6 @@ class CircuitSection:
             current_nets[side] = chamber_net
 
     def _draw_actuator(self) -> None:
-        """The actuator, and what it is."""
         canvas, function, position = self._canvas, self._function, (self._x, self._actuator_middle)
         cylinder, nets = function.cylinder, (self._chamber_nets["a"], self._chamber_nets["b"])
         if cylinder.motor:

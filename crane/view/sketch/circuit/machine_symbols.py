@@ -1,4 +1,4 @@
-"""Symbols of ISO 1219-1 for what turns, moves and stores: pumps, motors, cylinders, gas."""
+"""Symbols of machines (ISO 1219-1): pumps, motors, cylinders, accumulators."""
 
 import math
 
@@ -12,7 +12,7 @@ PORT_OFFSET = 14.0  # of an actuator, from its middle
 def draw_pump(
     canvas: CircuitCanvas, position: SheetPoint, component: str, net: str, is_variable: bool
 ) -> None:
-    """A pump that delivers upwards and draws from its own tank below; adjustable with an arrow."""
+    """Draw a pump with delivery at the top and suction at the bottom."""
     pose = SymbolPose(*position)
     canvas.add_port(component, net, pose.transform_point(0, PUMP_RADIUS))
     canvas.add_port(component, "suction " + component, pose.transform_point(0, -PUMP_RADIUS))
@@ -27,7 +27,7 @@ def draw_pump(
 def draw_regulator(
     canvas: CircuitCanvas, position: SheetPoint, name: str, component: str, has_power_limit: bool
 ) -> None:
-    """A box with what a regulator keeps, beside it the hyperbola of one that limits the power."""
+    """Draw a regulator as a box with its name; a hyperbola shows a power limit."""
     x, y = position
     canvas.draw_shape(
         [(x - 11, y - 6), (x + 11, y - 6), (x + 11, y + 6), (x - 11, y + 6)], gid=component
@@ -43,13 +43,13 @@ def draw_regulator(
 
 
 def draw_engine(canvas: CircuitCanvas, position: SheetPoint, component: str) -> None:
-    """What turns the pumps."""
+    """Draw an engine."""
     canvas.draw_circle(position, ENGINE_RADIUS, gid=component)
     canvas.draw_text(*position, "M", f"symbol {component}", size=9)
 
 
 def draw_shaft(canvas: CircuitCanvas, start: SheetPoint, end: SheetPoint) -> None:
-    """A shaft: two lines."""
+    """Draw a shaft as two lines."""
     for y in (-1.2, 1.2):
         canvas.draw_line([(start[0], start[1] + y), (end[0], end[1] + y)], linewidth=0.7,
                  zorder=2.5, gid="shaft")  # fmt: skip
@@ -58,7 +58,7 @@ def draw_shaft(canvas: CircuitCanvas, start: SheetPoint, end: SheetPoint) -> Non
 def draw_motor(
     canvas: CircuitCanvas, position: SheetPoint, component: str, nets: tuple[str, str]
 ) -> None:
-    """A motor for both directions of flow, its shaft upwards."""
+    """Draw a motor for both directions of flow, its shaft upwards."""
     pose = SymbolPose(*position)
     for y in (-1.2, 1.2):
         canvas.draw_line(pose((y, MOTOR_RADIUS), (y, MOTOR_RADIUS + 7)), linewidth=0.7)
@@ -92,7 +92,7 @@ def draw_motor(
 def draw_rotary_drive(
     canvas: CircuitCanvas, position: SheetPoint, component: str, nets: tuple[str, str]
 ) -> None:
-    """A rotary drive of limited angle: half a circle, its shaft upwards."""
+    """Draw a rotary drive of limited angle, its shaft upwards."""
     pose = SymbolPose(*position)
     for y in (-1.2, 1.2):
         canvas.draw_line(pose((y, BARREL_HALF_HEIGHT), (y, BARREL_HALF_HEIGHT + 7)), linewidth=0.7)
@@ -127,15 +127,15 @@ def draw_cylinder(
     nets: tuple[str, str],
     area_ratio: float,
 ) -> None:
-    """A double-acting cylinder, chamber A on the left.
+    """Draw a double-acting cylinder, chamber A on the left.
 
     Args:
-        canvas: What it is drawn with.
-        position: Its middle.
-        component: Its name.
-        nets: Of chambers A and B.
-        area_ratio: Of area B to area A: below 1 the rod is in B, above in A, and goes through at
-            1.
+        canvas: Canvas of the drawing.
+        position: Middle of the symbol.
+        component: Name of the component.
+        nets: Nets of chambers A and B.
+        area_ratio: Ratio of area B to area A. Below 1 the rod is in B, above 1 in A; at 1 it goes
+            through both.
     """
     pose, rod_pose = SymbolPose(*position), SymbolPose(*position, is_mirrored=area_ratio > 1)
     canvas.draw_shape(
@@ -178,7 +178,7 @@ def draw_cylinder(
 def draw_accumulator(
     canvas: CircuitCanvas, position: SheetPoint, component: str, net: str
 ) -> None:
-    """An accumulator with gas above its diaphragm, its port below."""
+    """Draw an accumulator with gas above its diaphragm, its port below."""
     pose = SymbolPose(*position)
     canvas.add_port(component, net, pose.transform_point(0, -17))
     upper_half = [

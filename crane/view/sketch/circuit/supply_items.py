@@ -1,4 +1,4 @@
-"""What hangs below the rails: tank, engine, pumps, accumulators, elements."""
+"""Items below the rails of a circuit drawing: tank, engine, pumps, accumulators, elements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.view.plots.figure_text import escape_label
 from crane.view.sketch.circuit import machine_symbols, valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose
-from crane.view.sketch.circuit.circuit_section import CircuitFunction
-from crane.view.sketch.circuit.format_quantities import (
+from crane.view.sketch.circuit.circuit_functions import CircuitFunction
+from crane.view.sketch.circuit.valve_symbols import (
     format_flow,
     format_number,
     format_pressure,
@@ -29,13 +29,13 @@ CONTROL_LABELS = {"pressure": "p", "load-sensing": "LS", "negative": "NFC", "pos
 
 @dataclass(frozen=True)
 class SupplyItem:
-    """Something that hangs on rails.
+    """An item that is connected to rails above it.
 
     Attributes:
-        width: What it takes.
-        height: Below the place where it hangs.
-        wires: Nets that lead up from it, with their places from its left edge.
-        stays_in_row: Whether it stands in the row of what is before it.
+        width: Width of the item.
+        height: Height of the item.
+        wires: Nets of its lines upwards, with offsets from its left edge.
+        stays_in_row: Whether it stays in the row of the previous item.
     """
 
     width: float
@@ -44,13 +44,13 @@ class SupplyItem:
     stays_in_row: bool
 
     def draw(self, canvas: CircuitCanvas, x: float, y: float, rails: Mapping[str, float]) -> None:
-        """Draw it, its left edge at x, hanging from y."""
+        """Draw the item with its left edge at x and its top at y."""
 
 
 def create_supply_items(
     hydraulics: Hydraulics, functions: Sequence[CircuitFunction]
 ) -> list[SupplyItem]:
-    """All that hangs below the rails, from the left."""
+    """Return all items below the rails, from the left."""
     items: list[SupplyItem] = [_create_tank(hydraulics)]
     if hydraulics.engine is not None:
         items.append(_create_engine(hydraulics.engine))
@@ -59,7 +59,7 @@ def create_supply_items(
         senses = (
             any(x.has_load_sensing for x in fed_functions) and supply.control == "load-sensing"
         )
-        # back to the pump before, to the engine, or to nothing that is told
+        # to the previous pump, to the engine, or to an unknown drive
         shaft = 116.0 if i else 64.0 if hydraulics.engine is not None else 24.0
         items.append(_create_pump(name, supply, senses, shaft))
     items += [_create_accumulator(name, x) for name, x in hydraulics.accumulators.items()]
@@ -76,7 +76,7 @@ def _draw_labels(
     name: str,
     texts: Sequence[str],
 ) -> None:
-    """Name and words below each other, the first line at y."""
+    """Write a name at y and texts below it."""
     canvas.draw_text(
         x,
         y,
@@ -217,7 +217,7 @@ class _PumpItem(SupplyItem):
 def _create_pump(
     name: str, supply: Supply, has_load_sensing: bool, shaft_length: float
 ) -> _PumpItem:
-    texts = [f"{format_flow(supply.flow)} l/min"] if supply.flow else ["as much as asked for"]
+    texts = [f"{format_flow(supply.flow)} l/min"] if supply.flow else ["unlimited flow"]
     if supply.control != "fixed":
         texts.append(f"max. {format_pressure(supply.pressure)}" if supply.control != "pressure"
                      else format_pressure(supply.pressure))  # fmt: skip

@@ -1,28 +1,140 @@
-"""The lines of open centres, from a pump through its valves to the throttle behind them."""
+"""Functions of a hydraulic circuit: actuators with their valves, and open-centre lines."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from crane.hydraulics.circuit_elements import TANK_NODE
+from crane.hydraulics.circuit_elements import TANK_NODE, Supply
+from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.view.sketch.circuit import valve_symbols
 from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
-from crane.view.sketch.circuit.circuit_section import CircuitFunction
+from crane.view.sketch.circuit.valve_symbols import format_flow, format_pressure
 
+_PORT_LANES = {"Ta": -26.0, "LS": -20.0, "P": 0.0, "T": 12.0}
+_SUPPLY_LANE_BESIDE_CENTRE = -7.0  # lane of P beside an open centre
+_COMPENSATOR_HEIGHT, _METERING_HEIGHT = 28.0, 48.0  # below the valve
+_ORIFICE_DROP = 1.0e6  # pressure drop of the flows that labels of plain valves give [Pa]
 _FEED_LANE, _RETURN_LANE, _SIGNAL_OFFSET = 40.0, 59.0, 6.0  # lanes from a section's middle
 _LANE_SPACING = 3.0  # between the lines of two pumps
 
 CentreEnds = Mapping[str, tuple[float, SheetPoint, SheetPoint]]
 
 
+@dataclass(frozen=True)
+class CircuitFunction:
+    """A cylinder or motor with its valve.
+
+    Attributes:
+        joint: Joint that it drives.
+        cylinder: The actuator.
+        valve: Its valve.
+        supply: The pump that feeds it.
+        is_revolute: Whether the joint is revolute.
+        stroke: Difference of the joint's limits [m], [rad]; infinite without limits.
+        tapped_chambers: Chambers "a" and "b" that other components are connected to.
+        has_load_sensing: Whether its load pressure goes to a pump or to other valves.
+        shares_load_sensing: Whether other functions share this load-sensing line.
+        centre_nets: Nets before and behind its open centre; None for a closed centre.
+    """
+
+    joint: str
+    cylinder: Cylinder
+    valve: Valve
+    supply: Supply
+    is_revolute: bool
+    stroke: float
+    tapped_chambers: frozenset[str] = frozenset()
+    has_load_sensing: bool = False
+    shares_load_sensing: bool = False
+    centre_nets: tuple[str, str] | None = None
+
+    @property
+    def ports(self) -> list[str]:
+        """Lower ports of the valve, from the left."""
+        has_separate_returns = self.valve.return_a != self.valve.return_b
+        availability = {
+            "Ta": has_separate_returns,
+            "LS": self.has_load_sensing,
+            "P": True,
+            "C": self.centre_nets is not None,
+            "T": True,
+        }
+        return [name for name, is_present in availability.items() if is_present]
+
+    @property
+    def rails(self) -> dict[str, str]:
+        """Nets with lines down to rails, by port of the valve or chamber."""
+        valve = self.valve
+        nets = {"P": valve.supply, "T": valve.return_b}
+        if "Ta" in self.ports:
+            nets["Ta"] = valve.return_a
+        if self.has_load_sensing:
+            nets["LS"] = f"LS {valve.supply}"
+        return nets | {side: f"{self.joint}.{side}" for side in sorted(self.tapped_chambers)}
+
+    @property
+    def height_below(self) -> float:
+        """Height required below the valve."""
+        if self.valve.sharing:
+            return _METERING_HEIGHT
+        return _COMPENSATOR_HEIGHT if self.valve.margin > 0 else 8.0
+
+    @property
+    def valve_texts(self) -> list[str]:
+        """Labels of the valve."""
+        valve = self.valve
+        margin = valve.margin or (self.supply.margin if valve.sharing else 0.0)
+        root_pressure_drop = (margin or _ORIFICE_DROP) ** 0.5
+        flow_in, flow_out = (
+            format_flow(valve.c1 * root_pressure_drop),
+            format_flow(valve.c4 * root_pressure_drop),
+        )
+        texts = (
+            [f"{flow_in} l/min"] if flow_in == flow_out else [f"{flow_in} | {flow_out}", "l/min"]
+        )
+        if valve.spool_b:
+            texts.insert(0, "2 spools: A, B")
+        if valve.margin > 0:
+            return [*texts, f"Δp {format_pressure(valve.margin)}"]
+        return [*texts, "sharing"] if margin else [*texts, f"at {format_pressure(_ORIFICE_DROP)}"]
+
+
+def port_lane(function: CircuitFunction, port: str) -> float:
+    """Return the offset of a port's lane from the middle of the section."""
+    if port == "P" and function.centre_nets is not None:
+        return _SUPPLY_LANE_BESIDE_CENTRE
+    return _PORT_LANES[port]
+
+
+def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
+    """Return names and heights of the rows between valve and actuator, upwards."""
+    cylinder, valve = function.cylinder, function.valve
+    rows: list[tuple[str, float]] = []
+    for side in "ab":
+        if getattr(cylinder, f"counterbalance_{side}") is not None:
+            rows.append((f"counterbalance_{side}", 32.0))
+    if cylinder.rupture_a or cylinder.rupture_b:
+        rows.append(("rupture", 22.0))
+    if cylinder.relief or cylinder.refill:
+        rows.append(("port", 44.0 if cylinder.relief else 34.0))
+    if cylinder.cross_relief:
+        rows.append(("cross", 48.0))
+    if valve.regeneration:
+        rows.append(("regeneration", 24.0))
+    if function.tapped_chambers:
+        rows.append(("tap", 8.0))
+    return rows
+
+
 class OpenCentreLines:
-    """Open centres of all pumps.
+    """Open-centre lines of all pumps.
 
     Args:
         hydraulics: The circuit.
         function_rows: Its functions by row.
 
     Attributes:
-        row_nets: That go from one row of functions to another.
+        row_nets: Nets that go from one row of functions to another.
     """
 
     def __init__(self, hydraulics: Hydraulics, function_rows: Sequence[Sequence[CircuitFunction]]):
@@ -47,11 +159,11 @@ class OpenCentreLines:
         return [x for x in self._function_rows[row] if x.centre_nets and x.valve.supply == name]
 
     def line_count(self, row: int) -> int:
-        """How many lines of open centres a row has."""
+        """Return the number of open-centre lines of a row."""
         return sum(bool(self._functions_of_pump(row, name)) for name in self._pump_names)
 
     def line_heights(self, row: int, valve_height: float) -> dict[str, float]:
-        """Heights at which they are handed on below the valves, by pump."""
+        """Return the heights of the open-centre lines below the valves, by pump."""
         heights: dict[str, float] = {}
         for name in self._pump_names:
             if self._functions_of_pump(row, name):
@@ -59,7 +171,7 @@ class OpenCentreLines:
         return heights
 
     def required_nets(self, row: int) -> set[str]:
-        """Nets of a row that need a rail."""
+        """Return the nets of a row that need a rail."""
         nets: set[str] = set()
         for name in self._pump_names:
             row_functions = self._functions_of_pump(row, name)
@@ -84,13 +196,13 @@ class OpenCentreLines:
         rail_heights: Mapping[str, float],
         line_heights: Mapping[str, float],
     ) -> None:
-        """Join the open centres of a row.
+        """Connect the open centres of a row.
 
         Args:
-            canvas: What they are drawn with.
+            canvas: Canvas of the drawing.
             row: Number of the row.
-            centre_ends: Middle of a section and where its open centre begins and ends, by joint.
-            rail_heights: Heights by net.
+            centre_ends: Middle of a section and both ends of its open centre, by joint.
+            rail_heights: Heights of the rails by net.
             line_heights: See `line_heights`.
         """
         for number, name in enumerate(line_heights):
