@@ -16,11 +16,11 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.description.parameter_changes import parameters
 from crane.description.sensors import Sensor
 from crane.formats.machine_loading import MachineVariants
-from crane.identification.calibration.calibration_problem import noise_std
-from crane.identification.calibration.profile_likelihood import estimate_with_profiles
+from crane.identification.calibration.calibration_statistics import estimate_with_profiles
+from crane.identification.calibration.recording_case import noise_std
 from crane.identification.calibration.residual_dependence import residual_dependences
 from crane.identification.calibration.unknowns import build_unknowns
-from crane.recordings import timeseries
+from crane.recordings import table_reader, timeseries
 
 pytestmark = pytest.mark.slow
 
@@ -192,7 +192,7 @@ def test_a_common_factor_and_delays(tmp_path):
     path = recorded(machine, tmp_path / "run.csv", 3, truth={
         "cylinder.x.hose_a": 1.5 * 1.9e-4, "cylinder.x.hose_b": 1.5 * 1.9e-4
     })  # fmt: skip
-    table = timeseries.read_table(path)
+    table = table_reader.read_table(path)
     late = table.values.copy()
     late[:, 2] = np.interp(late[:, 0] - 0.03, late[:, 0], late[:, 2])
     timeseries.write_table(path, timeseries.Table(table.units, late, {}))
@@ -450,7 +450,7 @@ def test_a_search_that_ended_in_the_wrong_minimum_goes_on(tmp_path):
     machine = simple(tmp_path)
     truth = {"valve.x.bandwidth": 250.0, "load_x.mass": 2050.0}
     path = recorded(machine, tmp_path / "run.csv", 2, truth)
-    table, random = timeseries.read_table(path), np.random.default_rng(9002)
+    table, random = table_reader.read_table(path), np.random.default_rng(9002)
     noisy = table.values.copy()
     for k, size in ((2, 2e-4), (3, 2e4), (4, 2e4)):
         noisy[:, k] += 8.0 * size * random.normal(size=len(noisy))
@@ -480,7 +480,7 @@ def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     """Of a raw log, with its columns; what is fitted is what was put on, a pressure of 3 bar."""
     machine, path, _ = fitted
     table, log, columns = (
-        timeseries.read_table(path),
+        table_reader.read_table(path),
         tmp_path / "log.csv",
         tmp_path / "columns.txt",
     )

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from crane.identification.calibration.calibration_result import FittedParameter
-from crane.identification.calibration.correlated_parameters import correlated_directions
-from crane.identification.calibration.profile_likelihood import (
+from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     ProfileEnds,
+    correlated_directions,
     estimate_with_profiles,
     evaluate_profile_ends,
 )

@@ -10,7 +10,8 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError
 from crane.control import largest_flow_share
-from crane.motion.sway import SWAY_METHODS, Sway, input_shaper, retime, suppress_sway
+from crane.motion.sway import Sway
+from crane.motion.sway_suppression import SWAY_METHODS, input_shaper, retime, suppress_sway
 
 pytestmark = pytest.mark.slow
 

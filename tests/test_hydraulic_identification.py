@@ -20,10 +20,13 @@ from crane.identification.hydraulics.cylinder_signals import (
     valve_opening,
 )
 from crane.identification.hydraulics.orifice_coefficients import identify_orifices
-from crane.identification.hydraulics.orifice_equations import OrificeEquations, chamber_terms
+from crane.identification.hydraulics.orifice_equations import (
+    OrificeEquations,
+    WeakFormWindows,
+    chamber_terms,
+)
 from crane.identification.hydraulics.valve_curve import identify_valve
 from crane.identification.signals.steady_samples import steady_means, steady_samples
-from crane.identification.signals.weak_form import WeakFormWindows
 
 pytestmark = pytest.mark.slow
 

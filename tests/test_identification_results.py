@@ -20,13 +20,12 @@ import crane
 from crane import cli
 from crane.cli.runs import read_run, write_identification
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
-from crane.identification.mechanics.force_element_terms import ForceElementTerm
-from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.force_terms import ForceElementTerm, friction_term
+from crane.identification.mechanics.identification_model import default_terms
+from crane.identification.mechanics.identified_urdf import divide_locked_bodies
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
-from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
-from crane.identification.mechanics.locked_body_division import divide_locked_bodies
-from crane.identification.mechanics.term_selection import default_terms
+from crane.identification.mechanics.model_term import InertialTerm, body_names
 from crane.identification.signals.signal_processing import Motion
 
 HERE = Path(__file__).parents[1]

@@ -13,12 +13,11 @@ import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description.sensors import Sensor
 from crane.formats.machine_loading import MachineVariants
-from crane.recordings import timeseries
-from crane.recordings.ideal_sensors import ideal_readings
-from crane.recordings.pin_derivatives import pin_derivatives
+from crane.recordings import table_reader, timeseries
+from crane.recordings.measured_recordings import dead_length
 from crane.recordings.recording import Recording
 from crane.recordings.recording_reader import correct_readings, read_quantities, select_time_span
-from crane.recordings.stroke_check import dead_length
+from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
 from crane.recordings.timeseries import Table
 
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -455,7 +454,7 @@ def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
 def test_a_delay_reads_beyond_the_window(machine, motion, tmp_path):
     """The end of a window holds what a late sensor says after it."""
     path = written(tmp_path, motion, [])
-    table = timeseries.read_table(path)
+    table = table_reader.read_table(path)
     late = {"X_lift": Sensor(delay=0.1)}
     cut = select_time_span(correct_readings(table, late), (3.0, 5.0), path)
     assert cut.values[-1, 1] == pytest.approx(
@@ -525,7 +524,7 @@ def test_a_raw_log_is_read_by_the_sensors_of_its_machine(machine, tmp_path):
         read_quantities(LIFTING, machine.replace(sensors=known))
     two = read_quantities(LIFTING, machine, columns)
     assert one.units == two.units and np.array_equal(one.values, two.values)
-    raw = timeseries.read_log_arrays(LIFTING)
+    raw = table_reader.read_log_arrays(LIFTING)
     at = list(one.units).index("inclination_tilt_boom")
     np.testing.assert_allclose(one.values[:, at], np.deg2rad(raw["z2_deg"]) + 0.085, atol=1e-12)
     # what crane wrote is no log

@@ -20,18 +20,21 @@ from crane.identification.mechanics.cross_validation import (
     format_trials,
     identify_options,
 )
-from crane.identification.mechanics.force_checks import check_shared_samples
-from crane.identification.mechanics.friction_laws import friction_laws
-from crane.identification.mechanics.friction_terms import (
+from crane.identification.mechanics.force_comparison import check_shared_samples
+from crane.identification.mechanics.force_terms import (
     FrictionalMemory,
     PreslidingFriction,
     friction_term,
     root_friction_term,
 )
+from crane.identification.mechanics.friction_laws import friction_laws
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
-from crane.identification.mechanics.model_term import ForceDirection
+from crane.identification.mechanics.model_term import (
+    ForceDirection,
+    InertialTerm,
+    RotorInertiaTerm,
+)
 from crane.identification.mechanics.priors import prior_from_names
 from crane.identification.signals.signal_processing import Motion
 

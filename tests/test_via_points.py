@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 import crane
 from crane.common.errors import DescriptionError, InputError, UnreachableTipError
 from crane.motion.attitude import InclinationCoordinate, roll_pitch_yaw
-from crane.motion.piecewise_polynomial import PiecewisePolynomial
-from crane.motion.quintic_splines import least_jerk
+from crane.motion.quintic_splines import PiecewisePolynomial, least_jerk
 
 PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
 TIMES = [0.0, 0.4, 1.5, 2.0]

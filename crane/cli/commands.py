@@ -136,7 +136,7 @@ def view(
     """Write a page that shows a machine, or a run with its forces and numbers, and open it."""
     from crane.cli.runs import PAGE, check_free, machine_of, read_run
     from crane.common.atomic_output import portable_file_name
-    from crane.recordings.recording_differences import joint_differences
+    from crane.recordings.recording_summary import joint_differences
     from crane.view.page.report_page import open_in_browser, report
 
     recording = other = None

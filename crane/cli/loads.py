@@ -60,9 +60,9 @@ def _table(path: Path) -> "tuple[Array, Array, Array]":
     import numpy as np
 
     from crane.description.external_forces import WRENCH_COMPONENTS
-    from crane.recordings import timeseries
+    from crane.recordings import table_reader
 
-    table = timeseries.read_table(path)
+    table = table_reader.read_table(path)
     names = list(table.units)
     if "time" not in names:
         raise InputError(f"{path}: has no column 'time', add it")

@@ -219,7 +219,7 @@ def follower_of(
 ) -> "Controller | ValveCommand":
     """What drives a machine along a reference, see `control_of`."""
     from crane.control import default_controller_name, make_controller
-    from crane.motion.sway import suppress_sway
+    from crane.motion.sway_suppression import suppress_sway
 
     if sway is not None:
         reference = suppress_sway(machine, reference, sway)

@@ -14,7 +14,8 @@ from crane.control.valve_openings import check_invertible, openings_per_velocity
 from crane.dynamics import Dynamics
 from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
-from crane.motion.sway import Sway, suppress_sway
+from crane.motion.sway import Sway
+from crane.motion.sway_suppression import suppress_sway
 from crane.motion.trajectory import Trajectory
 
 _KNOTS_PER_SECOND = 50  # of forces and gains

@@ -12,7 +12,7 @@ from crane.hydraulics import Hydraulics
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.orifice_flow import LAMINAR_PRESSURE_DROP
 from crane.machine import Machine
-from crane.motion.sway import retime, suppress_sway
+from crane.motion.sway_suppression import retime, suppress_sway
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 

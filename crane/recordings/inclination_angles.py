@@ -1,4 +1,4 @@
-"""Angles of joints from inclinations of their links, where nothing else tells the posture."""
+"""Joint angles from inclinations of links, where no joint measurement determines them."""
 
 import numpy as np
 
@@ -6,31 +6,32 @@ from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.machine import Machine
-from crane.recordings.ideal_sensors import ideal_readings
 from crane.recordings.measured_configurations import determining_joints, independent_joints
 from crane.recordings.missing_measurements import MissingMeasurementError
+from crane.recordings.sensor_kinematics import ideal_readings
 from crane.recordings.timeseries import Table, table_column
 
-_MAX_ITERATIONS, _STEP_TOLERANCE = 12, 1e-11  # of Newton's method, and the step that ends it [rad]
-_MIN_DERIVATIVE = 0.1  # least slope of an inclination by the joint of its link
+_MAX_ITERATIONS, _STEP_TOLERANCE = 12, 1e-11  # Newton iterations, and the last step [rad]
+_MIN_DERIVATIVE = 0.1  # least derivative of an inclination by the joint of its link
 UnknownAngles = list[tuple[str, str]]  # joint, inclination
 
 
 def add_inclination_angles(machine: Machine, table: Table) -> Table:
-    """The table with angles of joints whose links' inclinations determine the posture.
+    """Add joint angles that inclinations determine to a table.
 
-    Those that are missing are found by Newton's method, h(q(q_B)) = y, with h the inclinations
-    and q_B the joints that were measured and those that are sought.
+    Newton's method solves h(q(q_B)) = y with the inclinations h and the joints q_B, measured and
+    unknown ones.
 
     Args:
         machine: The machine.
-        table: Quantities.
+        table: Table of quantities.
 
     Returns:
-        The table as it is where joints determine the posture, or inclinations do not, either.
+        The extended table; the table itself if joints determine the configuration, or inclinations
+        do not.
 
     Raises:
-        RecordingError: No posture has these inclinations.
+        RecordingError: No closed configuration has these inclinations.
     """
     names = list(table.units)
     try:
@@ -40,7 +41,7 @@ def add_inclination_angles(machine: Machine, table: Table) -> Table:
         pass
     drives, unknown_angles = _find_unknown_angles(machine, table)
     if len(drives) < len(machine.active):
-        return table  # whoever needs them says so
+        return table  # the caller reports what is missing
     try:
         angles = _solve_angles(machine.with_active_joints(drives), table, unknown_angles)
     except (ClosureError, MechanismError) as error:
@@ -52,9 +53,10 @@ def add_inclination_angles(machine: Machine, table: Table) -> Table:
 
 
 def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...], UnknownAngles]:
-    """Joints that drive the machine, and those of them that inclinations have to tell.
+    """Independent joints of the machine, and those of them to be computed from inclinations.
 
-    Of each inclination the nearest joint below its link, which it depends on and nothing tells.
+    An inclination determines the nearest joint below its link that it depends on and that is not
+    measured.
     """
     drives = independent_joints(machine, list(table.units))
     unknown_angles: UnknownAngles = []
@@ -70,7 +72,7 @@ def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...
 
 
 def _inclining_joints(machine: Machine, name: str) -> list[str]:
-    """Joints from a link to the ground that change its inclination, at home."""
+    """Joints from a link to the ground that change its inclination at home."""
     parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
     link, home, rate, found = (
         name.removeprefix(INCLINATION_PREFIX),
@@ -93,10 +95,10 @@ def _inclining_joints(machine: Machine, name: str) -> list[str]:
 
 
 def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) -> Array:
-    """(N, k) of the joints that are sought, of a machine that they drive with those recorded.
+    """Angles (N, k) of the unknown joints of a machine with unknown and measured active joints.
 
     Raises:
-        ClosureError: No posture has these inclinations.
+        ClosureError: No configuration has these inclinations.
     """
     count, joints = len(table.values), [joint for joint, _ in unknown_angles]
     indices = [driven.active.index(joint) for joint in joints]
@@ -116,13 +118,13 @@ def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) 
         q_b[:, indices] += step
         if np.abs(step).max() < _STEP_TOLERANCE:
             return q_b[:, indices]
-    raise ClosureError(f"no posture has the inclinations of {', '.join(names)}")
+    raise ClosureError(f"no configuration has the inclinations of {', '.join(names)}")
 
 
 def _inclination_jacobian(
     driven: Machine, q: Array, names: list[str], indices: list[int]
 ) -> Array:
-    """(N, k, k) of inclinations by some of the coordinates that drive a machine."""
+    """Derivatives (N, k, k) of inclinations by some of the active coordinates."""
     gamma, rates = driven.closure.gamma(q), [name + VELOCITY_SUFFIX for name in names]
     columns = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
     return np.stack([np.column_stack([x[rate] for rate in rates]) for x in columns], axis=2)

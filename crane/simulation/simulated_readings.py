@@ -18,8 +18,8 @@ from crane.description.sensors import (
     quantity_unit,
 )
 from crane.machine import Machine
-from crane.recordings.ideal_sensors import ideal_readings
 from crane.recordings.recording import Recording
+from crane.recordings.sensor_kinematics import ideal_readings
 from crane.recordings.timeseries import TIME, Table, accepted_units, check_unit
 
 _INPUT_PREFIXES = (VALVE_SIGNAL_PREFIX, SUPPLY_PRESSURE, TANK_PRESSURE)

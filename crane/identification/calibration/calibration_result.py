@@ -1,4 +1,4 @@
-"""What a calibration found, how well it is known, and how well the machine follows now."""
+"""Result of a calibration: parameters with intervals, channels before and after, report."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.identification.calibration.calibration_problem import noise_std
-from crane.identification.calibration.correlated_parameters import correlated_directions
-from crane.identification.calibration.profile_likelihood import ProfileEnds
-from crane.identification.calibration.score_test import ScoreTestResult
+from crane.identification.calibration.calibration_statistics import (
+    ProfileEnds,
+    ScoreTestResult,
+    correlated_directions,
+)
+from crane.identification.calibration.recording_case import noise_std
 from crane.machine import Machine
 
-_DEGRADATION_FACTOR = 1.1  # times what was left before
+_DEGRADATION_FACTOR = 1.1  # times the residual before
 LOWER_MINIMUM_WARNING = (
     "Near these numbers the machine follows better still, where the search did not end: calibrate "
     "again from there, or fit fewer numbers."
@@ -24,18 +26,18 @@ LOWER_MINIMUM_WARNING = (
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """One number.
+    """Fitted parameter.
 
     Attributes:
-        name: Its name.
-        start: Before.
-        value: Fitted.
-        interval_half_width: Half of its interval of 95 %, as if there were no bounds.
-        at_bound: Whether it is on a bound.
-        is_unidentifiable: Whether the recordings do not tell it.
-        unit: Its SI unit, "" of a common factor.
-        members: Numbers of the machine and its sensors that it changed, as they were.
-        profile_ends: What the simulation says of the interval's ends.
+        name: Name of the parameter.
+        start: Value before.
+        value: Fitted value.
+        interval_half_width: Half width of its 95 % interval, without regard to bounds.
+        at_bound: Whether a bound is active.
+        is_unidentifiable: Whether the recordings do not determine it.
+        unit: SI unit, "" for a common factor.
+        members: Parameters that it changed, with their values before.
+        profile_ends: Profile likelihood at the ends of the interval.
     """
 
     name: str
@@ -50,17 +52,17 @@ class FittedParameter:
 
     @property
     def is_common_factor(self) -> bool:
-        """Whether it is a common factor of several numbers."""
+        """Whether it is a common factor of several parameters."""
         return "*" in self.name
 
     @property
     def initial_value(self) -> float:
-        """What the machine had, 1 of a common factor."""
+        """Value of the machine before, 1 for a common factor."""
         return 1.0 if self.is_common_factor or not self.members else self.members[0][1]
 
     @property
     def changed_significantly(self) -> bool:
-        """Whether what the machine had is outside of the interval of what is told."""
+        """Whether the value before is outside of the interval of an identifiable parameter."""
         return (
             not (self.is_unidentifiable or self.at_bound)
             and abs(self.value - self.initial_value) > self.interval_half_width
@@ -68,7 +70,7 @@ class FittedParameter:
 
     @property
     def remark(self) -> str:
-        """What is to be known beside the interval."""
+        """Remark beside the interval, or ""."""
         status = (
             "on its bound"
             if self.at_bound
@@ -78,7 +80,7 @@ class FittedParameter:
 
     @property
     def notes(self) -> dict[str, str]:
-        """Words for each number of the machine, as comments of a file have them."""
+        """Comment for each changed parameter in a machine file."""
         interval_text, remark = (
             f"±{self.interval_half_width:.2g}, 95 %",
             self.remark and f", {self.remark}",
@@ -97,17 +99,17 @@ class FittedParameter:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationChannel(OneLineRepr):
-    """A channel of a recording, SI units.
+    """Channel of a recording before and after the calibration, in SI units.
 
     Attributes:
-        recording: Name of its file.
-        name: Of the column.
+        recording: Name of the file.
+        name: Name of the column.
         unit: Its unit.
         time: (N,) [s].
-        train_mask: (N,) which instants were fitted.
-        measured: (N,).
-        simulated_before: (N,) simulated as the machine was.
-        simulated_after: (N,) as it is now.
+        train_mask: (N,) mask of the training data.
+        measured: (N,) measured values.
+        simulated_before: (N,) simulated values of the machine before.
+        simulated_after: (N,) simulated values of the fitted machine.
     """
 
     recording: str
@@ -121,11 +123,11 @@ class CalibrationChannel(OneLineRepr):
 
     @property
     def noise(self) -> float:
-        """Standard deviation of its noise, see `noise_std`."""
+        """Standard deviation of the noise, see `noise_std`."""
         return noise_std(self.measured)
 
     def rms(self, simulated: Array, training: bool) -> float:
-        """Root mean square of simulated less measured, over what was fitted or held out."""
+        """Root mean square of simulated minus measured over training or held-out data."""
         mask = self.train_mask if training else np.logical_not(self.train_mask)
         residual = (simulated - self.measured)[mask]
         return float(np.sqrt(np.mean(residual**2))) if len(residual) else float("nan")
@@ -133,22 +135,21 @@ class CalibrationChannel(OneLineRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(OneLineRepr):
-    """A machine fitted to recordings.
+    """Result of a calibration.
 
     Attributes:
-        machine: With the fitted numbers.
-        parameters: Numbers, in the order in which they were named.
+        machine: The fitted machine.
+        parameters: Fitted parameters, in the given order.
         channels: Channels before and after.
-        changes: Numbers of the machine that differ, as `crane.load(changes=)` takes them.
-        correlated_pairs: Pairs of names that the recordings tell apart badly, with their
-            correlation.
-        simulation_count: Simulations it took.
-        score_tests: Numbers that were not fitted and would help.
-        correlation: (n, n) of the numbers.
-        states: By recording, velocities and chamber pressures of the drives of the fitted machine.
-        is_lowest_minimum: Whether no lower minimum was seen at the ends of the intervals.
-        unobserved_parameters: Numbers that were chosen and of which nothing was seen; they stay as
-            they were.
+        changes: Parameter changes, as in `crane.load(changes=)`.
+        correlated_pairs: Pairs of strongly correlated parameters, with their correlation.
+        simulation_count: Number of simulations.
+        score_tests: Score tests of parameters that were not fitted.
+        correlation: (n, n) correlations of the parameters.
+        states: Velocities and chamber pressures of the drives of the fitted machine, by recording.
+        is_lowest_minimum: Whether no lower minimum was found at the ends of the intervals.
+        unobserved_parameters: Selected parameters without an effect in the recordings; they are
+            unchanged.
     """
 
     machine: Machine
@@ -164,7 +165,7 @@ class Calibration(OneLineRepr):
     unobserved_parameters: tuple[str, ...] = ()
 
     def _one_line(self) -> str:
-        """What was fitted to, and the numbers that are told."""
+        """Machine, channels, and identifiable parameters."""
         identifiable = [x for x in self.parameters if not (x.at_bound or x.is_unidentifiable)]
         values = ", ".join(f"{x.name} = {x.value:.5g}" for x in identifiable)
         numbers, channels = format_count(len(self.parameters), "number"), len(self.channels)
@@ -175,12 +176,12 @@ class Calibration(OneLineRepr):
 
     @property
     def notes(self) -> dict[str, str]:
-        """What is to be said of the fitted numbers beside them, by name."""
+        """Comments on the changed parameters by name."""
         return {name: text for one in self.parameters for name, text in one.notes.items()}
 
     @property
     def correlated_directions(self) -> list[dict[str, float]]:
-        """What the recordings cannot tell apart, see `together`."""
+        """Directions that the recordings do not determine, see `correlated_directions`."""
         half_widths = [one.interval_half_width for one in self.parameters]
         return correlated_directions(
             [one.name for one in self.parameters], self.correlation, np.array(half_widths)
@@ -188,12 +189,12 @@ class Calibration(OneLineRepr):
 
     @property
     def values(self) -> dict[str, float]:
-        """Fitted numbers by name."""
+        """Fitted values by name."""
         return {one.name: one.value for one in self.parameters}
 
     @property
     def degraded_channels(self) -> list[str]:
-        """Channels that were held out and are followed worse than before."""
+        """Channels with larger residuals on held-out data than before."""
         several = len({x.recording for x in self.channels}) > 1
         return [
             f"{x.recording}: {x.name}" if several else x.name
@@ -204,7 +205,7 @@ class Calibration(OneLineRepr):
 
     @property
     def cautions(self) -> list[str]:
-        """What is to be said of it as a whole."""
+        """Warnings about the calibration as a whole."""
         texts = [] if self.is_lowest_minimum else [LOWER_MINIMUM_WARNING]
         if self.degraded_channels:
             texts.append(
@@ -221,16 +222,16 @@ class Calibration(OneLineRepr):
 
     @property
     def command_line_options(self) -> str:
-        """What the command line takes for the same machine."""
+        """Options of the command line for the same machine."""
         return " ".join(f"--set {name}={value:.8g}" for name, value in self.changes.items())
 
     def describe_direction(self, direction: Mapping[str, float]) -> str:
-        """A direction in words: numbers that may change together."""
+        """Text of a direction: parameters that may change together."""
         units = {one.name: one.unit for one in self.parameters}
         return ", ".join(f"{x} by {by:+.2g} {units[x]}".rstrip() for x, by in direction.items())
 
     def to_text(self) -> str:
-        """A report, Markdown."""
+        """Report in Markdown."""
         lines = [
             "| number | before | fitted | 95 % interval | |",
             "| --- | ---: | ---: | ---: | --- |",

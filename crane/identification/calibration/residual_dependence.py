@@ -1,14 +1,13 @@
-"""What is left of a calibration, and what of the motion it depends on.
+"""Dependence of the residuals of a calibration on the motion.
 
-A model that lacks something leaves a residual that goes with the speed (viscous, orifices), with
-the pressure (areas, moduli, leakage) or with the direction of motion (friction, one orifice of
-four). How much of it does is the correlation ratio (Pearson 1905): with the samples in groups g of
-about the same x, n_g of mean m_g, of N of mean m,
+An incomplete model leaves residuals that depend on the speed (viscous friction, orifices), on the
+pressure (areas, moduli, leakage) or on the direction of motion (friction, one of four orifices).
+The correlation ratio (Pearson 1905) measures this: with N samples of mean m, and groups g of n_g
+samples with similar x and the mean m_g,
 
-    share = sum_g n_g (m_g - m)^2 / sum_t (r_t - m)^2.
+    ratio = sum_g n_g (m_g - m)^2 / sum_t (r_t - m)^2.
 
-As many samples as a recording has make it small by chance; few motions do not: eight groups of
-one stroke each are eight numbers.
+It is small by chance for many samples, but not for few motions.
 """
 
 from collections.abc import Mapping
@@ -22,23 +21,23 @@ from crane.common.samples import Array
 from crane.description.sensors import PRESSURE_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.identification.calibration.calibration_result import Calibration, CalibrationChannel
 
-_MAX_GROUPS = 8  # of about as many samples each
-_REST_SPEED_SHARE = 0.02  # of the largest speed, below which a drive stands
+_MAX_GROUPS = 8  # groups of about equal size
+_REST_SPEED_SHARE = 0.02  # of the largest speed, below which a drive is at rest
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResidualDependence(OneLineRepr):
-    """What is left of a channel over what was fitted, and the motion of a drive.
+    """Residuals of a channel over the training data, and the motion of a drive.
 
     Attributes:
-        name: Of the channel.
-        unit: Its unit.
-        residual: (N,) simulated less measured.
-        drive: Joint whose motion it is held against.
+        name: Name of the channel.
+        unit: Unit of the channel.
+        residual: (N,) simulated minus measured.
+        drive: Joint whose motion is compared.
         speed_unit: Unit of its speed.
-        chamber: "a" or "b", whose pressure that is.
-        motion: (N,) each: speed, pressure, direction (-1, 0 at rest, 1).
-        correlation_ratios: Of the residual's variance that goes with each of these.
+        chamber: Chamber "a" or "b" of the pressure.
+        motion: Speed, pressure and direction (-1, 0 at rest, 1), (N,) each.
+        correlation_ratios: Correlation ratio of the residual with each of these.
     """
 
     name: str
@@ -52,10 +51,10 @@ class ResidualDependence(OneLineRepr):
 
 
 def residual_dependences(calibration: Calibration) -> list[ResidualDependence]:
-    """What is left of every channel that was fitted, recordings together.
+    """Residual dependence of every fitted channel, over all recordings.
 
-    A channel is held against the drive that its name has, else against that with whose speed it
-    goes best. Empty for a machine without valves.
+    A channel is compared with the drive in its name, else with the drive of the largest
+    correlation ratio with the speed. The list is empty for a machine without valves.
     """
     channels: dict[str, list[CalibrationChannel]] = {}
     for channel in calibration.channels:
@@ -80,7 +79,7 @@ def residual_dependences(calibration: Calibration) -> list[ResidualDependence]:
 
 
 def group_samples(x: Array) -> list[NDArray[np.intp]]:
-    """Samples (N,) by x: groups of about the same size; where x has few values, one each."""
+    """Groups of samples (N,) by x, of about equal size, or one per value if x has few values."""
     values = np.unique(x)
     if len(values) <= _MAX_GROUPS:
         return [np.flatnonzero(x == value) for value in values]
@@ -88,7 +87,7 @@ def group_samples(x: Array) -> list[NDArray[np.intp]]:
 
 
 def correlation_ratio(residual: Array, x: Array) -> float:
-    """Of the variance of a residual (N,) that goes with x (N,), 0 to 1."""
+    """Correlation ratio of a residual (N,) with x (N,), 0 to 1."""
     deviation = residual - residual.mean()
     total = float(deviation @ deviation)
     explained = sum(len(some) * float(deviation[some].mean()) ** 2 for some in group_samples(x))
@@ -98,7 +97,7 @@ def correlation_ratio(residual: Array, x: Array) -> float:
 def _residual_dependence(
     calibration: Calibration, channels: list[CalibrationChannel], drive: str
 ) -> ResidualDependence:
-    """Channels of one name, held against the motion of a drive."""
+    """Dependence of channels of one name on the motion of a drive."""
     name, unit = channels[0].name, channels[0].unit
     chamber = "b" if name == f"{PRESSURE_PREFIX}{drive}_b" else "a"
 

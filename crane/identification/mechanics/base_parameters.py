@@ -16,7 +16,7 @@ from crane.machine import Machine
 
 _RANK_TOLERANCE = 1e-8  # of a column's norm, what of it must be new
 _ZERO_TOLERANCE = 1e-10  # of the largest norm, below which a column is zero
-_DEFAULT_SPAN = 1.0  # [rad], [machine's size] of joints without limits
+_DEFAULT_SPAN = 1.0  # [rad], [characteristic length] of joints without limits
 # Preferred as base parameters, first: what is told from one axis before what needs many.
 _PREFERENCE_ORDER = {
     "Izz": 0,
@@ -90,7 +90,7 @@ class BaseParameters(OneLineRepr):
 
 
 def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> MotionSamples:
-    """Closed postures all over the strokes, with random velocities and accelerations.
+    """Closed configurations all over the strokes, with random velocities and accelerations.
 
     Raises:
         InputError: The loops close nowhere within the limits.
@@ -109,7 +109,7 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
             break
     if len(q_a) < count:
         raise InputError(
-            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random postures "
+            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random configurations "
             "within its limits, narrow the limits"
         )
     # joints that move little per coordinate are moved faster, so that all columns are alike
@@ -140,13 +140,13 @@ def base_parameters(
 ) -> BaseParameters:
     """Base parameters of a model, numerically (Gautier, 1991).
 
-    The columns of W over random closed postures are taken one by one, those of Izz, mx, my and
+    The columns of W over random closed configurations are taken one by one, those of Izz, mx, my and
     of the last bodies first; one that is a combination of those before it joins their groups.
 
     Args:
         model: The model.
         samples: A motion, if what it can tell is asked for; all of the strokes if not given.
-        seed: Of the random postures.
+        seed: Of the random configurations.
 
     Raises:
         InputError: The loops close nowhere within the limits.
@@ -155,7 +155,7 @@ def base_parameters(
     if samples is None:
         samples = random_samples(model, max(60, 4 * p // n), seed)
     closure, bodies = model.machine.closure, 10 * len(model.bodies)
-    # forces as virtual work per 1 rad and the machine's size, so that drives compare
+    # forces as virtual work per 1 rad and the characteristic length, so that drives compare
     rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)
     units = np.ones(p)
     body = [1.0, *[closure.characteristic_length] * 3, *[closure.characteristic_length**2] * 6]

@@ -12,9 +12,10 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.text_tables import format_table
+from crane.identification.mechanics.equation_setup import RecordingOrMotion, prepare_motions
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions
+from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.priors import prior_from_names, read_priors
 from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
 from crane.identification.signals.signal_processing import Motion
@@ -131,7 +132,7 @@ def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
 def _check_settings(
     machine: Machine, grid: Sequence[Mapping[str, object]], options: Mapping[str, Any]
 ) -> None:
-    """See that settings are such as an identification takes, whatever is recorded.
+    """Check that settings are such as an identification takes, whatever is recorded.
 
     Raises:
         InputError: One is not, or what they need is not installed.

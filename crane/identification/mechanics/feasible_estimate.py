@@ -4,7 +4,8 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.identification.estimation.estimators import Estimate, Prior, estimate_from_minimum
+from crane.identification.estimation.estimators import estimate_from_minimum
+from crane.identification.estimation.regression_problem import Estimate, Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,

@@ -6,7 +6,7 @@ from crane.common.samples import Array
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
-from crane.identification.signals.spectrum import spectral_edge_frequency
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 
 _CUTOFF_FACTOR = 10.0  # times the frequency of the motion: cutoff of what is compared
 _POWER_SHARE = 0.995  # of the power of the coordinates is below that frequency

@@ -8,7 +8,7 @@ import numpy as np
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.description import Friction
-from crane.identification.mechanics.friction_terms import (
+from crane.identification.mechanics.force_terms import (
     FrictionalMemory,
     PreslidingFriction,
     VelocityFriction,

@@ -1,17 +1,37 @@
 """tau = W beta: the drives' forces as linear functions of a machine's parameters."""
 
+import fnmatch
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError
-from crane.common.samples import Array, as_samples
+from crane.common.errors import InputError, suggest_names
+from crane.common.samples import Array, as_number, as_samples
+from crane.description.estimation_settings import TermValues
 from crane.dynamics.joint_forces import JointForces
-from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
-from crane.identification.mechanics.model_term import ModelTerm, MotionSamples
-from crane.identification.mechanics.term_selection import TermChanges, select_terms
+from crane.identification.mechanics.force_terms import (
+    FrictionalMemory,
+    GasSpringTerm,
+    PreslidingFriction,
+    friction_term,
+    root_friction_term,
+)
+from crane.identification.mechanics.model_term import (
+    ForceDirection,
+    InertialTerm,
+    ModelTerm,
+    MotionSamples,
+    RotorInertiaTerm,
+    body_names,
+)
 from crane.machine import Machine
+
+TermChanges = Mapping[str, TermValues | None]
+"""Numbers of a term by name, () where it has none; None leaves it out."""
+_FRICTION_KINDS = ("coulomb", "coulomb_offset", "viscous", "viscous_offset")
 
 
 class IdentificationModel:
@@ -108,3 +128,160 @@ class IdentificationModel:
                 np.einsum("kij,kj->ki", samples.gamma, samples.a_a) + drift
             )
         return np.einsum("kij,ki->kj", samples.gamma, force)
+
+
+@dataclass(frozen=True)
+class TermKind:
+    """A kind of term.
+
+    Attributes:
+        description: What its numbers are, in words.
+        value_count: How many there are at least and at most.
+    """
+
+    description: str = ""
+    value_count: tuple[int, int] = (0, 0)
+
+
+TERM_KINDS = {
+    **{name: TermKind() for name in (*_FRICTION_KINDS, "root", "rotor_inertia", "gas_scale")},
+    "stiction": TermKind("velocities over which it fades", (0, 9)),
+    "presliding": TermKind("the distance over which it winds up", (1, 1)),
+    "memory": TermKind("the time and the speed by which rest is forgotten", (2, 2)),
+}
+
+
+def default_terms(machine: Machine) -> list[ModelTerm]:
+    """Bodies; four coefficients of friction per driven joint, viscous friction of all others."""
+    return _build_terms(machine, _default_kinds(machine))
+
+
+def select_terms(machine: Machine, changes: TermChanges) -> list[ModelTerm]:
+    """Terms of a model: the default ones, those of the machine's `estimation`, and changes.
+
+    Args:
+        machine: The machine.
+        changes: As in a machine file under `identification`, `terms`: later ones win.
+
+    Raises:
+        InputError: A name that nothing has, or numbers that do not fit or are not above 0.
+    """
+    values_by_element, requested = _default_kinds(machine), set()
+    for name, values in (*machine.estimation.terms.items(), *changes.items()):
+        where, _, kind = name.rpartition(".")
+        if kind not in TERM_KINDS:
+            raise InputError(
+                f"term '{name}': '{kind}' is unknown, {suggest_names(TERM_KINDS, kind)}"
+            )
+        if not where:
+            raise InputError(f"term '{name}' does not say of what, write q1.{kind} or q*.{kind}")
+        low, high = TERM_KINDS[kind].value_count
+        if values is not None and not low <= len(values) <= high:
+            hint = f"give {TERM_KINDS[kind].description}" if high else "it takes none"
+            raise InputError(f"term '{name}' has {len(values)} numbers, {hint}")
+        for number in values or ():
+            as_number(number, f"a number of term '{name}'", "", greater_than=0)
+        for element in _matching_elements(machine, where, kind):
+            kinds = values_by_element.setdefault(element, {})
+            if values is None:
+                kinds.pop(kind, None)
+                continue
+            kinds[kind] = values
+            requested.add((element, kind))
+    for element, kinds in values_by_element.items():
+        # Dahl's law is Coulomb friction that winds up first
+        if "presliding" in kinds and (element, "coulomb") not in requested:
+            kinds.pop("coulomb", None)
+    return _build_terms(machine, values_by_element)
+
+
+def parse_combination(name: str) -> ForceDirection | None:
+    """The direction of joints that a motor turns with together, None of a single name.
+
+    Raises:
+        InputError: A factor that is no number or 0, or a joint twice.
+    """
+    if "+" not in name:
+        return None
+    factors: dict[str, float] = {}
+    for part in name.split("+"):
+        factor, star, joint = (word.strip() for word in part.rpartition("*"))
+        try:
+            share = float(factor) if star else 1.0
+        except ValueError:
+            share = 0.0
+        if not share or not math.isfinite(share):
+            raise InputError(f"'{name}': '{factor}' is no factor, write q5+0.5*q6")
+        if joint in factors:
+            raise InputError(f"'{name}' names '{joint}' twice, give it once with its factor")
+        factors[joint] = share
+    return ForceDirection(name, factors)
+
+
+def _default_kinds(machine: Machine) -> dict[str, dict[str, TermValues]]:
+    """Numbers of the default terms, by where and kind."""
+    values_by_element: dict[str, dict[str, TermValues]] = {
+        joint: dict.fromkeys(_FRICTION_KINDS, ()) for joint in machine.driven_joints
+    }
+    for joint in machine.joints:
+        law = machine.friction.get(joint)
+        has_coulomb = law is not None and law.coulomb > 0
+        kinds = ("coulomb", "viscous") if has_coulomb else ("viscous",)
+        values_by_element.setdefault(joint, dict.fromkeys(kinds, ()))
+    return values_by_element
+
+
+def _matching_elements(machine: Machine, where: str, kind: str) -> list[str]:
+    """The joints, gas springs or combination that a name is about; none that is locked."""
+    if kind == "gas_scale":
+        names = [spring.joint for spring in machine.gas_springs]
+    elif where not in machine.joints and (direction := parse_combination(where)) is not None:
+        return [] if direction.has_locked_joint(machine) else [where]
+    else:
+        names = list(machine.joints)
+    found = [where] if where in names else fnmatch.filter(names, where)
+    if not found and not fnmatch.filter(machine.locked_joints, where):
+        raise InputError(
+            f"term '{where}.{kind}': '{where}' is unknown, {suggest_names(names, where)}"
+        )
+    return found
+
+
+def _build_terms(
+    machine: Machine, values_by_element: Mapping[str, Mapping[str, TermValues]]
+) -> list[ModelTerm]:
+    terms: list[ModelTerm] = [InertialTerm(machine)]
+    for where, kinds in values_by_element.items():
+        direction = where if where in machine.joints else parse_combination(where) or where
+        if "gas_scale" in kinds:
+            terms.append(GasSpringTerm(machine, where))
+        if "rotor_inertia" in kinds:
+            terms.append(RotorInertiaTerm(machine, direction))
+        friction_kinds = [kind for kind in _FRICTION_KINDS if kind in kinds]
+        if friction_kinds or "stiction" in kinds:
+            stribeck_velocities = kinds.get("stiction")
+            if stribeck_velocities == ():
+                stribeck_velocities = (_described_stribeck_velocity(machine, where),)
+            terms.append(
+                friction_term(
+                    machine, direction, friction_kinds, stribeck=stribeck_velocities or ()
+                )
+            )
+        if "root" in kinds:
+            terms.append(root_friction_term(machine, direction))
+        if "presliding" in kinds:
+            terms.append(PreslidingFriction(machine, direction, *kinds["presliding"]))
+        if "memory" in kinds:
+            terms.append(FrictionalMemory(machine, direction, *kinds["memory"]))
+    return terms
+
+
+def _described_stribeck_velocity(machine: Machine, joint: str) -> float:
+    """The velocity over which a joint's described stiction fades."""
+    law = machine.friction.get(joint)
+    if law is None or not law.stiction:
+        raise InputError(
+            f"term '{joint}.stiction' needs the velocity over which it fades, which the machine "
+            "does not have: give it"
+        )
+    return law.stribeck

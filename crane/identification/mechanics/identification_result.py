@@ -14,7 +14,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.text_tables import format_table
-from crane.identification.estimation.estimators import Estimate
+from crane.identification.estimation.regression_problem import Estimate
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions

@@ -12,27 +12,31 @@ from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics import Dynamics
-from crane.identification.estimation.estimators import Estimate, Prior
+from crane.identification.estimation.regression_problem import Estimate, Prior
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.force_checks import check_forces
-from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.free_joint_equations import iterate_estimate
-from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.equation_setup import build_equations, multi_pass_progress
+from crane.identification.mechanics.force_comparison import ForceComparison, check_forces
+from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import METHODS, build_equations, multi_pass_progress
+from crane.identification.mechanics.identify import METHODS
 from crane.identification.mechanics.model_term import MotionSamples
-from crane.identification.mechanics.payload_estimate import PayloadEstimate, PayloadTerm
-from crane.identification.mechanics.recording_checks import reject_unless_trusted
-from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
-from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.mechanics.static_mass import (
+from crane.identification.mechanics.payload_estimate import (
     MIN_FRICTION_SHARE,
+    PayloadEstimate,
+    PayloadTerm,
     breakaway_force,
     low_passed_motion,
     static_cutoff,
     static_mass,
 )
+from crane.identification.mechanics.recording_checks import reject_unless_trusted
+from crane.identification.mechanics.regression_equations import (
+    Progress,
+    RegressionEquations,
+    iterate_estimate,
+)
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
 from crane.recordings.recording import Recording

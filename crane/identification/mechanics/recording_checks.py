@@ -8,7 +8,6 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, RecordingError
 from crane.common.samples import Array
-from crane.identification.signals.outliers import outlier_mask, replace_outliers
 from crane.identification.signals.signal_processing import (
     central_differences,
     check_gaps,
@@ -16,7 +15,11 @@ from crane.identification.signals.signal_processing import (
     resample_evenly,
     sampling_step,
 )
-from crane.identification.signals.spectral_lines import strongest_spectral_line
+from crane.identification.signals.signal_quality import (
+    outlier_mask,
+    replace_outliers,
+    strongest_spectral_line,
+)
 
 _MIN_SAMPLES = 50  # samples
 _COMPARISON_CUTOFF = 10.0  # [Hz] up to which recorded velocities and positions are compared

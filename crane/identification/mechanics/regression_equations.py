@@ -9,10 +9,10 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
+from crane.identification.estimation.regression_problem import Estimate
 from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.free_joint_equations import free_joint_rows
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_term import MotionSamples
 from crane.identification.signals.signal_processing import (
@@ -27,8 +27,12 @@ _BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor that are computed at 
 _CACHE_BYTES = (
     3 << 27
 )  # bytes of filtered blocks that are held; others are computed again when needed
-
 Progress = Callable[[float], None]
+_MAX_ITERATIONS = 30
+_CONVERGENCE_TOLERANCE = 1e-2  # of a standard deviation
+_ROUNDING_TOLERANCE = 1e-9  # of the largest value
+RegressorFunction = Callable[[MotionSamples], tuple[Array, Array]]
+"""Samples -> W (N, n, r) and known forces (N, n)."""
 
 
 class _FilteredMotion:
@@ -332,3 +336,61 @@ class ProjectedRegressor:
         T = np.zeros((len(self._T) + 1, size + 1))
         T[:-1, :-1], T[-1, -1] = self._T, 1.0
         return np.array([triangular_factor(R @ T) for R in self._equations.triangular_factors])
+
+
+def free_joint_rows(
+    regressor_function: RegressorFunction,
+    samples: MotionSamples,
+    free_joints: np.ndarray,
+    values: Array,
+) -> tuple[Array, Array]:
+    """W (N, n, r) and what stands for known forces (N, n), of free joints' rows as above.
+
+    Args:
+        regressor_function: Of the model.
+        samples: Where.
+        free_joints: (f,) which joints.
+        values: b (r,).
+    """
+    term_states = dict(samples.term_states)  # of forces that remember the past
+    W, known = regressor_function(samples)
+    residual = (W @ values + known)[:, free_joints]
+
+    def free_rows_at(a_a: Array) -> tuple[Array, Array]:
+        W, known = regressor_function(
+            dataclasses.replace(samples, a_a=a_a, term_states=dict(term_states))
+        )
+        return W[:, free_joints], (W @ values + known)[:, free_joints]
+
+    columns = [
+        free_rows_at(samples.a_a + np.eye(samples.a_a.shape[1])[i])[1] - residual
+        for i in free_joints.tolist()
+    ]
+    a_a = samples.a_a.copy()
+    a_a[:, free_joints] -= np.linalg.solve(np.stack(columns, axis=2), residual[:, :, None])[
+        :, :, 0
+    ]
+    W[:, free_joints], _ = free_rows_at(a_a)
+    known[:, free_joints] = residual - W[:, free_joints] @ values
+    return W, known
+
+
+def iterate_estimate(
+    estimate: Callable[[Array], tuple[Estimate, Array]], start: Array
+) -> Estimate:
+    """The estimate at whose own values the rows of free joints are taken.
+
+    Args:
+        estimate: Values (r,) to take rows at -> what they tell, and its values (r,).
+        start: (r,) values to begin with.
+    """
+    result, values = estimate(start)
+    for _ in range(_MAX_ITERATIONS):
+        before, (result, values) = result.values, estimate(values)
+        step = np.abs(result.values - before)
+        if (
+            step
+            <= _CONVERGENCE_TOLERANCE * result.std + _ROUNDING_TOLERANCE * np.abs(before).max()
+        ).all():
+            break
+    return result

@@ -1,4 +1,4 @@
-"""From a recording to a motion: what is wrong with it is told, derivatives are found."""
+"""Motions from recordings: checked samples, derivatives, and recorded loads."""
 
 import math
 import warnings
@@ -7,8 +7,9 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, RecordingError, suggest_names
 from crane.common.samples import Array
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics import Dynamics
 from crane.identification.mechanics.force_delays import motion_frequency
-from crane.identification.mechanics.recorded_loads import recorded_load_forces
 from crane.identification.mechanics.recording_checks import (
     check_recording,
     check_samples,
@@ -17,26 +18,22 @@ from crane.identification.mechanics.recording_checks import (
     warn_hum,
 )
 from crane.identification.mechanics.regression_equations import Progress
-from crane.identification.signals.outliers import outlier_mask, replace_outliers
 from crane.identification.signals.signal_processing import (
     Derivatives,
     Motion,
     differentiate,
     resample_evenly,
 )
+from crane.identification.signals.signal_quality import outlier_mask, replace_outliers
 from crane.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
-from crane.recordings.recording import (
-    FORCE_SUFFIX,
-    VELOCITY_SUFFIX,
-    VELOCITY_UNITS,
-    Recording,
-    time_derivative,
-)
+from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
+from crane.recordings.recording_columns import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a joint's velocity, above which it moves
 _MAX_SPEED_FACTOR = 30.0  # times its limit, at which no joint moves
 _HUM_FACTOR = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
+_LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
 
 
 def smoothed_motion(
@@ -181,3 +178,58 @@ def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
             f"({joint}={place:.4g})"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:
+    """What recorded loads do at the active joints, so that W beta = tau + this.
+
+    Columns `load_NAME_force_x` to `load_NAME_moment_z` are a wrench in the world's axes at the
+    frame of the machine's load NAME, or at the link NAME; what has no column is zero.
+
+    Args:
+        machine: What was recorded.
+        recording: Of N samples.
+        q_a: (N, n) [m], [rad].
+        trust: See `smoothed_motion`.
+
+    Returns:
+        (N, n) [N], [N m].
+
+    Raises:
+        RecordingError: A load acts on no link, or one of the machine's is not recorded.
+    """
+    frames = {force.name: force.frame for force in machine.external_forces}
+    wrenches: dict[str, Array] = {}
+    for column, values in recording.channels.items():
+        part = next(
+            (x for x in WRENCH_COMPONENTS if column == f"{_LOAD_PREFIX}{_load_name(column)}_{x}"),
+            None,
+        )
+        if part is None:
+            continue
+        name, unit = _load_name(column), recording.channel_units[column]
+        if unit != _PART_UNITS[part[:-2]]:
+            raise RecordingError(
+                f"'{column}' is recorded in {unit}, give {_PART_UNITS[part[:-2]]}"
+            )
+        if name not in frames and name not in machine.tree.links:
+            links = suggest_names(machine.tree.links, name)
+            raise RecordingError(f"'{column}' acts on no link of '{machine.name}', {links}")
+        rows = wrenches.setdefault(name, np.zeros((len(values), len(WRENCH_COMPONENTS))))
+        rows[:, WRENCH_COMPONENTS.index(part)] = values
+    for name in frames:
+        if name not in wrenches:
+            reject_unless_trusted(
+                f"'{machine.name}' has the load '{name}', and no column tells what it did: add "
+                f"{_LOAD_PREFIX}{name}_force_x and so on, or take a machine without it",
+                trust,
+            )
+    dynamics, total = Dynamics(machine), np.zeros_like(q_a)
+    for name, rows in wrenches.items():
+        total += dynamics.project_wrenches(q_a, {frames.get(name, name): rows})
+    return total
+
+
+def _load_name(column: str) -> str:
+    """The load's name in a column's."""
+    return column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)[0]

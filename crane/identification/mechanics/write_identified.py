@@ -23,16 +23,19 @@ from crane.formats.machine_file.machine_writer import friction_data
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.coupled_motors import joint_combinations, motor_chain
 from crane.identification.mechanics.friction_laws import (
     FrictionLawFit,
     FrictionTerm,
     friction_laws,
 )
 from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.inertial_terms import BODY_PARAMETERS
-from crane.identification.mechanics.locked_body_division import divide_locked_bodies
-from crane.identification.mechanics.urdf_inertials import replace_inertials
+from crane.identification.mechanics.identified_urdf import (
+    divide_locked_bodies,
+    joint_combinations,
+    motor_chain,
+    replace_inertials,
+)
+from crane.identification.mechanics.model_term import BODY_PARAMETERS
 from crane.machine import Machine
 
 _FORCE_TOLERANCE = 1e-9  # of the largest force, by which the written machine may differ
@@ -118,7 +121,7 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
 
 
 def check_rewritable(machine: Machine) -> None:
-    """See that the files of a machine can be written again with other numbers in them.
+    """Check that the files of a machine can be written again with other numbers in them.
 
     Raises:
         InputError: They cannot.

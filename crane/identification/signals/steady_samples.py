@@ -1,4 +1,4 @@
-"""Where a motion is steady."""
+"""Steady samples of signals, and means over periods of signals that ring."""
 
 from dataclasses import dataclass
 

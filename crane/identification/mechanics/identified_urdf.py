@@ -1,0 +1,220 @@
+"""URDF content of an identified machine: inertials, divided bodies, rotors of coupled motors."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.common.atomic_output import portable_file_name
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.dynamics import Dynamics
+from crane.formats.visuals.mesh_files import find_mesh_file
+from crane.identification.mechanics.feasible_estimate import thicken_body
+from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_term import ForceDirection, body_names
+from crane.machine import Machine
+
+_FLATNESS_TOLERANCE = (
+    1e-6  # smallest eigenvalue of a flat body's pseudo-inertia, its diagonal scaled to one
+)
+_INERTIA_INDICES = {
+    "ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2),
+}  # fmt: skip
+_URDF_TEMPLATE = """<?xml version="1.0"?>
+<!-- The rotor of the motor that turns with {words}: its angle is theirs on the joints' side. -->
+<robot name="{name}">
+  <link name="{name}_stator"/>
+  <joint name="{name}" type="continuous">
+    <parent link="{name}_stator"/>
+    <child link="{name}_rotor"/>
+    <axis xyz="0 0 1"/>
+  </joint>
+  <link name="{name}_rotor">
+    <inertial>
+      <mass value="1e-6"/>
+      <inertia ixx="1e-12" ixy="0" ixz="0" iyy="1e-12" iyz="0" izz="1e-12"/>
+    </inertial>
+  </link>
+</robot>
+"""
+
+
+def divide_locked_bodies(
+    machine: Machine, parameters: Array, unlocked_machine: Machine
+) -> dict[str, Array]:
+    """Parameters (10,) of each moving link, from those of what locked joints make one body.
+
+    Of a body with the pseudo-inertia P (`feasible.pseudo_inertia`) that consists of links whose
+    descriptions D_k add up to D, link k gets
+
+        P_k = T D_k T^T,   T = L L_D^-1,   P = L L^T,  D = L_D L_D^T,
+
+    all in the frame of the body's joint: the parts add up to P, each is as possible as its
+    description, and all are the described ones where P is D. Descriptions of rods and plates
+    without thickness count with some. Links that the locks fix to the ground stay as described.
+
+    Args:
+        machine: With locked joints.
+        parameters: (10 nb,) of its bodies.
+        unlocked_machine: The same without.
+
+    Raises:
+        InputError: A body cannot exist.
+    """
+    described = (
+        Dynamics(unlocked_machine)
+        .parameters[: 10 * (unlocked_machine.model.njoints - 1)]
+        .reshape(-1, 10)
+    )
+    links_by_body: dict[int, list[tuple[str, Array, Array]]] = {}
+    out = {}
+    for name, body in zip(body_names(unlocked_machine), described, strict=True):
+        frame = machine.model.frames[machine.frame(name)]
+        A = frame.placement.homogeneous  # P about the body's joint is A P A^T
+        if frame.parentJoint == 0:
+            out[name] = body
+        else:
+            P = pseudo_inertia(body if is_solid(body) else thicken_body(body))
+            links_by_body.setdefault(frame.parentJoint - 1, []).append((name, A, P))
+    for i, links in links_by_body.items():
+        body_parameters_given = parameters[10 * i : 10 * i + 10]
+        if len(links) == 1:
+            out[links[0][0]] = body_parameters_given
+            continue
+        try:
+            L = np.linalg.cholesky(pseudo_inertia(body_parameters_given))
+            D = np.linalg.cholesky(sum(A @ P @ A.T for _, A, P in links))
+        except np.linalg.LinAlgError:
+            names = ", ".join(f"'{name}'" for name, *_ in links)
+            raise InputError(
+                f"what the locks make one body of {names} cannot exist, give feasible=True"
+            ) from None
+        T = L @ np.linalg.inv(D)
+        for name, A, P in links:
+            link_transform = np.linalg.inv(A) @ T @ A
+            out[name] = body_parameters(link_transform @ P @ link_transform.T)
+    return out
+
+
+def is_solid(body: Array) -> bool:
+    """Whether a body of parameters (10,) has mass in all directions, far above rounding."""
+    P = pseudo_inertia(body)
+    units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+    return bool(np.linalg.eigvalsh(P / np.outer(units, units))[0] > _FLATNESS_TOLERANCE)
+
+
+def replace_inertials(
+    file: Path, bodies: Mapping[str, Array], fixed_links: set[str], origin_text: str
+) -> etree._ElementTree:
+    """The tree of a URDF with other inertials, and without loops: their ends become links.
+
+    Args:
+        file: The URDF.
+        bodies: Ten parameters about the origin of its frame by link that a joint moves.
+        fixed_links: Links fixed to one of those, whose inertials are removed.
+        origin_text: Where the numbers come from, for a comment.
+    """
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
+    tree = etree.parse(str(file), parser)
+    robot = tree.getroot()
+    for link in robot.iterfind("link"):
+        name = link.get("name").strip()
+        inertial = link.find("inertial")
+        if name in bodies:
+            new_inertial = _inertial_element(bodies[name])
+            if inertial is None:
+                link.insert(0, new_inertial)
+            else:
+                new_inertial.tail = inertial.tail
+                link.replace(inertial, new_inertial)
+        elif name in fixed_links and inertial is not None:
+            _remove_element(inertial)
+    for mesh in robot.iter("mesh"):
+        _resolve_mesh_path(mesh, file.parent)
+    for loop in robot.findall("loop"):
+        for end in ("predecessor", "successor"):
+            _add_loop_frame(robot, loop, end)
+        _remove_element(loop)
+    comment = etree.Comment(f" Inertials: {origin_text}. ")
+    comment.tail = robot.text or "\n"
+    robot.text = "\n  "
+    robot.insert(0, comment)
+    return tree
+
+
+def _inertial_element(body: Array) -> etree._Element:
+    """<inertial> of ten parameters about the origin of the link's frame."""
+    inertia = pin.Inertia.FromDynamicParameters(body)
+    inertial = etree.Element("inertial")
+    xyz = " ".join(map(repr, inertia.lever.tolist()))
+    etree.SubElement(inertial, "origin", xyz=xyz, rpy="0 0 0")
+    etree.SubElement(inertial, "mass", value=repr(float(inertia.mass)))
+    tensor = {key: repr(float(inertia.inertia[at])) for key, at in _INERTIA_INDICES.items()}
+    etree.SubElement(inertial, "inertia", tensor)
+    inertial.text = inertial[0].tail = inertial[1].tail = "\n      "
+    inertial[2].tail = inertial.tail = "\n    "
+    return inertial
+
+
+def _remove_element(element: etree._Element) -> None:
+    """Remove an element, not what stands after it."""
+    element.tail, tail = None, element.tail
+    parent, previous = element.getparent(), element.getprevious()
+    parent.remove(element)
+    if previous is None:
+        parent.text = (parent.text or "") + (tail or "")
+    else:
+        previous.tail = (previous.tail or "") + (tail or "")
+
+
+def _resolve_mesh_path(mesh: etree._Element, folder: Path) -> None:
+    """Name a mesh by its whole path, where it is there."""
+    file = find_mesh_file(mesh.get("filename", ""), folder)
+    if file is not None:
+        mesh.set("filename", str(file.resolve()))
+
+
+def _add_loop_frame(robot: etree._Element, loop: etree._Element, end: str) -> None:
+    """The frame of a loop's end as a link, as a sub-chain has it."""
+    loop_end = loop.find(end)
+    name = f"{loop.get('name').strip()}_{end}"
+    etree.SubElement(robot, "link", name=name)
+    joint = etree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
+    if (origin := loop_end.find("origin")) is not None:
+        etree.SubElement(joint, "origin", dict(origin.attrib))
+    etree.SubElement(joint, "parent", link=loop_end.get("link").strip())
+    etree.SubElement(joint, "child", link=name)
+
+
+def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
+    """The directions of a model that several active joints make, each once."""
+    found = {
+        direction.name: direction
+        for term in model.terms
+        if (direction := getattr(term, "direction", None)) is not None and direction.factors
+    }
+    return list(found.values())
+
+
+def motor_chain(
+    direction: ForceDirection, parent: str
+) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """A rotor that a coupling turns: its chain, the coupling, and its URDF.
+
+    Its joint has the direction's name, and is where rotor inertia and friction are. Its link has a
+    mass of a milligram, as a body wants one.
+    """
+    name = direction.name
+    assert direction.factors is not None
+    chain = {"name": name, "urdf": f"motor_{portable_file_name(name)}.urdf", "parent": parent}
+    coupling_factors = {name: 1.0} | {
+        joint: -factor for joint, factor in direction.factors.items()
+    }
+    text = _URDF_TEMPLATE.format(name=escape(name), words=escape(" and ".join(direction.factors)))
+    return chain, {"name": name, "joints": coupling_factors}, text
