@@ -1,4 +1,4 @@
-"""Oscillations that neither decay nor are commanded: limit cycles of a circuit or a controller."""
+"""Limit cycles: sustained oscillations of a circuit or controller that are not commanded."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ from crane.common.scratch_arrays import release_pages
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.recordings.recording import REFERENCE_PREFIX, Recording
 
-_CYCLES = 8  # periods that an oscillation lasts at least
-_KEPT = 0.85  # of its swing over these: a damping ratio of less than 0.003
-_EVEN = 0.15  # standard deviation of its periods over their mean
-_ALIKE = 0.25  # the same of its half swings
-_SMALL = 0.01  # of a channel's largest size, below which no swing is told
-_LEAST = 1e5  # amplitude of a pressure that is told [Pa]
-_SHORTEST = 4  # samples of a period
-_SHOWN = 3  # channels that are named
+_CYCLES = 8  # least number of periods
+_KEPT = 0.85  # ratio of the last to the first swings: a damping ratio below 0.003
+_EVEN = 0.15  # standard deviation of the periods over their mean
+_ALIKE = 0.25  # standard deviation of the half swings over their mean
+_SMALL = 0.01  # of the largest value of a channel, least amplitude
+_LEAST = 1e5  # least amplitude of a pressure [Pa]
+_SHORTEST = 4  # least number of samples per period
+_SHOWN = 3  # channels in a message
 _COMMANDS = ("load_", "voltage_")
 
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """A sustained oscillation of one channel.
+    """Sustained oscillation of one channel.
 
     Attributes:
-        channel: Its name.
-        start: When it begins [s].
-        end: When it ends, or the samples do [s].
-        frequency: One over the median period [Hz].
-        amplitude: Half of the median swing of a period, in the channel's unit.
+        channel: Name of the channel.
+        start: Start [s].
+        end: End of the oscillation, or of the samples [s].
+        frequency: Frequency by the median period [Hz].
+        amplitude: Half of the median peak-to-peak value, in the unit of the channel.
     """
 
     channel: str
@@ -43,19 +43,19 @@ class LimitCycle:
 def sustained(
     time: Array, values: Array, least: float, commands: Iterable[Array] = (), name: str = ""
 ) -> LimitCycle | None:
-    """The largest oscillation of some samples that lasts eight even periods without decaying.
+    """Largest oscillation of samples that lasts eight even periods without decay.
 
-    Moving means of doubling widths w are taken off the samples; what is left crosses zero twice
-    per period. Of the widths those count that are one to two and a half periods long. A swing
-    whose last quarter of eight periods is below 0.85 of the first one decays; one over which a
-    command turns in half of the periods or more is commanded.
+    Moving means of doubling widths are subtracted from the samples; the difference crosses zero
+    twice per period. Widths of one to two and a half periods are used. An oscillation decays if
+    the swings of its last quarter of eight periods are below 0.85 of those of the first; it is
+    commanded if a command reverses in at least half of the periods.
 
     Args:
-        time: Instants (N,), evenly spaced [s].
+        time: Equidistant instants (N,) [s].
         values: Samples (N,).
-        least: Amplitude from which on it is told.
-        commands: Samples (N,) of what the motion is told to do.
-        name: Of the channel.
+        least: Least amplitude.
+        commands: Samples (N,) of commands.
+        name: Name of the channel.
     """
     least = max(least, _SMALL * float(np.abs(values).max(initial=0.0)))
     found: LimitCycle | None = None
@@ -78,10 +78,9 @@ def sustained(
 
 
 def limit_cycles(recording: Recording) -> list[LimitCycle]:
-    """Pressures that swing on at one frequency without being told to, the largest first.
+    """Limit cycles of pressures, the largest first.
 
-    What the motion is told are its references, and without these the valves' voltages, and loads
-    from outside.
+    Commands are the references, without these the valve signals, and external loads.
     """
     seen, units = recording.channels, recording.channel_units
     names = [x for x in seen if x.startswith("pressure_") and units.get(x) == "Pa"]
@@ -100,7 +99,7 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
 
 
 def ringing(recording: Recording) -> str:
-    """What to say of pressures that swing without decaying, else nothing."""
+    """Message about pressures that oscillate without decay, else ""."""
     cycles = limit_cycles(recording)
     if not cycles:
         return ""
@@ -117,7 +116,7 @@ def ringing(recording: Recording) -> str:
 
 
 def _moving_mean(values: Array, width: int) -> Array:
-    """Means (N,) over a width of samples, at the ends over what there is of it."""
+    """Means (N,) over a width of samples, at the ends over the available part."""
     total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(len(values))
     low, high = np.maximum(at - width // 2, 0), np.minimum(at - width // 2 + width, len(values))
@@ -125,14 +124,14 @@ def _moving_mean(values: Array, width: int) -> Array:
 
 
 def _spans(left: Array, width: int, least: float) -> Sequence[tuple[int, int, float]]:
-    """First sample, the one behind the last, and median period in samples of what is sustained."""
+    """Start, end and median period, in samples, of sustained oscillations."""
     up = left > 0
-    edges = np.flatnonzero(up[1:] != up[:-1]) + 1  # where half periods begin
+    edges = np.flatnonzero(up[1:] != up[:-1]) + 1  # starts of half periods
     count = 2 * _CYCLES
     if len(edges) <= count:
         return []
-    sizes = np.maximum.reduceat(np.abs(left), edges)[:-1]  # of each half period
-    # crossings between the samples, so that periods of a few of these are even
+    sizes = np.maximum.reduceat(np.abs(left), edges)[:-1]  # amplitude of each half period
+    # interpolated zero crossings
     exact = edges - left[edges] / (left[edges] - left[edges - 1])
     periods = exact[2:] - exact[:-2]
     rows = np.lib.stride_tricks.sliding_window_view(sizes, count)
@@ -152,7 +151,7 @@ def _spans(left: Array, width: int, least: float) -> Sequence[tuple[int, int, fl
 
 
 def _swings(values: Array, first: int, last: int, period: float) -> Array:
-    """Largest less smallest sample of each period, less what the samples drift over it."""
+    """Peak-to-peak value of each period, minus the drift over it."""
     starts = np.round(np.arange(first, last - period + 1, period)).astype(int)
     high, low = (x.reduceat(values[:last], starts) for x in (np.maximum, np.minimum))
     means = np.add.reduceat(values[:last], starts) / np.diff(starts, append=last)
@@ -161,7 +160,7 @@ def _swings(values: Array, first: int, last: int, period: float) -> Array:
 
 
 def _turns(command: Array) -> int:
-    """How often some samples turn."""
+    """Number of reversals of a command."""
     steps = np.diff(command)
     steps = steps[np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300)]
     return int(np.count_nonzero(np.signbit(steps[1:]) != np.signbit(steps[:-1])))

@@ -133,13 +133,13 @@ class TrajectoryOptimizer:
         if not vectors:
             raise InputError(
                 f"'{self._machine.name}' cannot even stand still within its limits in "
-                f"{_MAX_TRIALS} random configurations, lastly for {reason}: check it, or lower the "
-                f"margin"
+                f"{_MAX_TRIALS} random configurations, lastly for {reason}: check it, or lower "
+                "the margin"
             )
         return np.array(vectors)
 
     def scale_to_limits(self, x: Array) -> tuple[Array, str]:
-        """Scale the amplitudes of a vector to the limits; returns it with "" or the exceeded limit.
+        """Scale the amplitudes of a vector to the limits; returns also "" or an exceeded limit.
 
         Amplitudes are scaled by joint for strokes, velocities and accelerations, then together for
         forces and loops.
@@ -267,7 +267,7 @@ class TrajectoryOptimizer:
         return np.unique(np.linspace(before, after, _PEAK_INSTANTS))
 
     def _exceeded_limit(self, x: Array) -> str:
-        """Name of a limit that a trajectory exceeds, including its parts from and to rest, or ""."""
+        """Name of a limit that a trajectory with its parts from and to rest exceeds, or ""."""
         trajectory = FourierTrajectory(self.coefficients(x), self._period)
         try:
             shares = self._limit_usage_at(

@@ -1,4 +1,4 @@
-"""Settings of an identification chosen by what is left out of the training."""
+"""Cross-validation of settings of an identification within the training data."""
 
 import itertools
 import warnings
@@ -22,18 +22,18 @@ from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
 
 FOLD_COUNT = 5
-_MIN_FOLD_SAMPLES = 50  # samples of a part
+_MIN_FOLD_SAMPLES = 50  # least number of samples of a fold
 _BANDWIDTH = "bandwidth"
 
 
 @dataclass(frozen=True)
 class CrossValidationTrial:
-    """Settings, and how well they predict what they were not learned from.
+    """Settings and their prediction errors on held-out folds.
 
     Attributes:
-        settings: By name.
-        errors: (k,) norm of the residuals over that of the forces of each part left out; infinite
-            where it cannot be identified without it, nan where nothing moves in it.
+        settings: Settings by name.
+        errors: (k,) norm of the residuals over that of the forces of each held-out fold; infinite
+            if the identification fails without it, nan if nothing moves in it.
     """
 
     settings: Mapping[str, object]
@@ -41,7 +41,7 @@ class CrossValidationTrial:
 
     @property
     def mean_error(self) -> float:
-        """Root mean square of the errors of parts that move."""
+        """Root mean square of the errors of folds with motion."""
         errors = self.errors[~np.isnan(self.errors)]
         return float(np.sqrt(np.mean(errors**2))) if len(errors) else np.inf
 
@@ -53,23 +53,23 @@ def cross_validate(
     progress: Progress | None = None,
     **options: Any,
 ) -> list[CrossValidationTrial]:
-    """Errors of settings on parts of the training that were left out of it, the best first.
+    """Cross-validate settings on folds of the training data; the best are first.
 
-    Each recording is cut into five parts of equal length; each part is predicted by what the
-    others teach. All are judged by the same rows, through the same low-pass: that of the lowest
-    bandwidth tried.
+    Each recording is divided into five folds of equal length; each fold is predicted by an
+    identification from the others. All settings are compared by the same rows and the low-pass of
+    the lowest bandwidth.
 
     Args:
         machine: The machine.
-        recording: The training, one or several.
-        candidates: Values by name: "bandwidth" [Hz], or what is known of parameters by name, such
-            as {"bodies": ["1 %", "10 %"]}; all combinations are tried.
-        progress: Takes the finished share.
-        options: Of `identify`, the same for all.
+        recording: Training data, one or several recordings.
+        candidates: Values by name: "bandwidth" [Hz], or priors of parameters, such as {"bodies":
+            ["1 %", "10 %"]}; all combinations are evaluated.
+        progress: Called with the finished share, 0 to 1.
+        options: Options of `identify` for all settings.
 
     Raises:
-        InputError: Nothing is tried or what cannot be, or a recording is too short for its parts.
-        RecordingError: A recording cannot serve.
+        InputError: There are no candidates, one is not valid, or a recording is too short.
+        RecordingError: A recording is not suitable.
     """
     progress = progress_reporter(progress)
     if not candidates or not all(candidates.values()):
@@ -106,7 +106,7 @@ def cross_validate(
 
 
 def identify_options(trial: CrossValidationTrial, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What `identify` takes for these settings beside other options."""
+    """Options of `identify` for the settings of a trial and other options."""
     prior_settings = {name: what for name, what in trial.settings.items() if name != _BANDWIDTH}
     out = dict(options)
     if _BANDWIDTH in trial.settings:
@@ -120,7 +120,7 @@ def identify_options(trial: CrossValidationTrial, options: Mapping[str, Any]) ->
 
 
 def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
-    """A table of settings and errors."""
+    """Table of settings and errors."""
     rows = [["settings", "error", "of the parts left out"]]
     for trial in trials:
         words = ", ".join(f"{name}={value}" for name, value in trial.settings.items())
@@ -132,10 +132,10 @@ def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
 def _check_settings(
     machine: Machine, grid: Sequence[Mapping[str, object]], options: Mapping[str, Any]
 ) -> None:
-    """Check that settings are such as an identification takes, whatever is recorded.
+    """Check that settings are valid for an identification, independent of the recording.
 
     Raises:
-        InputError: One is not, or what they need is not installed.
+        InputError: A setting is not valid, or a required library is not installed.
     """
     if options.get("feasible"):
         load_convex_solver()
@@ -159,7 +159,7 @@ def _read_frequency(value: object) -> float:
 def _comparison_bandwidth(
     machine: Machine, candidates: Mapping[str, Sequence[object]], options: Mapping[str, Any]
 ) -> float | None:
-    """The bandwidth by which all are judged; None: that of the first identification."""
+    """Bandwidth of the comparison; None for that of the first identification."""
     if _BANDWIDTH in candidates:
         return min(map(_read_frequency, candidates[_BANDWIDTH]))
     return options.get("bandwidth") or machine.estimation.bandwidth
@@ -173,10 +173,10 @@ def _held_out_error(
     bandwidth: float | None,
     options: Mapping[str, Any],
 ) -> float:
-    """The error of one part of each motion by all the others, nan where nothing moves in it.
+    """Prediction error of one fold of each motion by the others, nan if nothing moves in it.
 
     Raises:
-        CraneError: They do not tell it.
+        CraneError: The identification fails.
     """
     training, held_out = [], []
     for motion in motions:
@@ -191,7 +191,7 @@ def _held_out_error(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         trial = identify_options(CrossValidationTrial(settings, np.empty(0)), options)
-        # of parts the checks know too little; the whole has passed, or will not
+        # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})
         held_out_equations = RegressionEquations(
             identification.model,

@@ -22,21 +22,19 @@ from crane.machine import Machine
 from crane.recordings.recording import Recording
 
 RecordingOrMotion = Recording | Motion
-_SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are left out
+_SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are omitted
 _DEFAULT_STICTION_SPEED = {
     "rad": 1e-2,
     "m": 1e-3,
-}  # [rad/s], [m/s] where stiction ends that nobody described
-_SMOOTHING_FACTOR = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
-_MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows count always
-_PASSBAND_SHARE = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
-_MIN_BANDWIDTH_FACTOR = (
-    3.0  # times the frequency below which 99 % of the velocities are, the filter's least
-)
+}  # [rad/s], [m/s] default end of stiction
+_SMOOTHING_FACTOR = 4.0  # times the smoothing velocity, tanh 4 = 0.9993
+_MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows are always used
+_PASSBAND_SHARE = 0.75  # of the passband of a smoother: there it passes 91 %
+_MIN_BANDWIDTH_FACTOR = 3.0  # least bandwidth, times the spectral edge frequency of the velocities
 _POWER_SHARE = 0.99
-_MAX_BANDWIDTH_FACTOR = 40.0  # times the frequency below which 99 % of the accelerations are
-_SPEED_SAMPLES = 500  # at which the speeds of joints are looked at
-_PASS_SHARE = 0.3  # of what is left to do that one pass over a recording is taken for
+_MAX_BANDWIDTH_FACTOR = 40.0  # times the spectral edge frequency of the accelerations
+_SPEED_SAMPLES = 500  # samples for ranges of speeds
+_PASS_SHARE = 0.3  # of the remaining progress, per pass over a recording
 
 
 def build_equations(
@@ -46,7 +44,7 @@ def build_equations(
     slow: Mapping[str, float] | ArrayLike | None = None,
     progress: Progress | None = None,
 ) -> tuple[RegressionEquations, BaseParameters]:
-    """Equations of motions, and what of the base parameters they tell.
+    """Regression equations of motions, and the identifiable part of the base parameters.
 
     Arguments and errors as for `identify`.
     """
@@ -61,12 +59,12 @@ def build_equations(
     if not equations.is_moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
     for joint, count in zip(model.machine.active, equations.is_moving.sum(axis=0), strict=True):
-        if count == 1:  # which tells nothing of its noise
+        if count == 1:  # one row does not determine the noise
             raise RecordingError(
                 f"'{joint}' is in one sample only faster than what counts as standstill, move it "
                 "more, or raise its slow"
             )
-    # of columns, the triangular factors tell what all rows tell
+    # the triangular factors have the column dependences of all rows
     return equations, equations.base.identifiable_part(
         np.vstack(list(equations.triangular_factors[:, :, :-1]))
     )
@@ -79,11 +77,11 @@ def prepare_motions(
     progress: Progress | None,
     role: str = "",
 ) -> list[Motion]:
-    """Recordings with velocities and accelerations; motions as they are.
+    """Motions of recordings, with velocities and accelerations.
 
     Raises:
-        InputError: There are none.
-        RecordingError: One cannot serve; the message says which, if there are several.
+        InputError: There are no recordings.
+        RecordingError: A recording is not suitable; the message names it if there are several.
     """
     sources = as_list(recordings)
     if not sources:
@@ -105,6 +103,7 @@ def prepare_motions(
 def as_list(
     recordings: RecordingOrMotion | Sequence[RecordingOrMotion] | None,
 ) -> list[RecordingOrMotion]:
+    """List of one or several recordings; empty for None."""
     if recordings is None:
         return []
     return [recordings] if isinstance(recordings, Recording | Motion) else list(recordings)
@@ -113,7 +112,7 @@ def as_list(
 def speed_ranges(
     model: IdentificationModel, motions: Sequence[Motion], slow: Array
 ) -> dict[str, tuple[float, float]]:
-    """Least and largest speed along each direction of friction, of so many samples."""
+    """Least and largest speed along each direction of friction."""
     directions = {
         x.direction.name: x.direction for x in model.terms if isinstance(x, FrictionTerm)
     }
@@ -131,7 +130,7 @@ def speed_ranges(
 
 
 def multi_pass_progress(progress: Progress | None) -> Progress | None:
-    """One bar for passes whose number is not known: each takes a share of what is left."""
+    """Progress over an unknown number of passes: each takes a share of the remainder."""
     if progress is None:
         return None
     done = 0.0
@@ -149,10 +148,10 @@ def multi_pass_progress(progress: Progress | None) -> Progress | None:
 def _slow_speeds(
     machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array
 ) -> Array:
-    """Velocities (n,) below which rows are left out.
+    """Standstill velocities (n,), below which rows are omitted.
 
-    If not given, a share of the largest, or where the described friction comes from rest to what
-    it is in motion, which it does in reality at velocities that nobody knows better.
+    The default is a share of the largest velocity, or the velocity at which the described friction
+    is fully developed.
     """
     out = _SLOW_SPEED_SHARE * fastest
     for i, joint in enumerate(machine.active):
@@ -180,12 +179,12 @@ def _slow_speeds(
 
 
 def _default_bandwidth(motion: Motion) -> float:
-    """[Hz] of the low-pass, far above the frequencies of the motion where it is measured well.
+    """Default bandwidth [Hz] of the low-pass, far above the frequencies of the motion.
 
-    What is modelled lies below it; above it is noise, which has to be seen to be known. But what
-    smoothing takes from the accelerations is missing in the regressor and not in the forces, most
-    at reversals, where friction jumps: so no higher than smoothing lets through, unless that is
-    hardly above the motion.
+    The band above the motion contains the noise to be estimated. But smoothing removes parts of
+    the accelerations from the regressor, not from the forces, mostly at reversals, where friction
+    jumps: so the bandwidth is at most the passband of smoothing, unless that is close to the
+    motion.
     """
     step = float(motion.time[1] - motion.time[0])
     highest = max(
@@ -196,7 +195,7 @@ def _default_bandwidth(motion: Motion) -> float:
 
 
 def _highest_frequency(x: Array, step: float) -> float:
-    """Frequency [Hz] below which 99 % of the power of each of the signals (N, n) is."""
+    """Largest frequency [Hz] below which 99 % of the power of a signal of (N, n) lies."""
     found = [
         spectral_edge_frequency(_POWER_SHARE, column / max(column.std(), 1e-300), step)
         for column in x.T

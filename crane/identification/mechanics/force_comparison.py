@@ -19,26 +19,26 @@ from crane.identification.mechanics.recording_checks import (
 from crane.identification.signals.signal_processing import Motion, sampling_step
 from crane.recordings.recording import Recording
 
-_MAX_FORCE_FACTOR = 30.0  # by which a force may be off from what the model says
-_MIN_CORRELATION = 0.9  # correlation from which a model is believed on a factor
-_BLOCK_COUNT = 10  # of time, whose scatter is the standard error of that factor
-_VALIDATION_FACTOR = 4.0  # times the training's error, from which a validation is remarked on
-_NEGLIGIBLE_ERROR = 1e-6  # of the forces, an error that is none
-_MAX_SHARED_SHARE = 0.2  # of a recording's samples, from which on it counts as part of another
-_COMPARED_SAMPLES = 2000  # samples that are looked for
-_DELAY_CONFIDENCE = 0.999  # probability of a delay that is told
+_MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model
+_MIN_CORRELATION = 0.9  # least correlation for a significant factor
+_BLOCK_COUNT = 10  # of time, for the standard error of that factor
+_VALIDATION_FACTOR = 4.0  # times the error on training data, above which a warning is given
+_NEGLIGIBLE_ERROR = 1e-6  # negligible error relative to the forces
+_MAX_SHARED_SHARE = 0.2  # of the samples of a recording that another one may contain
+_COMPARED_SAMPLES = 2000  # compared samples
+_DELAY_CONFIDENCE = 0.999  # confidence level of a reported delay
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ForceComparison(OneLineRepr):
-    """Measured and modelled forces of one recording, both through the same filter.
+    """Measured and modelled forces of one recording after the same filter.
 
     Attributes:
         time: (M,) [s].
-        measured: (M, n) [N], [N m].
-        modelled: (M, n).
-        is_moving: (M, n) which rows count: those away from zero velocity.
-        joints: Names (n,).
+        measured: (M, n) measured forces [N], [N m].
+        modelled: (M, n) modelled forces.
+        is_moving: (M, n) mask of the rows away from standstill.
+        joints: (n,) names.
     """
 
     time: Array
@@ -49,7 +49,7 @@ class ForceComparison(OneLineRepr):
 
     @property
     def residuals(self) -> Array:
-        """(M, n) measured less modelled."""
+        """Residuals (M, n): measured minus modelled forces."""
         return self.measured - self.modelled
 
     def _rms(self, values: Array) -> Array:
@@ -61,23 +61,23 @@ class ForceComparison(OneLineRepr):
 
     @property
     def rmse(self) -> Array:
-        """(n,) root mean square of the residuals [N], [N m], nan where nothing moves."""
+        """Root mean square (n,) of the residuals [N], [N m], nan for joints without motion."""
         return self._rms(self.residuals)
 
     @property
     def relative_error(self) -> Array:
-        """(n,) the same over the root mean square of the measured force, nan of a free one."""
+        """RMS of the residuals over that of the measured force (n,), nan of a free joint."""
         size = self._rms(self.measured)
         return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
 
     @property
     def percentage_error(self) -> Array:
-        """(n,) equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
+        """Error (n,) of equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
         return 100 * self.relative_error**2
 
     @property
     def overall_relative_error(self) -> float:
-        """Norm of all residuals over that of all measured forces, nan where these are zero."""
+        """Norm of all residuals over that of all measured forces, nan if these are zero."""
         residual_norm, force_norm = (
             np.linalg.norm(x[self.is_moving]) for x in (self.residuals, self.measured)
         )
@@ -91,16 +91,16 @@ def check_forces(
     longest_delay: float = 0.05,
     trust: bool = False,
 ) -> None:
-    """Compare recorded forces with those (N, n) of a model, of rough parameters even.
+    """Check recorded forces against those (N, n) of a model with rough parameters.
 
-    What friction and rotors can make counts for nothing: the scale c of a joint is that of the
-    regression tau = c modelled + c0 + c1 sign(v) + c2 v + c3 |v| + c4 a, its standard error the
-    scatter of ten blocks of time. Where the model has hardly a share in the force besides, c says
-    nothing, and a force that is many times the model's is a doubt that is told, not refused.
+    Effects of friction and rotors are excluded: the scale c of a joint is that of the regression
+    tau = c modelled + c0 + c1 sign(v) + c2 v + c3 |v| + c4 a, with the standard error by ten
+    blocks of time. If the model explains little of the remaining force, c is not significant, and
+    a force of many times the model's causes a warning only.
 
     Raises:
-        RecordingError: It is sure that they differ by more than a factor of thirty, in sign, or
-            that they come late or early.
+        RecordingError: The forces differ significantly by more than a factor of thirty, in sign,
+            or by a delay.
     """
     messages = []
     for i, joint in enumerate(joints):
@@ -133,8 +133,8 @@ def check_forces(
         if not is_known and not 1 / _MAX_FORCE_FACTOR < ratio < _MAX_FORCE_FACTOR:
             messages.append(f"'{joint}_force' is {ratio:.3g} times the model's")
         lag = signal_delay(motion.time, expected, measured)
-        # a rough model is believed on a delay only if that explains nearly everything: a force
-        # that friction makes looks like inertia's a quarter period later
+        # a rough model gives a delay only if the shift explains nearly everything: friction looks
+        # like inertia a quarter of a period later
         if not 0.5 < ratio < 2.0:
             continue
         shifted_correlation = _shifted_correlation(
@@ -155,9 +155,9 @@ def check_forces(
 def warn_delays(
     joints: Sequence[str], delays: Array, std: Array, blocks: int, longest_delay: float = 0.05
 ) -> None:
-    """Warn of forces that come late, by what `delays.delays` found (n,) [s].
+    """Warn of delays (n,) [s] of forces, see `force_delays`.
 
-    Early ones only where friction cannot be the reason: by more than `longest_delay`.
+    Early forces are reported only above `longest_delay`, as friction causes small leads.
     """
     from scipy.stats import t
 
@@ -177,7 +177,7 @@ def warn_delays(
 
 
 def warn_validation(training: ForceComparison, validation: ForceComparison) -> None:
-    """Warn where a fit predicts far worse than it fits, both relative and in N or N m."""
+    """Warn if errors on held-out data are far above those on training data."""
     messages = []
     pairs = zip(
         training.joints,
@@ -210,7 +210,7 @@ def check_shared_samples(
     validation: Sequence[Recording | Motion],
     trust: bool = False,
 ) -> None:
-    """Refuse what is learned from twice, and warn of a validation that was learned from.
+    """Reject repeated training data, and warn of held-out data that are training data.
 
     Raises:
         RecordingError: Two of the recordings share instants and forces.
@@ -234,9 +234,9 @@ def check_shared_samples(
 
 
 def _shared_share(one: Recording | Motion, other: Recording | Motion) -> float:
-    """Share of the other's samples that one has, at the same time and with the same forces.
+    """Share of the other's samples that one contains at the same time with the same forces.
 
-    Of those whose forces change: simulations that begin at rest begin alike.
+    Only samples with changing forces are used, as simulations from rest begin alike.
     """
     some = slice(None, None, max(1, len(other.time) // _COMPARED_SAMPLES))
     time, tau = other.time[some], other.tau[some]
@@ -249,7 +249,7 @@ def _shared_share(one: Recording | Motion, other: Recording | Motion) -> float:
 
 
 def _force_scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, float]:
-    """Scale of y against x with friction and rotors beside it, standard error, correlation."""
+    """Scale of y against x beside friction and rotors, its standard error, and correlation."""
     others = np.column_stack([np.ones_like(v), np.sign(v), v, np.abs(v), a])
     size = np.linalg.norm(others, axis=0)
     U, values, _ = np.linalg.svd(others / np.where(size > 0, size, 1.0), full_matrices=False)
@@ -259,7 +259,7 @@ def _force_scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, 
         rest = column - U @ (U.T @ column)
         residuals.append(rest)
         energy.append(float(rest @ rest))
-        if energy[-1] < 1e-18 * float(column @ column):  # all of it is friction's
+        if energy[-1] < 1e-18 * float(column @ column):  # explained by friction alone
             return 0.0, math.inf, 0.0
     scale = float(residuals[0] @ residuals[1]) / energy[1]
     products = residuals[1] * (residuals[0] - scale * residuals[1])
@@ -269,7 +269,7 @@ def _force_scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, 
 
 
 def _shifted_correlation(one: Array, other: Array, shift: int) -> float:
-    """Correlation of one signal with another that comes so many samples later."""
+    """Correlation of one signal with another one shifted by a number of samples."""
     count = len(one) - abs(shift)
     offsets = max(shift, 0), max(-shift, 0)
     return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])

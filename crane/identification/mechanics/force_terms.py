@@ -20,18 +20,18 @@ ForceShape = Callable[[Array], Array]
 
 
 class VelocityFriction:
-    """Forces along one direction whose shapes over its velocity are known: friction.
+    """Friction term: known functions of the velocity along one direction times parameters.
 
     Args:
         machine: The machine.
-        direction: A joint's name, or a combination.
-        shapes: Velocity (N,) -> (N,) by name of the parameter.
-        nominal: Their values; zero if not given.
+        direction: Name of a joint, or a combination.
+        shapes: Functions velocity (N,) -> (N,) by name of the parameter.
+        nominal: Nominal values; default zero.
         nonnegative: Names of parameters that cannot be negative.
 
     Attributes:
         direction: See above.
-        stribeck_velocities: Velocities over which stiction fades [m/s], [rad/s].
+        stribeck_velocities: Stribeck velocities [m/s], [rad/s].
     """
 
     stribeck_velocities: tuple[float, ...] = ()
@@ -57,12 +57,12 @@ class VelocityFriction:
         return rows[:, :, None] * self.steady_forces(speed)[:, None, :]
 
     def steady_forces(self, v: Array) -> Array:
-        """(N, k) forces per parameter at steady speeds (N,)."""
+        """Forces (N, k) per parameter at steady speeds (N,)."""
         return np.stack([shape(v) for shape in self._shapes.values()], axis=1)
 
 
 def smoothed_sign(smoothing: float) -> ForceShape:
-    """sign(v), smoothed to tanh(v / smoothing) as in the simulation."""
+    """Function sign(v), smoothed to tanh(v / smoothing) as in the simulation."""
     if smoothing == 0:
         return np.sign
     return lambda v: np.tanh(v / smoothing)
@@ -75,17 +75,17 @@ def friction_term(
     smoothing: float | None = None,
     stribeck: Sequence[float] = (),
 ) -> VelocityFriction:
-    """Friction of equation (5) of the reduced-scale forwarder paper, and Stribeck's.
+    """Friction term of equation (5) of the reduced-scale forwarder paper, with stiction.
 
         coulomb s + coulomb_offset + viscous v + viscous_offset |v|
         + sum_i stiction_i s e^-(v / v_i)^2,    s = sign(v).
 
     Args:
-        machine: The machine, whose own friction is nominal.
-        direction: A joint's name, or a combination.
-        kinds: Which of the four.
-        smoothing: Of the sign [m/s], [rad/s]; the machine's if not given, 0 for a jump.
-        stribeck: Velocities v_i [m/s], [rad/s]; the parameters of several: stiction_1, ...
+        machine: The machine, whose friction gives the nominal values.
+        direction: Name of a joint, or a combination.
+        kinds: Names of the kinds, some of the four.
+        smoothing: Smoothing velocity of the sign [m/s], [rad/s]; default that of the machine.
+        stribeck: Stribeck velocities v_i [m/s], [rad/s]; parameters of several are stiction_1, ...
     """
     name = direction if isinstance(direction, str) else direction.name
     law = machine.friction.get(name, Friction(smoothing=0.0))
@@ -116,22 +116,21 @@ def friction_term(
 
 
 def root_friction_term(machine: Machine, direction: str | ForceDirection) -> VelocityFriction:
-    """Friction like the root of the speed, of mixed lubrication: root sign(v) sqrt |v|."""
+    """Friction term of mixed lubrication: root sign(v) sqrt |v|."""
     shape = {"root": lambda v: np.sign(v) * np.sqrt(np.abs(v))}
     return VelocityFriction(machine, direction, shape)
 
 
 class FrictionalMemory:
-    """Friction that remembers rest: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 first.
+    """Frictional memory: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 at the start.
 
-    A joint that starts from rest sticks more than one that comes to rest, as the contact takes
-    time to change.
+    The friction is larger after rest than before it, as the contact changes with a lag.
 
     Args:
         machine: The machine.
-        direction: A joint's name, or a combination.
-        lag: Over which rest is forgotten [s].
-        speed: At which it is forgotten [m/s], [rad/s].
+        direction: Name of a joint, or a combination.
+        lag: Time constant [s].
+        speed: Characteristic speed [m/s], [rad/s].
     """
 
     names: tuple[str, ...]
@@ -158,7 +157,7 @@ class FrictionalMemory:
             raise InputError(f"'{self.names[0]}' remembers time, give the step of the samples")
         rows = self.direction.jacobian(self._machine, samples)
         v = np.einsum("ij,ij->i", rows, samples.v_a)
-        share = -np.expm1(-samples.step / self._lag)  # exact for a steady speed
+        share = -np.expm1(-samples.step / self._lag)  # exact for constant speed
         w, state = np.empty_like(v), samples.term_states.get(self, np.zeros(1))
         edges = sorted({0, *samples.starts, len(v)})
         for start, end in pairwise(edges):
@@ -168,19 +167,19 @@ class FrictionalMemory:
         return (rows * (np.sign(v) * np.exp(-w / self._speed))[:, None])[:, :, None]
 
     def steady_forces(self, v: Array) -> Array:
-        """(N, 1) force per parameter at steady speeds (N,), where w = |v|."""
+        """Force (N, 1) per parameter at steady speeds (N,), where w = |v|."""
         return (np.sign(v) * np.exp(-np.abs(v) / self._speed))[:, None]
 
 
 class PreslidingFriction:
-    """Friction that has to be wound up first: Dahl's law over the travelled distance.
+    """Presliding friction: Dahl's law over the travelled distance.
 
-    F = force z, dz = (1 - sign(v) z) ds / length, z = 0 where a recording begins (Dahl, 1968).
+    F = force z, dz = (1 - sign(v) z) ds / length, z = 0 at the start of a recording (Dahl, 1968).
 
     Args:
         machine: The machine.
-        direction: A joint's name, or a combination.
-        length: Distance over which it winds up [m], [rad].
+        direction: Name of a joint, or a combination.
+        length: Characteristic distance [m], [rad].
     """
 
     names: tuple[str, ...]
@@ -207,22 +206,22 @@ class PreslidingFriction:
             if i in restarts:
                 state = 0.0
             limit = 1.0 if step > 0 else -1.0
-            state = limit + (state - limit) * np.exp(-abs(step))  # exact for a steady direction
+            state = limit + (state - limit) * np.exp(-abs(step))  # exact for a constant direction
             z[i] = state
         samples.term_states[self] = (state, travel[-1])
         return rows[:, :, None] * z[:, None, None]
 
     def steady_forces(self, v: Array) -> Array:
-        """(N, 1) force per parameter at steady speeds (N,), wound up."""
+        """Force (N, 1) per parameter at steady speeds (N,), fully developed."""
         return np.sign(v)[:, None]
 
 
 class GasSpringTerm:
-    """A factor on the force of a gas spring, whose nominal value is 1.
+    """Term of a gas spring: a factor on its force with the nominal value 1.
 
     Args:
         machine: The machine.
-        joint: That the gas spring acts on, or its own name.
+        joint: Joint of the gas spring, or its name.
     """
 
     names: tuple[str, ...]
@@ -244,14 +243,14 @@ class GasSpringTerm:
 
 
 class ForceElementTerm:
-    """A passive force of known shape along a joint or distance times an unknown factor.
+    """Passive force of known shape along a joint or distance times a factor.
 
     Args:
         machine: The machine.
-        direction: A joint's name, active or passive, or a combination or distance.
-        shape: Coordinate (N,) [m], [rad] -> force in the positive direction per factor.
-        name: Of the factor.
-        nominal: Its value.
+        direction: Name of a joint, active or passive, or a combination or distance.
+        shape: Function coordinate (N,) [m], [rad] -> force in the positive direction per factor.
+        name: Name of the factor.
+        nominal: Nominal value of the factor.
     """
 
     names: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Identified friction as a machine file has it."""
+"""Friction laws of a machine file for identified friction terms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -19,19 +19,18 @@ FrictionTerm = VelocityFriction | PreslidingFriction | FrictionalMemory
 SpeedRanges = Mapping[str, tuple[float, float]]
 
 _FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))
-_SPEED_COUNT = 100  # speeds at which laws are compared, each way
-_MAX_STRIBECK_SHARE = 0.3  # of the largest speed, where stiction is gone
-_STRIBECK_GRID_SIZE = 30  # that are tried for where stiction fades
+_SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
+_MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
+_STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
 
 
 @dataclass(frozen=True)
 class FrictionLawFit:
-    """A law of friction in the place of the identified one.
+    """Friction law that replaces identified friction terms.
 
     Attributes:
-        law: The law.
-        max_deviation: By how much the two differ at most at a steady speed [N], [N m]; 0 where
-            they are one.
+        law: The friction law.
+        max_deviation: Largest difference at a steady speed [N], [N m]; 0 if the law is exact.
     """
 
     law: Friction
@@ -41,20 +40,19 @@ class FrictionLawFit:
 def friction_laws(
     model: IdentificationModel, parameters: Array, speed_ranges: SpeedRanges
 ) -> dict[str, FrictionLawFit]:
-    """The law of each direction that the model has friction along.
+    """Friction law of each direction with friction terms in the model.
 
-    What is none of a machine file's kinds (friction that winds up, remembers rest, goes with the
-    root of the speed, or fades over several velocities) is replaced by the law that is nearest, in
-    least squares, to what all of it is at a steady speed, both ways.
+    Terms that a machine file does not contain (presliding, frictional memory, root of the speed,
+    several Stribeck velocities) are replaced by the law that is nearest in least squares to the
+    total friction at steady speeds in both directions.
 
     Args:
         model: The model.
-        parameters: Of all (p,).
-        speed_ranges: Least and largest speed by direction [m/s], [rad/s], between which they are
-            compared.
+        parameters: All parameters (p,).
+        speed_ranges: Least and largest speed of the comparison by direction [m/s], [rad/s].
 
     Raises:
-        InputError: Friction is negative.
+        InputError: Identified friction is negative.
     """
     values = dict(zip(model.names, parameters.tolist(), strict=True))
     terms_by_direction: dict[str, list[FrictionTerm]] = {}
@@ -74,7 +72,7 @@ def _exact_law(
     found = {each.removeprefix(f"{name}."): values[each] for term in terms for each in term.names}
     if not found.keys() <= set(_FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
         return None
-    # a joint without friction of its own is identified with a sign that jumps
+    # a joint without described friction is identified with an unsmoothed sign
     law = model.machine.friction.get(name, Friction(smoothing=0.0))
     stribeck_velocities = [
         v for term in terms if isinstance(term, VelocityFriction) for v in term.stribeck_velocities

@@ -1,4 +1,4 @@
-"""tau = W beta: the drives' forces as linear functions of a machine's parameters."""
+"""Identification model tau = W beta: drive forces as linear functions of parameters."""
 
 import fnmatch
 import math
@@ -30,33 +30,32 @@ from crane.identification.mechanics.model_term import (
 from crane.machine import Machine
 
 TermChanges = Mapping[str, TermValues | None]
-"""Numbers of a term by name, () where it has none; None leaves it out."""
+"""Values of a term by name, () if it has none; None removes the term."""
 _FRICTION_KINDS = ("coulomb", "coulomb_offset", "viscous", "viscous_offset")
 
 
 class IdentificationModel:
-    """The parameters of a machine and their linear effect on the drives' forces.
+    """Identification model: drive forces as linear functions of the parameters of a machine.
 
         tau_A = W(q_A, v_A, a_A) beta + known,
 
-    known = gamma^T (I_r a - f) with the passive forces f and the rotor inertias I_r of the machine
-    that no term scales.
+    with known = gamma^T (I_r a - f), the passive forces f and rotor inertias I_r of the machine
+    that are not estimated by a term.
 
     Args:
         machine: The machine.
-        terms: Groups of columns; or what is to be estimated beside or instead of what its
-            description asks for, by name, see `select_terms`.
-        known_forces: Samples -> (N, n), in the place of these forces.
+        terms: Terms of the model; or changes of the default terms by name, see `select_terms`.
+        known_forces: Function samples -> (N, n) in place of these known forces.
 
     Attributes:
-        names: (p,) of the parameters.
-        nominal: (p,) values by the machine's description.
-        nonnegative: (p,) whether a parameter cannot be negative.
-        bodies: Names of the bodies, whose inertial parameters are the first 10 nb columns, or ()
-            where the model has none.
+        names: (p,) names of the parameters.
+        nominal: (p,) values by the description of the machine.
+        nonnegative: (p,) whether a parameter must not be negative.
+        bodies: Names of the bodies, whose inertial parameters are the first 10 nb columns; ()
+            without bodies.
 
     Raises:
-        InputError: Two parameters of the same name.
+        InputError: Two parameters have the same name.
     """
 
     def __init__(
@@ -102,7 +101,7 @@ class IdentificationModel:
         step: float | None = None,
         starts: Sequence[int] = (0,),
     ) -> MotionSamples:
-        """Close the loops along a motion, (N, n) each; see `MotionSamples`."""
+        """Close the loops along a motion (N, n); see `MotionSamples`."""
         active = self.machine.active
         q_a, v_a, a_a = (
             np.atleast_2d(as_samples(x, len(active), name, active))
@@ -113,11 +112,11 @@ class IdentificationModel:
         return MotionSamples(q_a, v_a, a_a, q, closure.gamma(q), step, starts)
 
     def regressor(self, samples: MotionSamples) -> Array:
-        """W (N, n, p)."""
+        """Regressor W (N, n, p)."""
         return np.concatenate([term.columns(samples) for term in self.terms], axis=2)
 
     def known_forces(self, samples: MotionSamples) -> Array:
-        """Forces (N, n) that no parameter changes: tau = W beta + known."""
+        """Known forces (N, n), independent of the parameters: tau = W beta + known."""
         if self._known_forces_function is not None:
             return self._known_forces_function(samples)
         v = np.einsum("kij,kj->ki", samples.gamma, samples.v_a)
@@ -132,11 +131,11 @@ class IdentificationModel:
 
 @dataclass(frozen=True)
 class TermKind:
-    """A kind of term.
+    """Kind of a term.
 
     Attributes:
-        description: What its numbers are, in words.
-        value_count: How many there are at least and at most.
+        description: Text of its values.
+        value_count: Least and largest number of values.
     """
 
     description: str = ""
@@ -152,19 +151,23 @@ TERM_KINDS = {
 
 
 def default_terms(machine: Machine) -> list[ModelTerm]:
-    """Bodies; four coefficients of friction per driven joint, viscous friction of all others."""
+    """Default terms: bodies, and friction of driven (four kinds) and other joints (viscous)."""
     return _build_terms(machine, _default_kinds(machine))
 
 
 def select_terms(machine: Machine, changes: TermChanges) -> list[ModelTerm]:
-    """Terms of a model: the default ones, those of the machine's `estimation`, and changes.
+    """Terms of a model: default terms, those of the machine's `estimation`, and changes.
+
+    A name is WHERE.KIND. WHERE is a joint, a pattern of joints (q*), or active joints with factors
+    that a motor turns together (q5+q6, q6+0.5*q5); KIND is one of `TERM_KINDS`.
 
     Args:
         machine: The machine.
-        changes: As in a machine file under `identification`, `terms`: later ones win.
+        changes: Changes as in a machine file under `identification`, `terms`; later ones take
+            precedence.
 
     Raises:
-        InputError: A name that nothing has, or numbers that do not fit or are not above 0.
+        InputError: A name is unknown, or values are not valid or not positive.
     """
     values_by_element, requested = _default_kinds(machine), set()
     for name, values in (*machine.estimation.terms.items(), *changes.items()):
@@ -189,17 +192,17 @@ def select_terms(machine: Machine, changes: TermChanges) -> list[ModelTerm]:
             kinds[kind] = values
             requested.add((element, kind))
     for element, kinds in values_by_element.items():
-        # Dahl's law is Coulomb friction that winds up first
+        # Dahl's law replaces Coulomb friction
         if "presliding" in kinds and (element, "coulomb") not in requested:
             kinds.pop("coulomb", None)
     return _build_terms(machine, values_by_element)
 
 
 def parse_combination(name: str) -> ForceDirection | None:
-    """The direction of joints that a motor turns with together, None of a single name.
+    """Direction of joints that a motor turns together, None for a single name.
 
     Raises:
-        InputError: A factor that is no number or 0, or a joint twice.
+        InputError: A factor is no number or 0, or a joint is named twice.
     """
     if "+" not in name:
         return None
@@ -219,7 +222,7 @@ def parse_combination(name: str) -> ForceDirection | None:
 
 
 def _default_kinds(machine: Machine) -> dict[str, dict[str, TermValues]]:
-    """Numbers of the default terms, by where and kind."""
+    """Values of the default terms by element and kind."""
     values_by_element: dict[str, dict[str, TermValues]] = {
         joint: dict.fromkeys(_FRICTION_KINDS, ()) for joint in machine.driven_joints
     }
@@ -232,7 +235,7 @@ def _default_kinds(machine: Machine) -> dict[str, dict[str, TermValues]]:
 
 
 def _matching_elements(machine: Machine, where: str, kind: str) -> list[str]:
-    """The joints, gas springs or combination that a name is about; none that is locked."""
+    """Joints, gas springs or combination that a name refers to, without locked ones."""
     if kind == "gas_scale":
         names = [spring.joint for spring in machine.gas_springs]
     elif where not in machine.joints and (direction := parse_combination(where)) is not None:
@@ -277,7 +280,7 @@ def _build_terms(
 
 
 def _described_stribeck_velocity(machine: Machine, joint: str) -> float:
-    """The velocity over which a joint's described stiction fades."""
+    """Stribeck velocity of a joint by the description."""
     law = machine.friction.get(joint)
     if law is None or not law.stiction:
         raise InputError(

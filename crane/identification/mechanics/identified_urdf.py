@@ -20,9 +20,7 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.mechanics.model_term import ForceDirection, body_names
 from crane.machine import Machine
 
-_FLATNESS_TOLERANCE = (
-    1e-6  # smallest eigenvalue of a flat body's pseudo-inertia, its diagonal scaled to one
-)
+_FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
 _INERTIA_INDICES = {
     "ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2),
 }  # fmt: skip
@@ -48,24 +46,24 @@ _URDF_TEMPLATE = """<?xml version="1.0"?>
 def divide_locked_bodies(
     machine: Machine, parameters: Array, unlocked_machine: Machine
 ) -> dict[str, Array]:
-    """Parameters (10,) of each moving link, from those of what locked joints make one body.
+    """Divide the parameters of bodies with locked joints among their links, (10,) each.
 
-    Of a body with the pseudo-inertia P (`feasible.pseudo_inertia`) that consists of links whose
-    descriptions D_k add up to D, link k gets
+    For a body with the pseudo-inertia P (`pseudo_inertia`) that consists of links with the
+    descriptions D_k, whose sum is D, link k gets
 
         P_k = T D_k T^T,   T = L L_D^-1,   P = L L^T,  D = L_D L_D^T,
 
-    all in the frame of the body's joint: the parts add up to P, each is as possible as its
-    description, and all are the described ones where P is D. Descriptions of rods and plates
-    without thickness count with some. Links that the locks fix to the ground stay as described.
+    all in the frame of the body's joint: the sum of the links is P, each link is feasible if its
+    description is, and P = D gives the descriptions. Rods and plates without thickness are
+    thickened. Links that locks fix to the ground are unchanged.
 
     Args:
-        machine: With locked joints.
-        parameters: (10 nb,) of its bodies.
-        unlocked_machine: The same without.
+        machine: Machine with locked joints.
+        parameters: (10 nb,) parameters of its bodies.
+        unlocked_machine: The machine without locked joints.
 
     Raises:
-        InputError: A body cannot exist.
+        InputError: A body is not feasible.
     """
     described = (
         Dynamics(unlocked_machine)
@@ -76,7 +74,7 @@ def divide_locked_bodies(
     out = {}
     for name, body in zip(body_names(unlocked_machine), described, strict=True):
         frame = machine.model.frames[machine.frame(name)]
-        A = frame.placement.homogeneous  # P about the body's joint is A P A^T
+        A = frame.placement.homogeneous  # the pseudo-inertia about the body's joint is A P A^T
         if frame.parentJoint == 0:
             out[name] = body
         else:
@@ -103,7 +101,7 @@ def divide_locked_bodies(
 
 
 def is_solid(body: Array) -> bool:
-    """Whether a body of parameters (10,) has mass in all directions, far above rounding."""
+    """Whether a body of parameters (10,) has an extent in all directions."""
     P = pseudo_inertia(body)
     units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
     return bool(np.linalg.eigvalsh(P / np.outer(units, units))[0] > _FLATNESS_TOLERANCE)
@@ -112,13 +110,13 @@ def is_solid(body: Array) -> bool:
 def replace_inertials(
     file: Path, bodies: Mapping[str, Array], fixed_links: set[str], origin_text: str
 ) -> etree._ElementTree:
-    """The tree of a URDF with other inertials, and without loops: their ends become links.
+    """Replace the inertials of a URDF, and its loops by links at their ends.
 
     Args:
         file: The URDF.
-        bodies: Ten parameters about the origin of its frame by link that a joint moves.
-        fixed_links: Links fixed to one of those, whose inertials are removed.
-        origin_text: Where the numbers come from, for a comment.
+        bodies: Ten parameters about the link origin, by link that a joint moves.
+        fixed_links: Links fixed to one of these, whose inertials are removed.
+        origin_text: Source of the values, for a comment.
     """
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     tree = etree.parse(str(file), parser)
@@ -149,7 +147,7 @@ def replace_inertials(
 
 
 def _inertial_element(body: Array) -> etree._Element:
-    """<inertial> of ten parameters about the origin of the link's frame."""
+    """Element <inertial> of ten parameters about the link origin."""
     inertia = pin.Inertia.FromDynamicParameters(body)
     inertial = etree.Element("inertial")
     xyz = " ".join(map(repr, inertia.lever.tolist()))
@@ -163,7 +161,7 @@ def _inertial_element(body: Array) -> etree._Element:
 
 
 def _remove_element(element: etree._Element) -> None:
-    """Remove an element, not what stands after it."""
+    """Remove an element, but not the text after it."""
     element.tail, tail = None, element.tail
     parent, previous = element.getparent(), element.getprevious()
     parent.remove(element)
@@ -174,14 +172,14 @@ def _remove_element(element: etree._Element) -> None:
 
 
 def _resolve_mesh_path(mesh: etree._Element, folder: Path) -> None:
-    """Name a mesh by its whole path, where it is there."""
+    """Replace the path of a mesh by the absolute path, if the file exists."""
     file = find_mesh_file(mesh.get("filename", ""), folder)
     if file is not None:
         mesh.set("filename", str(file.resolve()))
 
 
 def _add_loop_frame(robot: etree._Element, loop: etree._Element, end: str) -> None:
-    """The frame of a loop's end as a link, as a sub-chain has it."""
+    """Add the frame at the end of a loop as a link, as in a sub-chain."""
     loop_end = loop.find(end)
     name = f"{loop.get('name').strip()}_{end}"
     etree.SubElement(robot, "link", name=name)
@@ -193,7 +191,7 @@ def _add_loop_frame(robot: etree._Element, loop: etree._Element, end: str) -> No
 
 
 def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
-    """The directions of a model that several active joints make, each once."""
+    """Directions of a model that combine several active joints."""
     found = {
         direction.name: direction
         for term in model.terms
@@ -205,10 +203,10 @@ def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
 def motor_chain(
     direction: ForceDirection, parent: str
 ) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """A rotor that a coupling turns: its chain, the coupling, and its URDF.
+    """Rotor of a motor that turns several joints: its chain, coupling, and URDF.
 
-    Its joint has the direction's name, and is where rotor inertia and friction are. Its link has a
-    mass of a milligram, as a body wants one.
+    Its joint has the name of the direction and carries rotor inertia and friction. Its link has a
+    mass of 1 mg, as bodies need a mass.
     """
     name = direction.name
     assert direction.factors is not None

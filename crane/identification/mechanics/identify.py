@@ -56,7 +56,7 @@ from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
 
 METHODS = {"ols": least_squares, "wls": weighted_least_squares, "huber": huber}
-_MIN_COMPARED_ROWS = 50  # rows from which on forces are compared with the model's
+_MIN_COMPARED_ROWS = 50  # least number of rows for a comparison of forces with the model
 
 
 @with_single_threaded_blas
@@ -74,44 +74,43 @@ def identify(
     trust: bool = False,
     progress: Progress | None = None,
 ) -> Identification:
-    """Base parameters of a machine from recorded strokes and forces.
+    """Identify the base parameters of a machine from recorded strokes and forces.
 
-    tau_A + gamma^T f = W(q_A, v_A, a_A) beta on both sides of a zero-phase low-pass, thinned;
-    rows of a joint near standstill left out. What the machine file says under `identification`
-    (terms, prior, bandwidth, slow) counts, with what is given here beside it, or in its place.
+    Both sides of tau_A + gamma^T f = W(q_A, v_A, a_A) beta pass a zero-phase low-pass and are
+    decimated; rows of a joint near standstill are omitted. The settings of the machine file under
+    `identification` (terms, prior, bandwidth, slow) are used; arguments add to them or replace
+    them.
 
     Args:
         machine: The machine, whose geometry is taken as known.
-        recording: What to learn from, one or several; a `Motion` if velocities and accelerations
-            are known.
-        validation: What to be judged by, not learned from, likewise; told where it is too short
-            for the low-pass or stands still.
-        method: "ols", "wls" (rows of each joint by its noise) or "huber" (robust).
-        prior: What is known before, about which the estimate is regularised: by name, such as
-            {"bodies": "10 %", "q1.viscous": "200 +- 50"}, see `priors.stated`; the share to which
-            all of the description holds; or means and standard deviations (p,) of all
-            parameters. All parameters come out then, not only the base parameters.
-        feasible: Whether the bodies have to be able to exist and friction must not be negative;
-            all parameters come out.
-        terms: Of the model; or by name what changes of the usual ones, such as
-            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `terms.select_terms`.
-        bandwidth: [Hz] of the low-pass; if not given, far above the frequencies of the motion,
-            but no higher than the motion is known where noise asked for smoothing, as of a coarse
-            potentiometer.
-        slow: Velocities below which rows are left out, (n,) or by joint or pattern: a few times
-            that over which friction at rest fades. If not given, 4 times the description's
-            smoothing and Stribeck velocity, of friction that sticks with neither 0.01 rad/s and
-            1 mm/s, or 2 % of a joint's largest.
-        trust: Whether a recording that is most likely wrong is taken nevertheless: why it is so
-            is told as a warning, and outliers are left in.
+        recording: Training data, one or several recordings; a `Motion` if velocities and
+            accelerations are known.
+        validation: Held-out data, likewise; a warning is given if it is too short for the low-pass
+            or has no motion.
+        method: "ols", "wls" (rows of each joint weighted by its noise) or "huber" (robust).
+        prior: Prior that regularizes the estimate: by name, such as {"bodies": "10 %",
+            "q1.viscous": "200 +- 50"}, see `prior_from_names`; a relative standard deviation of
+            the whole description; or means and standard deviations (p,) of all parameters. With a
+            prior all parameters are estimated, not only the base parameters.
+        feasible: Whether to constrain bodies to be physically feasible and friction to be
+            nonnegative; all parameters are estimated then.
+        terms: Terms of the model; or changes of the default terms by name, such as
+            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `select_terms`.
+        bandwidth: Bandwidth of the low-pass [Hz]; default far above the frequencies of the motion,
+            but at most the passband of the smoothing of noisy coordinates.
+        slow: Standstill velocities below which rows are omitted, (n,) or by joint or pattern.
+            Default 4 times the smoothing or Stribeck velocity of the description (0.01 rad/s and 1
+            mm/s for stiction without them), or 2 % of a joint's largest velocity.
+        trust: Whether to accept a recording that is probably wrong: reasons become warnings, and
+            outliers are not removed.
         progress: Takes the finished share.
 
     Returns:
-        Parameters, their confidence, and how well they predict both recordings.
+        Parameters with covariance, and prediction errors on training and held-out data.
 
     Raises:
-        InputError: Arguments that do not fit, or no CVXPY for feasible bodies.
-        RecordingError: A recording that cannot serve, and why; one that determines nothing.
+        InputError: Arguments are not valid, or CVXPY is missing for feasible bodies.
+        RecordingError: A recording is not suitable, or does not determine any parameter.
     """
     progress = progress_reporter(progress)
     if method not in METHODS:
@@ -120,7 +119,7 @@ def identify(
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     if feasible:
-        load_convex_solver()  # before all the work
+        load_convex_solver()  # fail early
     final_progress, progress = progress, multi_pass_progress(progress)
     check_shared_samples(as_list(recording), as_list(validation), trust)
     motions = prepare_motions(machine, recording, trust, progress)
@@ -170,7 +169,7 @@ def identify(
         parameters = estimate.values
         values = identifiable.values(parameters)
         covariance = identifiable.grouping @ estimate.covariance @ identifiable.grouping.T
-    # what is known of all parameters predicts another motion better than what this one tells
+    # an estimate of all parameters predicts other motions better
     predicting_values = (
         selection @ values if parameters is None else equations.base.values(parameters)
     )
@@ -228,10 +227,10 @@ def identify(
 
 
 def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
-    """Check that not all forces are known to be zero.
+    """Check that the mass scale is determined: not all forces are zero.
 
     Raises:
-        RecordingError: They are.
+        RecordingError: All forces are zero.
     """
     if machine.free and not equations.y.any():
         body = body_names(machine)[-1]
@@ -245,7 +244,7 @@ def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
 def _warn_short_validations(
     motions: Sequence[Motion], long_motions: Sequence[Motion], bandwidth: float
 ) -> None:
-    """Warn of validations that judge nothing."""
+    """Warn of held-out data that are not usable."""
     short_count = len(motions) - len(long_motions)
     text = (
         f"{short_count} of {len(motions)} validations are too short for a low-pass of "
@@ -264,14 +263,12 @@ def _build_prior(
     parameter_sizes: Array,
     feasible: bool,
 ) -> Prior | None:
-    """Means and standard deviations (p,) of all parameters; None where nothing is known."""
+    """Prior means and standard deviations (p,) of all parameters; None without a prior."""
     known = dict(model.machine.estimation.prior)
     if given is not None:
         if not isinstance(given, Mapping | int | float):
             return check_prior(model, base, given, feasible)
-        given_priors = read_priors(
-            given
-        )  # after what the machine file says, also of the same name
+        given_priors = read_priors(given)  # takes precedence over the machine file
         known = {
             name: what for name, what in known.items() if name not in given_priors
         } | given_priors
@@ -284,7 +281,7 @@ def _check_forces(
     equations: RegressionEquations,
     trust: bool,
 ) -> None:
-    """Doubts about the forces of recordings, by what the model can say."""
+    """Check the forces of recordings against the model."""
     modelled, first = equations.compare(equations.base.values(model.nominal)).modelled, 0
     for motion, thinned in zip(motions, equations.thinned_motions(), strict=True):
         here = modelled[first : first + len(thinned.time)]

@@ -21,20 +21,20 @@ from crane.identification.mechanics.model_term import (
 from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
 from crane.machine import Machine
 
-_REST_SPEED_SHARE = 0.05  # of a joint's largest velocity, below which it rests
-_MIN_REST_DURATION = 0.25  # s of rest, that tell a mass
-MIN_FRICTION_SHARE = 0.01  # of a drive's force, that its friction and its sensor may hide at rest
-_CUTOFF_FACTOR = 10.0  # times the motion's frequency, below which weights are compared
-_MIN_PERIODS = 5.0  # periods of that in a recording
+_REST_SPEED_SHARE = 0.05  # of a joint's largest velocity, below which it is at rest
+_MIN_REST_DURATION = 0.25  # [s], least duration of rest
+MIN_FRICTION_SHARE = 0.01  # least uncertainty at rest by friction and sensors, per drive force
+_CUTOFF_FACTOR = 10.0  # cutoff of static forces, times the frequency of the motion
+_MIN_PERIODS = 5.0  # periods of the cutoff in a recording
 
 
 class PayloadTerm:
-    """A rigid body on a frame: its ten parameters about the frame's origin.
+    """Term of a rigid body on a frame: its ten parameters about the origin of the frame.
 
     Args:
         machine: The machine.
-        frame: A link of it, which moves.
-        parameter_count: How many of the ten: 4 without inertia, 1 for a point at the origin.
+        frame: Name of a moving link.
+        parameter_count: Number of the parameters: 10, 4 without inertia, 1 for a point mass.
     """
 
     def __init__(self, machine: Machine, frame: str, parameter_count: int = 10):
@@ -42,7 +42,7 @@ class PayloadTerm:
         if model_frame.parentJoint == 0:
             raise InputError(f"frame '{frame}' does not move, choose another")
         first = 10 * (model_frame.parentJoint - 1)
-        A = model_frame.placement.homogeneous  # P about the joint is A P A^T
+        A = model_frame.placement.homogeneous  # the pseudo-inertia about the joint is A P A^T
         self._frame_transform = body_parameters(A @ pseudo_inertia(np.eye(10)) @ A.T)[
             :parameter_count
         ].T
@@ -61,23 +61,23 @@ class PayloadTerm:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PayloadEstimate(OneLineRepr):
-    """A load on a frame.
+    """Estimated payload on a frame.
 
     Attributes:
-        frame: A link of the machine.
-        mass: [kg].
-        com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not tell.
-            All nan where it was taken to be at the frame's origin, as nothing tells it.
-        covariance: (4, 4) of mass and com, to first order; nan as `com`. The larger of what the
-            noise makes and of what leaving out a tenth of the recording changes (jackknife).
-        degrees_of_freedom: (4,) degrees of freedom behind each.
-        directions: (k, 3) orthonormal directions of the frame along which the motion tells where
-            the centre of mass is.
-        friction_corrections: By drive, Coulomb friction that the machine's own lacks [N], [N m],
-            of those that moved both ways.
-        static_mass: Mass that the forces at rest tell with that centre of mass, and by how much
-            friction may be in it [kg]; None where nothing rests, or the centre is not told.
-        fit: What of the forces is not the machine's, and what the load explains.
+        frame: Name of the link.
+        mass: Mass [kg].
+        com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not
+            determine, all nan if the load was taken as a point at the origin.
+        covariance: (4, 4) covariance of mass and com to first order, the larger of that by noise
+            and that by the jackknife; nan as for `com`.
+        degrees_of_freedom: (4,) degrees of freedom of each variance.
+        directions: (k, 3) orthonormal directions of the frame in which the motion determines the
+            centre of mass.
+        friction_corrections: Corrections of Coulomb friction [N], [N m] by drive that moved in
+            both directions.
+        static_mass: Mass by the forces at rest for this centre of mass, and its uncertainty by
+            friction [kg]; None without rest.
+        fit: Forces beyond those of the machine, measured and by the load.
     """
 
     frame: str
@@ -97,11 +97,11 @@ class PayloadEstimate(OneLineRepr):
 
     @property
     def std_com(self) -> Array:
-        """(3,) standard deviations of the centre of mass [m]."""
+        """Standard deviations (3,) of the centre of mass [m]."""
         return np.sqrt(np.diag(self.covariance)[1:])
 
     def interval(self, level: float = 0.95) -> Array:
-        """(4, 2) ends of what covers mass and centre of mass with this probability each."""
+        """Confidence intervals (4, 2) of mass and centre of mass."""
         from scipy.stats import t
 
         half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * np.sqrt(
@@ -112,7 +112,7 @@ class PayloadEstimate(OneLineRepr):
 
     @property
     def warning(self) -> str:
-        """Why the mass should not be believed, "" where nothing is against it."""
+        """Warning if the forces at rest contradict the mass, else ""."""
         low, high = self.interval()[0].tolist()
         if self.static_mass is None:
             return ""
@@ -125,7 +125,7 @@ class PayloadEstimate(OneLineRepr):
         )
 
     def to_text(self) -> str:
-        """A table of mass and centre of mass."""
+        """Table of mass and centre of mass."""
         rows = [["", "value", "std", "95 % interval", ""]]
         values, names = np.append(self.mass, self.com), ("mass", "com x", "com y", "com z")
         units = ("kg", "m", "m", "m")
@@ -155,7 +155,7 @@ class PayloadEstimate(OneLineRepr):
 
 
 def low_passed_motion(motion: Motion) -> Motion:
-    """A motion without what trembles beyond `static_cutoff`."""
+    """Motion with velocities and accelerations filtered at `static_cutoff`."""
     cutoff, step = static_cutoff(motion), float(motion.time[1] - motion.time[0])
     if 4 * cutoff >= 1 / step:
         return motion
@@ -164,7 +164,7 @@ def low_passed_motion(motion: Motion) -> Motion:
 
 
 def static_cutoff(motion: Motion) -> float:
-    """Low-pass [Hz] below which forces are weights and friction."""
+    """Cutoff [Hz] below which forces are weights and friction."""
     step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
     wanted = max(_CUTOFF_FACTOR * motion_frequency(motion.q, step), _MIN_PERIODS / duration)
     return min(wanted, 0.24 / step)
@@ -177,9 +177,9 @@ def static_mass(
     friction_corrections: dict[str, float],
     com: Array,
 ) -> tuple[float, float] | None:
-    """Mass by the forces at rest, and how much friction may hold of it; None if nothing rests.
+    """Mass by the forces at rest and its uncertainty by friction; None without rest.
 
-    Each drive counts by its friction, described and found, as by a standard deviation.
+    Each drive is weighted by its friction, described and corrected, as a standard deviation.
     """
     step = float(motion.time[1] - motion.time[0])
     v = low_passed_motion(motion).v
@@ -205,7 +205,7 @@ def static_mass(
     if not information > 0:
         return None
     mass = float((unit_forces * tau / friction_forces**2).sum() / information)
-    # where drives disagree by more than their friction, what they say is worth less
+    # drives that disagree by more than their friction widen the uncertainty
     misfit = float((((tau - unit_forces * mass) / friction_forces) ** 2).sum()) / max(
         unit_forces.size - 1, 1
     )

@@ -30,9 +30,11 @@ from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
 from crane.recordings.recording_columns import time_derivative
 
-_MOTION_FACTOR = 3.0  # standard deviations of a joint's velocity, above which it moves
-_MAX_SPEED_FACTOR = 30.0  # times its limit, at which no joint moves
-_HUM_FACTOR = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
+_MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
+_MAX_SPEED_FACTOR = (
+    30.0  # times the velocity limit of a joint, above which a recording is rejected
+)
+_HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
 _LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
 
 
@@ -44,22 +46,21 @@ def smoothed_motion(
     trust: bool = False,
     progress: Progress | None = None,
 ) -> Motion:
-    """Velocities and accelerations of a recording, which is checked first.
+    """Motion of a recording, with checks, velocities and accelerations.
 
-    Outliers are bridged by lines between their neighbours, before anything is filtered. Forces
-    are those of the joints and of recorded loads together.
+    Outliers are replaced by linear interpolation before filtering. Forces are the sum of joint
+    forces and recorded loads.
 
     Args:
         machine: What was recorded.
-        recording: With all active joints of the machine.
-        derivatives: "kalman" or "lowpass", see `signals.differentiate`.
-        cutoff: [Hz] of "lowpass".
-        trust: Whether what is most likely wrong with the recording is only told, and outliers
-            are left in.
-        progress: Takes the finished share.
+        recording: Recording with all active joints of the machine.
+        derivatives: Method "kalman" or "lowpass", see `differentiate`.
+        cutoff: Cutoff of "lowpass" [Hz].
+        trust: Whether to warn only of what is probably wrong, and keep outliers.
+        progress: Called with the finished share, 0 to 1.
 
     Raises:
-        RecordingError: What is recorded cannot serve; the message names column and time.
+        RecordingError: The recording is not suitable; the message names column and time.
     """
     original, recording = recording, _select_active_joints(machine, recording)
     locked_columns = {
@@ -87,12 +88,12 @@ def smoothed_motion(
 
 
 def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
-    """Of a recording what belongs to the machine's active joints, in their order.
+    """Select the active joints of a machine from a recording, in their order.
 
-    Free joints may be among the channels: their force is known to be zero.
+    Free joints may be among the channels; their forces are zero.
 
     Raises:
-        RecordingError: One is missing, or in another unit, or a free one has a force.
+        RecordingError: A joint is missing or has another unit, or a free joint has a force.
     """
     recorded_columns, units = recording.columns(), recording.units | recording.channel_units
     available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
@@ -127,10 +128,10 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
 
 
 def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
-    """Refuse coordinates and forces (N, 2 n), and velocities (N, n) as recorded, by `check`."""
+    """Check coordinates and forces (N, 2 n) and recorded velocities (N, n)."""
     q, tau = np.split(columns, 2, axis=1)
     recorded = None
-    if np.any(v):  # only compared; where none were recorded, derivatives of outliers
+    if np.any(v):  # for comparison only, without outliers
         recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in v.T])
     limits = np.column_stack([machine.lower, machine.upper])
     bounded = limits if np.isfinite(limits).all() else None
@@ -140,7 +141,7 @@ def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trus
 
 
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
-    """Doubt velocities (N, n) that the machine's joints are far from having."""
+    """Reject velocities (N, n) far above the velocity limits."""
     limits = machine.model.velocityLimit[machine.closure.active]
     for joint, speed, limit in zip(
         machine.active, np.sqrt(np.mean(v**2, axis=0)), limits, strict=True
@@ -155,14 +156,14 @@ def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
 
 
 def _lowest_passband(found: Derivatives) -> float:
-    """Least of the frequencies [Hz] of which half is left, of the joints that move."""
+    """Lowest passband [Hz] of the moving joints."""
     if found.passband is None:
         return math.inf
     return float(found.passband[_is_moving(found)].min(initial=math.inf))
 
 
 def _is_moving(found: Derivatives) -> np.ndarray:
-    """Which joints (n,) move by more than what is uncertain of their velocities."""
+    """Mask (n,) of joints that move by more than the uncertainty of their velocities."""
     if found.std_v is None:
         return np.ones(found.v.shape[1], dtype=bool)
     uncertain = np.sqrt(np.mean(found.std_v**2, axis=0))
@@ -170,7 +171,7 @@ def _is_moving(found: Derivatives) -> np.ndarray:
 
 
 def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
-    """Warn of joints that tremble, but do not move: friction at rest makes any force."""
+    """Warn of joints that have noise, but no motion: static friction makes any force."""
     for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
         text = (
@@ -181,14 +182,14 @@ def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
 
 
 def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:
-    """What recorded loads do at the active joints, so that W beta = tau + this.
+    """Forces of recorded loads at the active joints, so that W beta = tau + forces.
 
-    Columns `load_NAME_force_x` to `load_NAME_moment_z` are a wrench in the world's axes at the
-    frame of the machine's load NAME, or at the link NAME; what has no column is zero.
+    Columns `load_NAME_force_x` to `load_NAME_moment_z` are a wrench in the world frame at the
+    frame of the machine's load NAME, or at the link NAME; missing components are zero.
 
     Args:
         machine: What was recorded.
-        recording: Of N samples.
+        recording: Recording of N samples.
         q_a: (N, n) [m], [rad].
         trust: See `smoothed_motion`.
 
@@ -196,7 +197,7 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
         (N, n) [N], [N m].
 
     Raises:
-        RecordingError: A load acts on no link, or one of the machine's is not recorded.
+        RecordingError: A load acts on an unknown link, or a load of the machine is not recorded.
     """
     frames = {force.name: force.frame for force in machine.external_forces}
     wrenches: dict[str, Array] = {}
@@ -231,5 +232,5 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
 
 
 def _load_name(column: str) -> str:
-    """The load's name in a column's."""
+    """Name of the load of a column."""
     return column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)[0]
