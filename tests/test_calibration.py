@@ -168,7 +168,7 @@ def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
 def test_what_is_chosen_takes_no_start(fitted):
     machine, path, _ = fitted
     done = typed("calibrate", machine.path, path, "--fit", "auto=3")
-    assert done.returncode == 2 and "'auto' chooses numbers by itself" in done.stderr
+    assert done.returncode == 2 and "'auto' chooses parameters by itself" in done.stderr
 
 
 @pytest.mark.long

@@ -75,7 +75,7 @@ def test_an_interval_that_reaches_farther_is_told():
     assert ends.remark == "reaches farther up" and lower is None
     assert other == pytest.approx((1.0, 1.0))
     one = FittedParameter("a", 1.0, 1.0, 0.8, False, True, profile_ends=ends)
-    assert one.remark == "not told by the recordings, reaches farther up"
+    assert one.remark == "not determined by the recordings, reaches farther up"
     assert ProfileEnds().remark == "" and ProfileEnds(0.9, 2.0).remark == ""
     assert ProfileEnds(1.0, 4.0).remark == "derivatives do not hold over its interval"
 

@@ -144,7 +144,7 @@ def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
     assert found.vague == ["oil.gas_exponent"]  # there is no gas
     assert found.std["oil.gas_exponent"] == np.inf
     text = found.to_text()
-    assert "not told by these sensors in this time: oil.gas_exponent" in text
+    assert "not determined by these sensors in this time: oil.gas_exponent" in text
     assert "load_x.mass" in text and "std, designed" in text
 
 

@@ -399,7 +399,7 @@ def test_short_strokes_do_not_tell_c1_from_c2(machine):
     rng = np.random.default_rng(4)
     run = recorded(simulate(reference, 6, 2e-3), 1.0, rng)
     run = dataclasses.replace(run, q=run.q + 2e-3 * rng.standard_normal(run.q.shape))
-    with pytest.raises(InputError, match="cannot be told apart along 0.2.*'chambers'"):
+    with pytest.raises(InputError, match="cannot be separated along 0.2.*'chambers'"):
         identify_orifices(machine, run, "boom")
     found = identify_orifices(machine, run, "boom", "chambers")
     np.testing.assert_allclose(found.values[1:], X[1:], rtol=0.25)

@@ -218,7 +218,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
         ),
         (
             identify(changed, motion(changed), prior=0.3),
-            "'mini_forwarder' was loaded with changed numbers, identify it as its files describe",
+            "'mini_forwarder' was loaded with parameter changes, identify it as its files",
         ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
@@ -337,7 +337,7 @@ def test_what_a_motion_does_not_tell_of_a_load(mini):
     np.testing.assert_allclose(estimate.com[:2], TRUTH[1:3], atol=3e-3)
     assert np.isnan(estimate.com[2]) and np.isnan(estimate.std_com[2])
     assert estimate.directions.shape == (2, 3) and np.abs(estimate.directions[:, 2]).max() < 1e-9
-    assert re.search(r"^com z +- +not told by this motion$", estimate.to_text(), re.M)
+    assert re.search(r"^com z +- +not determined by this motion$", estimate.to_text(), re.M)
 
 
 def test_no_load_can_be_told(mini):
@@ -400,7 +400,7 @@ def test_motion_one_way_does_not_tell_friction_from_weight(mini):
     with pytest.raises(RecordingError) as caught:
         identify_payload(mini, given)
     text = str(caught.value)
-    assert text.startswith("this recording does not tell the mass (") and "\n" not in text
+    assert text.startswith("this recording does not determine the mass (") and "\n" not in text
     assert "'X1', 'X2' moved one way only, where friction looks like weight" in text
     assert "the forces at rest hold -0.0" in text
     # a long way tells a load by its levers, whatever the friction

@@ -417,7 +417,7 @@ def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
     """One for two freedoms, and one that no posture has."""
     columns, units = motion
     for name, off, said in (
-        ("inclination_lift_boom", 0.0, "nothing tells where 'X_lift', 'X_tilt' are"),
+        ("inclination_lift_boom", 0.0, "'X_lift', 'X_tilt' are not determined"),
         ("inclination_tilt_boom", 1.6, "see that zero and sign of inclination_tilt_boom are"),
     ):
         names = ["time", name, "X_lift_force", "X_tilt_force"] + ["X_lift"] * bool(off)
@@ -571,7 +571,7 @@ def test_all_that_a_log_lacks_is_told_at_once(tmp_path):
     done = typed("simulate", "patu655", "--inputs", LIFTING, "--columns", columns,
                  "--out", tmp_path / "out")  # fmt: skip
     assert done.returncode == 2 and "no signal of a valve, give at least one of" in done.stderr
-    assert "nothing tells where 'slew', 'X_ext' are, give 'slew [rad]', 'X_ext [m]'" in done.stderr
+    assert "'slew', 'X_ext' are not determined, give 'slew [rad]', 'X_ext [m]'" in done.stderr
     assert "--lock slew=0 (home) --lock X_ext=0.1 (home)" in done.stderr
     few = [
         x for x in COLUMNS.splitlines() if not re.match("voltage|pressure_(supply|X_lift_b)", x)
@@ -580,6 +580,6 @@ def test_all_that_a_log_lacks_is_told_at_once(tmp_path):
     done = typed("circuit", "patu655", LIFTING, "--columns", columns, "--joint", "X_lift")
     for said in (
         "columns are missing: 'pressure_X_lift_b', 'pressure_supply', 'voltage_X_lift' or 'spool_",
-        "nothing tells where 'slew', 'X_ext' are", "--lock slew=0 (home) --lock X_ext=0.1 (home)",
+        "'slew', 'X_ext' are not determined", "--lock slew=0 (home) --lock X_ext=0.1 (home)",
     ):  # fmt: skip
         assert done.returncode == 2 and said in done.stderr

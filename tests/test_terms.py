@@ -130,19 +130,19 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
         ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 numbers, it takes none"),
         (
             {"q1.presliding": (-1.0,)},
-            "a number of term 'q1.presliding' is -1.0, give a number above",
+            "a value of term 'q1.presliding' is -1.0, give a number above",
         ),
         (
             {"q1.stiction": (0.1, 0.0)},
-            "a number of term 'q1.stiction' is 0.0, give a number above 0",
+            "a value of term 'q1.stiction' is 0.0, give a number above 0",
         ),
         (
             {"q*.stiction": (np.nan,)},
-            "a number of term 'q*.stiction' is nan, give a number above 0",
+            "a value of term 'q*.stiction' is nan, give a number above 0",
         ),
         (
             {"q1.memory": (np.inf, 1.0)},
-            "a number of term 'q1.memory' is inf, give a number above 0",
+            "a value of term 'q1.memory' is inf, give a number above 0",
         ),
         ({"nan*q5+q6.viscous": ()}, "'nan*q5+q6': 'nan' is no factor, write q5+0.5*q6"),
         ({"0*q5+q6.viscous": ()}, "'0*q5+q6': '0' is no factor, write q5+0.5*q6"),
@@ -343,7 +343,7 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
         (["--train", "0:9"], "nothing of use lies outside of --train 0:9, so nothing judges"),
         (
             ["--train", "0:7.7", "--bandwidth", "10"],
-            "1 of 1 validations are too short for a low-pass of 10 Hz and judge",
+            "1 of 1 held-out recordings are too short for a low-pass of 10 Hz and judge",
         ),
         (
             ["--train", "0:6", "--slow", "crank=1.03", "--bandwidth", "40"],  # else 4 rows
@@ -404,7 +404,9 @@ def test_the_prior_that_predicts_is_chosen(arm):
     assert [trial.settings["bodies"] for trial in trials] == ["1 %", "10000 %"]
     assert trials[0].mean_error < trials[1].mean_error and trials[0].errors.shape == (FOLD_COUNT,)
     assert "bodies=1 %" in format_trials(trials).splitlines()[2]
-    with pytest.raises(InputError, match="nothing is tried, give values such as bandwidth=2,5,10"):
+    with pytest.raises(
+        InputError, match="there are no candidates, give values such as bandwidth=2,5,10"
+    ):
         cross_validate(arm, given, {})
     few = {name: getattr(given, name)[:200] for name in ("time", "q", "v", "a", "tau")}
     with pytest.raises(InputError, match="200 samples are too few for 5 parts, give at least 250"):

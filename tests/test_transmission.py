@@ -249,7 +249,7 @@ def test_an_update_is_little_work_so_that_a_thousand_fit_into_a_second():
         (lambda t: t.wrench_to_actuator([1.0, 0, 0]), "the wrench on 'tip' has the shape (3,)"),
         (lambda t: t.wrench_to_actuator([0.0] * 6, "hook"), "frame 'hook' is unknown, "),
         (lambda t: crane.Transmission(t.machine).wrench_to_actuator([0.0] * 6),
-         "the posture is not known yet, update it with slew, X_lift, X_tilt, X_ext"),
+         "the configuration is not known yet, update it with slew, X_lift, X_tilt, X_ext"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_one_line(act, error):

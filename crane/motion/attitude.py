@@ -116,15 +116,13 @@ class InclinationCoordinate:
         if not axis_candidates:
             raise InputError(
                 f"{message_prefix}the joint that turns it is along neither its y axis nor its z "
-                f"axis, "
-                "give roll, pitch and yaw, or a frame that is so"
+                "axis, give roll, pitch and yaw, or a frame that is so"
             )
         self._rotation_axis, self._k = axis_candidates[0], 3 - axis_candidates[0]
         if abs(rotation[2, self._rotation_axis]) > _MAX_AXIS_TILT:
             raise InputError(
                 f"{message_prefix}the joint that turns it is upright at home, not level, give "
-                f"roll, "
-                "pitch and yaw"
+                "roll, pitch and yaw"
             )
         configuration = machine.coordinates.configuration(machine.home)
         pin.computeJointJacobians(model, data, configuration)
@@ -233,8 +231,7 @@ def via_attitudes(
     ):
         raise InputError(
             f"attitudes have the shape {given_angles.shape} and rates {given_rates.shape}, give "
-            f"(N, 3) roll, "
-            "pitch and yaw"
+            "(N, 3) roll, pitch and yaw"
         )
     vectors, vector_rates = np.full_like(given_angles, np.nan), np.full_like(given_angles, np.nan)
     times = np.ravel(time)
@@ -247,8 +244,7 @@ def via_attitudes(
         if np.linalg.norm(previous_vector) > _MAX_ROTATION_ANGLE:
             raise InputError(
                 f"the attitude at {times[i]:g} s is {np.linalg.norm(previous_vector):.3g} rad "
-                f"from the "
-                f"first one, give at most {_MAX_ROTATION_ANGLE:g}"
+                f"from the first one, give at most {_MAX_ROTATION_ANGLE:g}"
             )
         if np.isfinite(given_rates[i]).all():
             angular_velocity = (

@@ -251,8 +251,7 @@ class Kinematics(FrameKinematics):
             )
             raise UnreachableTipError(
                 f"'{self.frame}' cannot reach ({target_text}{sample_label}: it stays "
-                f"{distance_text} away, "
-                f"nearest at {stroke_text}; choose a point within reach"
+                f"{distance_text} away, nearest at {stroke_text}; choose a point within reach"
             )
         return q_a
 

@@ -54,8 +54,7 @@ def limit_violation_message(
     joint, others_text = machine.active[violation.joint_index], _others_text(violation.other_count)
     return (
         f"the reference of {_violation_text(machine, joint, violation)}{others_text}: keep it "
-        f"within, or widen the "
-        "limits"
+        "within, or widen the limits"
     )
 
 
@@ -96,11 +95,10 @@ def passive_limit_violation_message(
         return ""  # a dead centre or an unreachable position: the simulation reports it
     if violation is not None:
         joint = machine.joints[passive[violation.joint_index]]
+        text = _violation_text(machine, joint, violation, "to")
         return (
-            f"the reference takes "
-            f"{_violation_text(machine, joint, violation, 'to')}"
-            f"{_others_text(violation.other_count)}: keep "
-            "it within, or widen the limits"
+            f"the reference takes {text}{_others_text(violation.other_count)}: keep it within, or "
+            "widen the limits"
         )
     velocity_limits = np.array(
         [
@@ -207,8 +205,8 @@ def _violation_text(
     unit = machine.unit(joint)
     return (
         f"'{joint}' {verb} {violation.value:.6g} {unit} at t = {violation.time:.4g} s, beyond "
-        f"its limit "
-        f"{violation.limit:.6g} {unit}{_limit_location(machine, joint)} {violation.interval_text}"
+        f"its limit {violation.limit:.6g} {unit}{_limit_location(machine, joint)} "
+        f"{violation.interval_text}"
     )
 
 

@@ -158,8 +158,7 @@ def _path_times(table: Table) -> Array:
         if not following > previous:
             raise InputError(
                 f"time goes from {previous:g} to {following:g} s at row {row} of its samples, "
-                f"let it "
-                "increase"
+                "let it increase"
             )
     return time - time[0]
 

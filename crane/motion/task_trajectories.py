@@ -132,8 +132,7 @@ def add_free_joints(machine: Machine, reference: Trajectory) -> Trajectory:
     if len(start) not in (len(driven_names), len(machine.active)):
         raise InputError(
             f"the reference has {len(start)} coordinates, give the {len(driven_names)} of the "
-            f"driven "
-            f"joints ({', '.join(driven_names)}) or those of all {len(machine.active)}"
+            f"driven joints ({', '.join(driven_names)}) or those of all {len(machine.active)}"
         )
     if len(start) == len(driven_names):
         start = machine.home[machine.closure.active]

@@ -191,8 +191,7 @@ def via_points(time: ArrayLike, points: ArrayLike, rates: ArrayLike | None = Non
     ):
         raise InputError(
             f"via points have the shape {point_table.shape} at times {times.shape}, give (N, n) "
-            f"at "
-            "(N,), two at least"
+            "at (N,), two at least"
         )
     given_rates = (
         np.full_like(point_table, np.nan) if rates is None else np.array(rates, dtype=np.float64)

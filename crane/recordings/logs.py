@@ -112,8 +112,8 @@ def assemble_table(
         if found[line.heading].shape not in ((), (count,)):
             raise RecordingError(
                 f"{line.source_location}: '{line.heading}' has {len(found[line.heading])} "
-                f"samples, others "
-                f"have {count}, choose a column of a table by its number, as in a[0]"
+                f"samples, others have {count}, choose a column of a table by its number, as in "
+                "a[0]"
             )
     columns_by_heading = {
         name: np.broadcast_to(values, (count,)) for name, values in found.items()

@@ -48,10 +48,7 @@ def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...
     it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
     requested = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
     alternatives = f", or a joint that moves with {it} ({', '.join(others)})" if others else ""
-    text = (
-        f"nothing tells where {', '.join(map(repr, missing))} {are}, give "
-        f"{requested}{alternatives}"
-    )
+    text = f"{', '.join(map(repr, missing))} {are} not determined, give {requested}{alternatives}"
     raise MissingMeasurementError(text, missing)
 
 
@@ -200,10 +197,9 @@ def motion_from_joints(
             raise RecordingError(f"{_renumber_samples(start, error)}; {hint}") from None
         if (distance > _CONFIGURATION_TOLERANCE).any():
             raise RecordingError(
-                f"sample {start + int(np.argmax(distance > _CONFIGURATION_TOLERANCE))} is "
-                f"beyond a dead centre, where "
-                f"{', '.join(machine.active)} do not tell the configuration: {hint}, or cut the "
-                "recording"
+                f"sample {start + int(np.argmax(distance > _CONFIGURATION_TOLERANCE))} is beyond "
+                f"a dead centre, where {', '.join(machine.active)} do not determine the "
+                f"configuration: {hint}, or cut the recording"
             )
     low, high = q_a.min(axis=0), q_a.max(axis=0)
     slack = _LIMIT_TOLERANCE * _stroke_ranges(machine)

@@ -204,8 +204,7 @@ def check_pressures(machine: Machine, table: Table) -> None:
             )
         warnings.warn(
             f"'{name}' is below a vacuum in {is_negative.sum()} of {len(is_negative)} samples, "
-            f"by up to "
-            f"{-lowest:.3g} Pa, taken as noise; to gauge pressures add 1e5 Pa",
+            f"by up to {-lowest:.3g} Pa, taken as noise; to gauge pressures add 1e5 Pa",
             CraneWarning,
             stacklevel=2,
         )

@@ -76,8 +76,8 @@ def find_active_joints(names: Sequence[str], free: Sequence[str] = ()) -> tuple[
         if stem not in available and stem + VELOCITY_SUFFIX in available:
             raise RecordingError(
                 f"column '{stem}' is missing beside '{stem}{VELOCITY_SUFFIX}', "
-                f"'{stem}{FORCE_SUFFIX}', "
-                f"add it, or rename those if '{stem}' is not an active joint"
+                f"'{stem}{FORCE_SUFFIX}', add it, or rename those if '{stem}' is not an active "
+                "joint"
             )
     for x in free:
         if x not in available:

@@ -139,7 +139,7 @@ def calibrate(
     requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
     automatic = AUTO in requested
     if requested.pop(AUTO, None) is not None:
-        raise InputError(f"'{AUTO}' chooses numbers by itself, give it no start")
+        raise InputError(f"'{AUTO}' chooses parameters by itself, give it no start")
     for path, table in zip((*paths, *validation), tables, strict=True):
         _check_sensor_parameters(path, table, requested)
     variants = MachineVariants(machine)
@@ -196,9 +196,8 @@ def _check_sensor_parameters(path: str | Path, table: Table, fit: Iterable[str])
         if name.startswith(SENSOR_PREFIX) and table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
             raise InputError(
                 f"{path}: '{name}' cannot be fitted to quantities, which its note "
-                f"'{SENSORS_NOTE}: "
-                f"{IDEAL_SENSORS}' says they are: give the readings, or remove the note if they "
-                f"are"
+                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
+                "the note if they are"
             )
 
 

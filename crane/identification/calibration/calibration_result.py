@@ -19,8 +19,8 @@ from crane.machine import Machine
 
 _DEGRADATION_FACTOR = 1.1  # times the residual before
 LOWER_MINIMUM_WARNING = (
-    "Near these numbers the machine follows better still, where the search did not end: calibrate "
-    "again from there, or fit fewer numbers."
+    "There is a lower minimum near these parameters: calibrate again from there, or fit fewer "
+    "parameters."
 )
 
 
@@ -74,7 +74,7 @@ class FittedParameter:
         status = (
             "on its bound"
             if self.at_bound
-            else "not told by the recordings" * self.is_unidentifiable
+            else "not determined by the recordings" * self.is_unidentifiable
         )
         return ", ".join(filter(None, (status, self.profile_ends.remark)))
 
@@ -168,9 +168,10 @@ class Calibration(OneLineRepr):
         """Machine, channels, and identifiable parameters."""
         identifiable = [x for x in self.parameters if not (x.at_bound or x.is_unidentifiable)]
         values = ", ".join(f"{x.name} = {x.value:.5g}" for x in identifiable)
-        numbers, channels = format_count(len(self.parameters), "number"), len(self.channels)
+        parameters, channels = format_count(len(self.parameters), "parameter"), len(self.channels)
         return (
-            f"Calibration of '{self.machine.name}': {len(identifiable)} of {numbers} told by "
+            f"Calibration of '{self.machine.name}': {len(identifiable)} of {parameters} "
+            "determined by "
             f"{format_count(channels, 'channel')}{': ' * bool(identifiable)}{values}"
         )
 
@@ -209,13 +210,12 @@ class Calibration(OneLineRepr):
         texts = [] if self.is_lowest_minimum else [LOWER_MINIMUM_WARNING]
         if self.degraded_channels:
             texts.append(
-                f"Held out, the machine follows worse than before in "
-                f"{', '.join(self.degraded_channels)}: fit "
-                "fewer numbers, or record more."
+                "On held-out data the residuals are larger than before in "
+                f"{', '.join(self.degraded_channels)}: fit fewer parameters, or record more."
             )
         if self.unobserved_parameters:
             texts.append(
-                "Nothing of these was seen, they are left as the machine has them: "
+                "These have no effect in the recordings and are unchanged: "
                 f"{', '.join(self.unobserved_parameters)}."
             )
         return texts
@@ -233,7 +233,7 @@ class Calibration(OneLineRepr):
     def to_text(self) -> str:
         """Report in Markdown."""
         lines = [
-            "| number | before | fitted | 95 % interval | |",
+            "| parameter | before | fitted | 95 % interval | |",
             "| --- | ---: | ---: | ---: | --- |",
         ]
         for one in self.parameters:
@@ -244,16 +244,16 @@ class Calibration(OneLineRepr):
         for caution in self.cautions:
             lines += ["", caution]
         if self.correlated_pairs:
-            lines += ["", "Told apart badly, of which a combination alone is known:", ""]
+            lines += ["", "Strongly correlated, of which only a combination is identifiable:", ""]
             lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.correlated_pairs]
         if self.correlated_directions:
-            lines += ["", "What changes together without the recordings telling it:", ""]
+            lines += ["", "Directions that the recordings do not determine:", ""]
             lines += [
                 f"- {self.describe_direction(direction)}"
                 for direction in self.correlated_directions
             ]
         if self.score_tests:
-            lines += ["", "What would take away more of what is left, if it were fitted, too:", ""]
+            lines += ["", "Parameters whose fit would reduce the cost further:", ""]
             lines += [
                 f"- {x.name} at about {x.value:.3g}: {100 * x.cost_reduction:.0f} %"
                 for x in self.score_tests

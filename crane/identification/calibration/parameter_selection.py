@@ -232,7 +232,7 @@ def select_parameters(
     }
     included = [i for i, unknown in enumerate(unknowns) if unknown.name not in excluded]
     if not included:
-        raise InputError("the recordings tell nothing of the machine: move more, or name numbers")
+        raise InputError("the recordings determine no parameter: move more, or name parameters")
     reduced_problem = CalibrationProblem(
         problem.machine, [unknowns[i] for i in included], problem.cases
     )

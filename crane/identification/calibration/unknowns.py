@@ -83,7 +83,7 @@ def build_unknowns(
     """
     requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
     if not requested:
-        raise InputError("nothing is to be fitted, name numbers such as 'payload.mass'")
+        raise InputError("nothing is to be fitted, name parameters such as 'payload.mass'")
     return [
         _build_unknown(name, value, spec, parameters, sensor_units)
         for name, value in requested.items()
@@ -116,7 +116,7 @@ def _build_unknown(
     if "*" in name:
         found = {x: parameters[x] for x in fnmatch.filter(parameters, name) if parameters[x]}
         if not found:
-            raise InputError(f"'{name}' matches no number of the machine that is not 0")
+            raise InputError(f"'{name}' matches no nonzero parameter of the machine")
         initial = 1.0 if start is None else start
         lower = _MIN_SHARE if low is None else low
         return _bounded_unknown(name, initial, lower, high, 1.0, tuple(found.items()))

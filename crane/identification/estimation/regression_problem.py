@@ -127,8 +127,7 @@ class RegressionProblem:
             if prior_mean.shape != (size,) or std.shape != (size,):
                 raise InputError(
                     f"the prior has means of the shape {prior_mean.shape} and deviations of the "
-                    f"shape "
-                    f"{std.shape}, give ({size},) each, one per column of the regressor"
+                    f"shape {std.shape}, give ({size},) each, one per column of the regressor"
                 )
             if not (std > 0).all():
                 raise InputError(f"the prior has the deviation {std.min():g}, give one above 0")

@@ -227,9 +227,8 @@ class ExchangeAlgorithm:
         if best is None:
             raise InputError(
                 f"none of {trials} random signals keeps '{self._information.machine.name}' "
-                f"within its "
-                f"limits, lastly {self._rejection_reason}: lower the margin or the rate, or try "
-                f"another seed"
+                f"within its limits, lastly {self._rejection_reason}: lower the margin or the "
+                "rate, or try another seed"
             )
         return reference_run, best
 
@@ -304,6 +303,6 @@ class ExchangeAlgorithm:
             return None
         reason = self._limits.exceeded_limit(unsmoothed_run)
         if not reason and stroke_margins.min() <= 0:
-            reason = "a stroke of a machine whose numbers are off"
+            reason = "a stroke with deviating parameters"
         self._rejection_reason = f"for {reason}"
         return None if reason else unsmoothed_run

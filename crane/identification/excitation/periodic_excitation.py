@@ -274,7 +274,7 @@ def excite(
     time = np.arange(0.0, period, step)
     if len(time) * len(machine.active) < base.rank:
         raise InputError(
-            f"{len(time)} samples in a period of {period:g} s tell no {base.rank} base "
+            f"{len(time)} samples in a period of {period:g} s do not determine {base.rank} base "
             "parameters, give a smaller step or a longer period"
         )
     random_motions = _random_motions(model, bounds, 2 * np.pi / period * harmonics)

@@ -75,7 +75,7 @@ class SignalExcitation(OneLineRepr):
         return (
             f"SignalExcitation of '{self.machine.name}', {self.run.time[-1]:.6g} s: "
             f"{len(self.unknowns) - len(self.unidentifiable)} of "
-            f"{format_count(len(self.unknowns), 'number')} told"
+            f"{format_count(len(self.unknowns), 'parameter')} identifiable"
         )
 
     @property
@@ -115,7 +115,7 @@ class SignalExcitation(OneLineRepr):
 
     def to_text(self) -> str:
         """Tables of standard deviations, strokes and unidentifiable parameters."""
-        numbers: list[tuple[str, ...]] = [("number", "value", "std, plain", "std, designed")]
+        numbers: list[tuple[str, ...]] = [("parameter", "value", "std, plain", "std, designed")]
         for one, initial_std, optimized_std in zip(
             self.unknowns,
             self.initial_information.std,
@@ -130,7 +130,7 @@ class SignalExcitation(OneLineRepr):
         )
         numbers.append(("ln det (1 + M)", "", *gain))
         strokes: list[tuple[str, ...]] = [
-            ("stroke", "least left", "numbers off", "largest pressure", "fastest signal")
+            ("stroke", "least margin", "worst case", "largest pressure", "fastest signal")
         ]
         for i, joint in enumerate(require_circuit(self.machine).joints):
             strokes.append((
@@ -143,7 +143,7 @@ class SignalExcitation(OneLineRepr):
         if self.unidentifiable:
             names = ", ".join(self.unidentifiable)
             parts.append(
-                f"not told by these sensors in this time: {names}\n"
+                f"not determined by these sensors in this time: {names}\n"
                 "leave them out, name further --sensors, or give a longer --duration"
             )
         return "\n\n".join(parts)
@@ -207,8 +207,7 @@ def excite_valves(
     if step < _MIN_STEP or duration < _MIN_DURATION:
         raise InputError(
             f"{duration:g} s in steps of {step:g} s: give a duration of at least "
-            f"{_MIN_DURATION:g} s "
-            f"and a step from {_MIN_STEP:g} to {_MAX_STEP:g} s"
+            f"{_MIN_DURATION:g} s and a step from {_MIN_STEP:g} to {_MAX_STEP:g} s"
         )
     rate = as_number(rate, "the rate", "1/s", greater_than=0)
     if not 0 <= as_number(margin, "the margin", "") < 0.5:

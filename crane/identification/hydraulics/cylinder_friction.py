@@ -164,7 +164,7 @@ def identify_cylinder_friction(
     if stribeck is not False:
         stiction_fit, note = _fit_with_stiction(at, speed, force, described_friction.smoothing)
         if note and stribeck:
-            raise RecordingError(f"stiction of '{joint}' cannot be told: {note}")
+            raise RecordingError(f"stiction of '{joint}' cannot be determined: {note}")
         if not note:
             result = stiction_fit
     values, estimate = result

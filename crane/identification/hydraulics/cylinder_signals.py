@@ -67,8 +67,8 @@ def cylinder_and_valve(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
         raise InputError(f"'{joint}' has no cylinder, {suggest_names(circuit.cylinders, joint)}")
     if circuit.valves[joint].spool_b:
         raise InputError(
-            f"the valve of '{joint}' has two spools, which this does not tell apart: fit its "
-            "numbers with crane calibrate"
+            f"the valve of '{joint}' has two spools, which this method does not separate: fit "
+            "its parameters with crane calibrate"
         )
     return circuit.cylinders[joint], circuit.valves[joint]
 

@@ -329,7 +329,7 @@ def _check_identifiable(sets: list[OrificeEquations], joint: str) -> None:
             energy += 0.5 * float((halves**2).sum())
             spread += float((products**2).sum())
         if not (total > _MIN_CORRELATION * energy or total > _MIN_SIGNIFICANCE * np.sqrt(spread)):
-            raise InputError(f"{name} of '{joint}' cannot be told: {reason}")
+            raise InputError(f"{name} of '{joint}' cannot be determined: {reason}")
 
 
 def _check_values(
@@ -342,8 +342,7 @@ def _check_values(
             low, high = (min(r.x.min() for r in runs), max(r.x.max() for r in runs))
             other = "" if method == "chambers" else ", or take method 'chambers'"
             raise InputError(
-                f"{pair} of '{joint}' cannot be told apart along {low:.3g} to {high:.3g} of its "
-                f"stroke ({PARAMETER_NAMES[j]} = {values[j]:.3g} +- {std[j]:.2g}): record "
-                f"longer strokes"
-                f"{other}"
+                f"{pair} of '{joint}' cannot be separated along {low:.3g} to {high:.3g} of its "
+                f"stroke ({PARAMETER_NAMES[j]} = {values[j]:.3g} +- {std[j]:.2g}): record longer "
+                f"strokes{other}"
             )

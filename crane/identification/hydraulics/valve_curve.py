@@ -138,10 +138,10 @@ class ValveCurve(OneLineRepr):
         if self.ringing is not None:
             low, high, size = self.ringing
             at = f"{low:.3g}" if high < 1.02 * low else f"{low:.3g} to {high:.3g}"
-            told = (
-                f"the speed rings at {at} Hz by up to {size:.3g} {unit}/s while the signal is held"
+            lines.append(
+                f"the speed rings at {at} Hz by up to {size:.3g} {unit}/s while the signal is "
+                "held: means over its periods are taken"
             )
-            lines.append(f"{told}: means over its periods are taken")
         return "\n".join(lines) + "\n"
 
 

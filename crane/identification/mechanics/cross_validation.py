@@ -73,7 +73,7 @@ def cross_validate(
     """
     progress = progress_reporter(progress)
     if not candidates or not all(candidates.values()):
-        raise InputError("nothing is tried, give values such as bandwidth=2,5,10")
+        raise InputError("there are no candidates, give values such as bandwidth=2,5,10")
     motions = prepare_motions(machine, recording, options.get("trust", False), None)
     if (shortest := min(len(motion.time) for motion in motions)) < FOLD_COUNT * _MIN_FOLD_SAMPLES:
         raise InputError(
@@ -99,8 +99,8 @@ def cross_validate(
             progress((done + 1) / len(grid))
     if not np.isfinite(min(trial.mean_error for trial in trials)):
         raise InputError(
-            "some part of the training is not told by the others whatever the settings, give a "
-            f"prior, higher bandwidths or a longer recording (lastly: {reason})"
+            "some fold of the training data is not determined by the others for any settings, "
+            f"give a prior, higher bandwidths or a longer recording (lastly: {reason})"
         )
     return sorted(trials, key=lambda trial: trial.mean_error)
 
@@ -114,14 +114,16 @@ def identify_options(trial: CrossValidationTrial, options: Mapping[str, Any]) ->
     if prior_settings:
         given_prior = {} if (given := out.get("prior")) is None else given
         if not isinstance(given_prior, Mapping | int | float):
-            raise InputError("the prior is numbers of all parameters, give it by name to try some")
+            raise InputError(
+                "the prior is an array of all parameters, give it by name to vary parts of it"
+            )
         out["prior"] = read_priors(given_prior) | read_priors(prior_settings)
     return out
 
 
 def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
     """Table of settings and errors."""
-    rows = [["settings", "error", "of the parts left out"]]
+    rows = [["settings", "error", "of the held-out folds"]]
     for trial in trials:
         words = ", ".join(f"{name}={value}" for name, value in trial.settings.items())
         each = " ".join("-" if np.isnan(x) else f"{100 * x:.2f}" for x in trial.errors)

@@ -198,9 +198,9 @@ def warn_validation(training: ForceComparison, validation: ForceComparison) -> N
             )
     if messages:
         text = (
-            f"errors on the validation are far above those on the training: "
-            f"{', '.join(messages)}: "
-            "the recordings do not belong together, or too little is told by the first one"
+            "errors on the validation are far above those on the training: "
+            f"{', '.join(messages)}: the recordings do not belong together, or the training data "
+            "determine too little"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
 
@@ -218,7 +218,7 @@ def check_shared_samples(
     for (i, one), (j, other) in itertools.combinations(enumerate(recordings, start=1), 2):
         if (share := _shared_share(one, other)) > _MAX_SHARED_SHARE:
             reject_unless_trusted(
-                f"{share:.0%} of recording {j}'s samples are in recording {i} as well: learned "
+                f"{share:.0%} of recording {j}'s samples are in recording {i} as well: used "
                 "twice they make intervals too narrow, give each once",
                 trust,
             )
@@ -227,8 +227,8 @@ def check_shared_samples(
     )
     if share > _MAX_SHARED_SHARE:
         text = (
-            f"{share:.0%} of a validation's samples were learned from: its errors say nothing of "
-            "other motions, give one that was not"
+            f"{share:.0%} of the held-out samples are training data: their errors do not apply to "
+            "other motions, give other data"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
 

@@ -154,7 +154,7 @@ class FrictionalMemory:
         from scipy.signal import lfilter
 
         if samples.step is None:
-            raise InputError(f"'{self.names[0]}' remembers time, give the step of the samples")
+            raise InputError(f"'{self.names[0]}' depends on time, give the step of the samples")
         rows = self.direction.jacobian(self._machine, samples)
         v = np.einsum("ij,ij->i", rows, samples.v_a)
         share = -np.expm1(-samples.step / self._lag)  # exact for constant speed

@@ -144,9 +144,9 @@ class TermKind:
 
 TERM_KINDS = {
     **{name: TermKind() for name in (*_FRICTION_KINDS, "root", "rotor_inertia", "gas_scale")},
-    "stiction": TermKind("velocities over which it fades", (0, 9)),
-    "presliding": TermKind("the distance over which it winds up", (1, 1)),
-    "memory": TermKind("the time and the speed by which rest is forgotten", (2, 2)),
+    "stiction": TermKind("the Stribeck velocities", (0, 9)),
+    "presliding": TermKind("the characteristic distance", (1, 1)),
+    "memory": TermKind("the time constant and the characteristic speed", (2, 2)),
 }
 
 
@@ -181,9 +181,9 @@ def select_terms(machine: Machine, changes: TermChanges) -> list[ModelTerm]:
         low, high = TERM_KINDS[kind].value_count
         if values is not None and not low <= len(values) <= high:
             hint = f"give {TERM_KINDS[kind].description}" if high else "it takes none"
-            raise InputError(f"term '{name}' has {len(values)} numbers, {hint}")
+            raise InputError(f"term '{name}' has {len(values)} values, {hint}")
         for number in values or ():
-            as_number(number, f"a number of term '{name}'", "", greater_than=0)
+            as_number(number, f"a value of term '{name}'", "", greater_than=0)
         for element in _matching_elements(machine, where, kind):
             kinds = values_by_element.setdefault(element, {})
             if values is None:

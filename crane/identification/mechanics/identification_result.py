@@ -78,8 +78,7 @@ class Identification(OneLineRepr):
         vague = self.marks.count("not determined")
         return (
             f"Identification of '{self.described_machine.name}': {len(self.values)} base "
-            f"parameters"
-            f"{f', {vague} not determined' if vague else ''}, "
+            f"parameters{f', {vague} not determined' if vague else ''}, "
             f"{kind}{self.method}{''.join(error_texts)}"
         )
 
@@ -144,8 +143,7 @@ class Identification(OneLineRepr):
         if wrong:
             parts.append(
                 f"{', '.join(wrong[:_MAX_SHOWN])} {'is' if len(wrong) == 1 else 'are'} beyond "
-                f"what "
-                f"such a machine can have: look at units, signs and zeros of the recording"
+                "what such a machine can have: look at units, signs and zeros of the recording"
             )
         return "; ".join(parts)
 
@@ -181,9 +179,9 @@ class Identification(OneLineRepr):
         """Tables of the errors and of the parameters."""
         lines = [
             f"{self.described_machine.name}: {self.base.rank} base parameters of "
-            f"{len(self.base.names)}, "
-            f"{self.method}{', feasible' if self.feasible else ''}; condition number "
-            f"{self.estimate.condition:.3g}, columns scaled {self.estimate.scaled_condition:.3g}",
+            f"{len(self.base.names)}, {self.method}{', feasible' if self.feasible else ''}; "
+            f"condition number {self.estimate.condition:.3g}, columns scaled "
+            f"{self.estimate.scaled_condition:.3g}",
             "",
         ]
         for title, fit in (("training", self.training), ("validation", self.validation)):

@@ -91,7 +91,7 @@ def divide_locked_bodies(
         except np.linalg.LinAlgError:
             names = ", ".join(f"'{name}'" for name, *_ in links)
             raise InputError(
-                f"what the locks make one body of {names} cannot exist, give feasible=True"
+                f"the body of the locked links {names} is not feasible, give feasible=True"
             ) from None
         T = L @ np.linalg.inv(D)
         for name, A, P in links:

@@ -235,9 +235,9 @@ def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
     if machine.free and not equations.y.any():
         body = body_names(machine)[-1]
         raise RecordingError(
-            "nothing drives what moves in this recording: it tells ratios of masses, not masses; "
-            f"say what one is known to be, as prior={{'{body}.m': '100 +- 1'}} "
-            f"(--prior {body}.m=100+-1)"
+            "nothing drives what moves in this recording: it determines ratios of masses only; "
+            "give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} (--prior "
+            f"{body}.m=100+-1)"
         )
 
 
@@ -247,11 +247,10 @@ def _warn_short_validations(
     """Warn of held-out data that are not usable."""
     short_count = len(motions) - len(long_motions)
     text = (
-        f"{short_count} of {len(motions)} validations are too short for a low-pass of "
-        f"{bandwidth:g} Hz "
-        "and judge nothing"
+        f"{short_count} of {len(motions)} held-out recordings are too short for a low-pass of "
+        f"{bandwidth:g} Hz and are not used"
         if short_count
-        else "no validation moves faster than what counts as standstill, nothing is judged"
+        else "no held-out recording moves faster than standstill, none is used"
     )
     warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
 

@@ -200,7 +200,9 @@ class _PayloadCase:
         equations, estimate = self._estimate(equations, columns, None)
         combinations, directions = _identifiable_moments(base)
         if not combinations[:, 0].any():
-            raise _UnidentifiableMassError("this motion does not tell the mass, move all joints")
+            raise _UnidentifiableMassError(
+                "this motion does not determine the mass, move all joints"
+            )
         mass, *first = (combinations.T @ estimate.values).tolist()
         com = np.where(combinations[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
         derivatives = np.eye(4)  # of mass and com by mass and first moments
@@ -375,17 +377,16 @@ def _raise_unidentifiable(
     if estimate is None:
         raise RecordingError(reason)
     low, high = estimate.interval()[0].tolist()
-    text = f"this recording does not tell the mass ({low:.3g} to {high:.3g} kg): "
+    text = f"this recording does not determine the mass ({low:.3g} to {high:.3g} kg): "
     if one_way_drives:
         names = ", ".join(f"'{joint}'" for joint in one_way_drives)
         text += f"{names} moved one way only, where friction looks like weight, record both ways"
     else:
-        text += "its parts tell different loads, identify the machine without a load first"
+        text += "its parts give different loads, identify the machine without a load first"
     if static_mass is not None:
         text += (
             f"; with its centre at '{estimate.frame}' the forces at rest hold "
-            f"{static_mass[0]:.4g} +- "
-            f"{static_mass[1]:.2g} kg, by the described friction"
+            f"{static_mass[0]:.4g} +- {static_mass[1]:.2g} kg, by the described friction"
         )
     raise RecordingError(text)
 

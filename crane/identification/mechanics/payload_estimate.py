@@ -133,7 +133,7 @@ class PayloadEstimate(OneLineRepr):
         table = zip(names, units, values, std, self.interval(), strict=True)
         for name, unit, value, deviation, (low, high) in table:
             if np.isnan(value):
-                rows.append([name, "-", "", "not told by this motion", ""])
+                rows.append([name, "-", "", "not determined by this motion", ""])
                 continue
             interval_text = f"{low:.5g} to {high:.5g} {unit}"
             rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval_text, ""])

@@ -182,7 +182,7 @@ def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
         len(undetermined) > _MAX_LISTED
     )
     raise InputError(
-        f"the prior says nothing of {listed}, and this motion does not tell them apart: move the "
-        "joints both ways and at several speeds, give prior=(means, deviations) with finite ones "
-        "for them, or leave the prior out, which tells of them together"
+        f"there is no finite prior of {listed}, and this motion does not determine them "
+        "separately: move the joints both ways and at several speeds, give prior=(means, "
+        "deviations) with finite ones for them, or omit the prior to estimate base parameters"
     )

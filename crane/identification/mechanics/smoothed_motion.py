@@ -102,9 +102,8 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
         listed = ", ".join(f"'{joint}'" for joint in missing)
         held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
         raise RecordingError(
-            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}; "
-            f"lock what was "
-            f"held ({held})"
+            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}; lock "
+            f"what was held ({held})"
         )
     for joint in machine.active:
         if units[joint] != machine.unit(joint):
@@ -175,8 +174,8 @@ def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
     for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
         text = (
-            f"'{joint}' stands still but for noise: its forces tell nothing, move it, or lock it "
-            f"({joint}={place:.4g})"
+            f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
+            f"lock it ({joint}={place:.4g})"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
 
@@ -221,7 +220,7 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
     for name in frames:
         if name not in wrenches:
             reject_unless_trusted(
-                f"'{machine.name}' has the load '{name}', and no column tells what it did: add "
+                f"'{machine.name}' has the load '{name}', and no column contains it: add "
                 f"{_LOAD_PREFIX}{name}_force_x and so on, or take a machine without it",
                 trust,
             )

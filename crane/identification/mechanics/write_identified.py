@@ -137,7 +137,7 @@ def check_rewritable(machine: Machine) -> None:
         )
     if machine.parameter_changes:
         raise InputError(
-            f"'{machine.name}' was loaded with changed numbers, identify it as its files "
+            f"'{machine.name}' was loaded with parameter changes, identify it as its files "
             "describe it"
         )
 
@@ -305,10 +305,9 @@ def _warn_inexact_friction(machine: Machine, law_fits: Mapping[str, FrictionLawF
         worst = max(deviations, key=lambda name: deviations[name])
         unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
         text = (
-            f"a machine file has no place for all of the friction of {', '.join(deviations)}: the "
-            f"nearest law at steady speeds is written, off by at most {deviations[worst]:.3g} "
-            f"{unit} "
-            f"({worst})"
+            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
+            "the nearest law at steady speeds is written, off by at most "
+            f"{deviations[worst]:.3g} {unit} ({worst})"
         )
         warnings.warn(text, CraneWarning, stacklevel=4)
 

@@ -178,9 +178,8 @@ class Workspace(OneLineRepr):
         """Frame, strokes, and the share that closes."""
         return (
             f"Workspace of '{self.frame}' of '{self.machine.name}': {len(self.tip_positions)} "
-            f"configurations "
-            f"over {', '.join(self.strokes)}, {100 * self.closed_share:.3g} % close, "
-            f"{self.area:.4g} m2"
+            f"configurations over {', '.join(self.strokes)}, {100 * self.closed_share:.3g} % "
+            f"close, {self.area:.4g} m2"
         )
 
     def __len__(self) -> int:
@@ -303,9 +302,8 @@ class Workspace(OneLineRepr):
         )
         least_index = int(self.least_singular_value.argmin())
         lines.append(
-            f"| least singular value of the tip | {self.least_singular_value[least_index]:.3g} "
-            f"m per scale | "
-            f"{self.format_strokes(self.q_a[least_index])} |"
+            f"| least singular value of the tip | {self.least_singular_value[least_index]:.3g} m "
+            f"per scale | {self.format_strokes(self.q_a[least_index])} |"
         )
         lines += ["", "| stroke | reaches | of its limits |", "| --- | --- | --- |"]
         for joint in self.strokes:
