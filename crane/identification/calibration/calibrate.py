@@ -118,39 +118,19 @@ def calibrate(
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
     if not paths:
         raise InputError("no recording is given, name at least one")
-    if not train[0] < train[1]:
-        raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
-    if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
-        raise InputError(
-            f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
-            f"{span[1]:g} s, which is read"
-        )
-    tables = [
-        select_time_span(read_sensor_readings(path, machine, columns), span, path)
-        for path in paths
-    ]
-    tables += [read_sensor_readings(path, machine, columns) for path in validation]
-    cases = [
-        _read_case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
-        for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
-    ]
-    if not any(case.train_mask.any() for case in cases):
-        raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    cases = _read_cases(machine, paths, validation, columns, train, span, sensors)
     requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
     automatic = AUTO in requested
     if requested.pop(AUTO, None) is not None:
         raise InputError(f"'{AUTO}' chooses parameters by itself, give it no start")
-    for path, table in zip((*paths, *validation), tables, strict=True):
-        _check_sensor_parameters(path, table, requested)
+    for path, case in zip((*paths, *validation), cases, strict=True):
+        _check_sensor_parameters(path, case.table, requested)
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = {
-        name: table.units[name]
-        for case, table in zip(cases, tables, strict=True)
-        for name in (
-            *case.sensors,
-            *(VALVE_SIGNAL_PREFIX + joint for joint in case.inputs.signals),
-        )
+        name: case.table.units[name]
+        for case in cases
+        for name in (*case.sensors, *(VALVE_SIGNAL_PREFIX + x for x in case.inputs.signals))
     }
 
     def unknowns_for(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
@@ -188,6 +168,37 @@ def calibrate(
         calibration,
         machine=_machine_with_sensors(calibration.machine, known, columns, calibration.changes),
     )
+
+
+def _read_cases(
+    machine: Machine,
+    paths: Sequence[str | Path],
+    validation: Sequence[str | Path],
+    columns: str | Path | None,
+    train: TimeSpan,
+    span: TimeSpan,
+    sensors: Sequence[str] | None,
+) -> list[RecordingCase]:
+    """Read the recordings of a calibration, those of the validation last; see `calibrate`."""
+    if not train[0] < train[1]:
+        raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
+    if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
+        raise InputError(
+            f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
+            f"{span[1]:g} s, which is read"
+        )
+    tables = [
+        select_time_span(read_sensor_readings(path, machine, columns), span, path)
+        for path in paths
+    ]
+    tables += [read_sensor_readings(path, machine, columns) for path in validation]
+    cases = [
+        _read_case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
+        for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
+    ]
+    if not any(case.train_mask.any() for case in cases):
+        raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    return cases
 
 
 def _check_sensor_parameters(path: str | Path, table: Table, fit: Iterable[str]) -> None:

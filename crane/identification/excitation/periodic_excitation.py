@@ -258,16 +258,7 @@ def excite(
     model = model or IdentificationModel(machine)
     _check_size(model, period, harmonics, periods, step)
     bounds = trajectory_limits(machine, acceleration, margin)
-    force = machine.model.effortLimit[machine.closure.active]
-    default = np.where(np.isfinite(force), _NOISE_SHARE * force, 1.0)
-    deviation = joint_values(machine, noise, "noise", default)
-    for joint, force_limit, value in zip(machine.active, force, deviation, strict=True):
-        if value > force_limit:
-            raise InputError(
-                f"noise of '{joint}' is {value:g}, above the {force_limit:g} of its drive: give "
-                f"less"
-            )
-    force = np.where(np.isfinite(force), force, deviation / _NOISE_SHARE)
+    deviation, force = _force_noise(machine, noise)
     base = base_parameters(model)
     if not base.rank:
         raise InputError(f"nothing of '{machine.name}' has an effect on its drives")
@@ -287,18 +278,7 @@ def excite(
         smooth_information, bounds, period, harmonics, count, CRITERIA[criterion]
     )
     draws = search.random_references(np.random.default_rng(seed))
-    costs = search.evaluate(draws)[0]
-    order = np.argsort(costs, kind="stable")[:starts]
-    best, lowest_cost = draws[order[0]], float(costs[order[0]])
-    for start_index, start in enumerate(draws[order]):
-
-        def report(share: float, tried: int = start_index) -> None:
-            if progress is not None:
-                progress((tried + share) / len(order))
-
-        found = search.optimize(start, report)
-        if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:
-            best, lowest_cost = found, cost
+    best = _optimize_best(search, draws, starts, progress)
     initial_trajectory, trajectory = (
         FourierTrajectory(search.coefficients(x), period, periods) for x in (draws[0], best)
     )
@@ -321,6 +301,39 @@ def excite(
         seed=seed,
         step=step,
     )
+
+
+def _force_noise(machine: Machine, noise: Mapping[str, float] | None) -> tuple[Array, Array]:
+    """Standard deviations (n,) of the force noise, and force limits (n,) or their equivalents."""
+    force = machine.model.effortLimit[machine.closure.active]
+    default = np.where(np.isfinite(force), _NOISE_SHARE * force, 1.0)
+    deviation = joint_values(machine, noise, "noise", default)
+    for joint, force_limit, value in zip(machine.active, force, deviation, strict=True):
+        if value > force_limit:
+            raise InputError(
+                f"noise of '{joint}' is {value:g}, above the {force_limit:g} of its drive: give "
+                "less"
+            )
+    return deviation, np.where(np.isfinite(force), force, deviation / _NOISE_SHARE)
+
+
+def _optimize_best(
+    search: TrajectoryOptimizer, draws: Array, starts: int, progress: Progress | None
+) -> Array:
+    """The best vector after optimization of the best random ones (V, size)."""
+    costs = search.evaluate(draws)[0]
+    order = np.argsort(costs, kind="stable")[:starts]
+    best, lowest_cost = draws[order[0]], float(costs[order[0]])
+    for start_index, start in enumerate(draws[order]):
+
+        def report(share: float, tried: int = start_index) -> None:
+            if progress is not None:
+                progress((tried + share) / len(order))
+
+        found = search.optimize(start, report)
+        if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:
+            best, lowest_cost = found, cost
+    return best
 
 
 def _with_smooth_friction(machine: Machine) -> Machine:

@@ -167,21 +167,7 @@ def solve_feasible(
         cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MIN_EIGENVALUE * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
-    # default tolerances if these are not reached, and a solver without factorization for dependent
-    # columns
-    solvers = (
-        *((cp.CLARABEL, x) for x in (_SOLVER_TOLERANCES, {}, _CAUTIOUS_OPTIONS)),
-        (cp.SCS, _SCS_OPTIONS),
-    )
-    for solver, options in solvers:
-        with suppress(cp.SolverError):  # reported below
-            problem.solve(solver=solver, **options)
-            break
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        raise CraneError(
-            f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"
-        )
-
+    _solve_convex_problem(problem)
     solved = [0.5 * (x.value + x.value.T) for x in X]
     others = start + unit * z.value
     others[bounded] = np.maximum(others[bounded], 0)  # rounding errors
@@ -198,6 +184,28 @@ def solve_feasible(
             ]
         ),
     )
+
+
+def _solve_convex_problem(problem: Any) -> None:
+    """Solve a convex problem, with looser tolerances or another solver if necessary.
+
+    Raises:
+        CraneError: All solvers fail.
+    """
+    cp = load_convex_solver()
+    # the last solver needs no factorization, for dependent columns
+    solvers = (
+        *((cp.CLARABEL, x) for x in (_SOLVER_TOLERANCES, {}, _CAUTIOUS_OPTIONS)),
+        (cp.SCS, _SCS_OPTIONS),
+    )
+    for solver, options in solvers:
+        with suppress(cp.SolverError):  # reported below
+            problem.solve(solver=solver, **options)
+            break
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        raise CraneError(
+            f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"
+        )
 
 
 def divergence_hessian_root(body: Array) -> Array:

@@ -12,7 +12,7 @@ from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation.estimators import huber, least_squares, weighted_least_squares
-from crane.identification.estimation.regression_problem import Estimate, Prior, condition_numbers
+from crane.identification.estimation.regression_problem import Prior, condition_numbers
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.equation_setup import (
     RecordingOrMotion,
@@ -50,7 +50,6 @@ from crane.identification.mechanics.regression_equations import (
     Progress,
     RegressionEquations,
     is_long_enough,
-    iterate_estimate,
 )
 from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
@@ -132,7 +131,6 @@ def identify(
         model, identifiable, columns.triangular_factors(equations.y, equations.groups)
     )
     known_prior = _build_prior(model, prior, equations.base, parameter_sizes, feasible)
-    parameters = None
     estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
     if known_prior is None:
         _check_mass_scale(machine, equations)
@@ -141,22 +139,9 @@ def identify(
         check_identifiable(
             model.names, np.vstack(list(equations.triangular_factors[:, :, :-1] @ T)), known_prior
         )
-
-    def estimate_at(values: Array) -> tuple[Estimate, Array]:
-        nonlocal equations
-        equations = equations.at_values(values) if machine.free else equations
-        found = METHODS[method](
-            equations.projected_regressor(T),
-            equations.y,
-            equations.groups,
-            equations.samples,
-            estimator_prior,
-        )
-        return found, T @ found.values
-
     start = equations.base.values(model.nominal)
-    estimate = iterate_estimate(estimate_at, start) if machine.free else estimate_at(start)[0]
-    values, covariance = estimate.values, estimate.covariance
+    equations, estimate = equations.estimate(T, METHODS[method], estimator_prior, start)
+    values, covariance, parameters = estimate.values, estimate.covariance, None
     if feasible:
         estimate = feasible_estimate(
             model, identifiable, equations, selection, estimate, known_prior
@@ -188,37 +173,22 @@ def identify(
             motion for motion in validation_motions if is_long_enough(motion, bandwidth)
         ]
         if long_motions:
-            validation_equations = RegressionEquations(
+            held_out = RegressionEquations(
                 model, base, long_motions, bandwidth, slow_speeds, progress
             )
-            validation_comparison = (
-                validation_equations.compare(predicting_values)
-                if validation_equations.is_moving.any()
-                else None
-            )
+            if held_out.is_moving.any():
+                validation_comparison = held_out.compare(predicting_values)
         if validation_comparison is None or len(long_motions) < len(validation_motions):
             _warn_short_validations(validation_motions, long_motions, bandwidth)
         if validation_comparison is not None:
             warn_validation(training, validation_comparison)
     if final_progress is not None:
         final_progress(1.0)
+    magnitudes = base_magnitudes(identifiable, parameter_sizes)
     identification = Identification(
-        model,
-        identifiable,
-        values,
-        covariance,
-        parameters,
-        estimate,
-        method,
-        feasible,
-        training,
-        base_magnitudes(identifiable, parameter_sizes),
-        advice,
-        speeds,
-        bandwidth,
-        slow_speeds,
-        validation_comparison,
-    )
+        model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
+        magnitudes, advice, speeds, bandwidth, slow_speeds, validation_comparison,
+    )  # fmt: skip
     if all(mark == "not determined" for mark in identification.marks):
         reject_unless_trusted(identification.warning, trust)
     elif identification.warning:

@@ -34,7 +34,6 @@ from crane.identification.mechanics.recording_checks import reject_unless_truste
 from crane.identification.mechanics.regression_equations import (
     Progress,
     RegressionEquations,
-    iterate_estimate,
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
@@ -197,7 +196,9 @@ class _PayloadCase:
             drive_motion, equations.offset[:, drive_indices], self.moving_drives, trust=trust
         )
         columns = equations.column_selection(base)
-        equations, estimate = self._estimate(equations, columns, None)
+        equations, estimate = equations.estimate(
+            columns, METHODS[self.method], None, np.zeros(len(columns))
+        )
         combinations, directions = _identifiable_moments(base)
         if not combinations[:, 0].any():
             raise _UnidentifiableMassError(
@@ -242,7 +243,9 @@ class _PayloadCase:
             band = max(breakaway_force(self.machine, joint), least)
             std.append(band if joint in self.one_way_drives else math.inf)
         prior = np.zeros(len(std)), np.array(std)
-        equations, parameters = self._estimate(equations, columns, prior)
+        equations, parameters = equations.estimate(
+            columns, METHODS[self.method], prior, np.zeros(len(columns))
+        )
         derivatives = np.zeros((4, len(std)))
         derivatives[0, 0] = 1.0
         covariance, freedom = _widen_covariance(
@@ -269,29 +272,6 @@ class _PayloadCase:
         if estimate.static_mass is not None:  # the difference of both estimates is an uncertainty
             covariance[0, 0] += (estimate.static_mass[0] - estimate.mass) ** 2
         return estimate
-
-    def _estimate(
-        self, equations: RegressionEquations, columns: Array, prior: Prior | None
-    ) -> tuple[RegressionEquations, Estimate]:
-        """Estimate, and the equations at its values."""
-
-        def estimate_at(values: Array) -> tuple[Estimate, Array]:
-            nonlocal equations
-            equations = equations.at_values(values) if self.machine.free else equations
-            found = METHODS[self.method](
-                equations.projected_regressor(columns),
-                equations.y,
-                equations.groups,
-                equations.samples,
-                prior,
-            )
-            return found, columns @ found.values
-
-        zeros = np.zeros(len(columns))
-        found = (
-            iterate_estimate(estimate_at, zeros) if self.machine.free else estimate_at(zeros)[0]
-        )
-        return equations, found
 
     def _weight_loads_drive(self, motion: Motion) -> bool:
         """Whether the weight of a point mass loads a moving drive."""

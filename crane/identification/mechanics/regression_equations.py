@@ -9,7 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.identification.estimation.regression_problem import Estimate
+from crane.identification.estimation.regression_problem import Estimate, Prior
 from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
@@ -28,7 +28,7 @@ _CACHE_BYTES = (
     3 << 27
 )  # bytes of filtered blocks that are held; others are computed again when needed
 Progress = Callable[[float], None]
-_MAX_ITERATIONS = 30
+_MAX_ITERATIONS = 31
 _CONVERGENCE_TOLERANCE = 1e-2  # of a standard deviation
 _ROUNDING_TOLERANCE = 1e-9  # of the largest value
 RegressorFunction = Callable[[MotionSamples], tuple[Array, Array]]
@@ -283,6 +283,33 @@ class RegressionEquations:
                     update_triangular_factor(R, np.column_stack([W[mask, joint], y[mask, joint]]))
         return out
 
+    def estimate(
+        self, T: Array, estimator: Callable[..., Estimate], prior: Prior | None, start: Array
+    ) -> tuple["RegressionEquations", Estimate]:
+        """Estimate theta of the parameters T theta, (r, p).
+
+        With free joints the estimate is iterated until their rows are evaluated at its own values.
+
+        Args:
+            T: (r, p) combinations of the columns.
+            estimator: One of `estimators`.
+            prior: Prior of theta, None without one.
+            start: (r,) parameters at which rows of free joints are evaluated first.
+
+        Returns:
+            The equations of the last iteration, and the estimate.
+        """
+        equations, values, previous = self, start, None
+        has_free_joints = bool(self._model.machine.free)
+        for _ in range(_MAX_ITERATIONS):
+            equations = equations.at_values(values) if has_free_joints else equations
+            W = equations.projected_regressor(T)
+            found = estimator(W, equations.y, equations.groups, equations.samples, prior)
+            if not has_free_joints or previous is not None and _is_converged(found, previous):
+                break
+            values, previous = T @ found.values, found.values
+        return equations, found
+
     def column_selection(self, base: BaseParameters) -> Array:
         """Selection matrix (r, s) of the columns of a subset of the base parameters."""
         return np.eye(self.base.rank)[:, np.searchsorted(self.base.independent, base.independent)]
@@ -387,22 +414,8 @@ def free_joint_rows(
     return W, known
 
 
-def iterate_estimate(
-    estimate: Callable[[Array], tuple[Estimate, Array]], start: Array
-) -> Estimate:
-    """Iterate an estimate until the rows of free joints are evaluated at its own values.
-
-    Args:
-        estimate: Function parameters (r,) of the rows -> estimate, and its parameters (r,).
-        start: (r,) initial parameters.
-    """
-    result, values = estimate(start)
-    for _ in range(_MAX_ITERATIONS):
-        before, (result, values) = result.values, estimate(values)
-        step = np.abs(result.values - before)
-        if (
-            step
-            <= _CONVERGENCE_TOLERANCE * result.std + _ROUNDING_TOLERANCE * np.abs(before).max()
-        ).all():
-            break
-    return result
+def _is_converged(estimate: Estimate, previous: Array) -> bool:
+    """Whether an estimate differs from previous values (p,) by a small part of its std."""
+    tolerance = _CONVERGENCE_TOLERANCE * estimate.std
+    step = np.abs(estimate.values - previous)
+    return bool((step <= tolerance + _ROUNDING_TOLERANCE * np.abs(previous).max()).all())
