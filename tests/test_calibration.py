@@ -16,9 +16,9 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.description.parameter_changes import parameters
 from crane.description.sensors import Sensor
 from crane.formats.machine_loading import MachineVariants
+from crane.identification.calibration.calibration_result import residual_dependences
 from crane.identification.calibration.calibration_statistics import estimate_with_profiles
 from crane.identification.calibration.recording_case import noise_std
-from crane.identification.calibration.residual_dependence import residual_dependences
 from crane.identification.calibration.unknowns import build_unknowns
 from crane.recordings import table_reader, timeseries
 

@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from crane.identification.calibration.calibration_result import FittedParameter
+from crane.identification.calibration.calibration_result import (
+    FittedParameter,
+    correlation_ratio,
+    group_samples,
+)
 from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     ProfileEnds,
@@ -11,7 +15,6 @@ from crane.identification.calibration.calibration_statistics import (
     estimate_with_profiles,
     evaluate_profile_ends,
 )
-from crane.identification.calibration.residual_dependence import correlation_ratio, group_samples
 
 
 class Fake:

@@ -22,7 +22,7 @@ from crane.cli.runs import read_run, write_identification
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.force_terms import ForceElementTerm, friction_term
 from crane.identification.mechanics.identification_model import default_terms
-from crane.identification.mechanics.identified_urdf import divide_locked_bodies
+from crane.identification.mechanics.identified_description import divide_locked_bodies
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
 from crane.identification.mechanics.model_term import InertialTerm, body_names

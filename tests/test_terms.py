@@ -27,8 +27,8 @@ from crane.identification.mechanics.force_terms import (
     friction_term,
     root_friction_term,
 )
-from crane.identification.mechanics.friction_laws import friction_laws
 from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identified_description import friction_laws
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model_term import (
     ForceDirection,

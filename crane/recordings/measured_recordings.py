@@ -23,8 +23,11 @@ from crane.common.errors import CraneWarning, RecordingError, prefix_location
 from crane.common.samples import Array
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
 from crane.machine import Machine
-from crane.recordings.inclination_angles import add_inclination_angles
-from crane.recordings.measured_configurations import determining_joints, motion_from_joints
+from crane.recordings.measured_configurations import (
+    add_inclination_angles,
+    determining_joints,
+    motion_from_joints,
+)
 from crane.recordings.missing_measurements import (
     HELD_JOINT_TOLERANCE,
     MissingMeasurementError,

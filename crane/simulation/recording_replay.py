@@ -20,8 +20,11 @@ from crane.common.samples import Array, as_number
 from crane.control import ValveDrive, ValveSignals
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine import Machine
-from crane.recordings.inclination_angles import add_inclination_angles
-from crane.recordings.measured_configurations import determining_joints, joint_motion
+from crane.recordings.measured_configurations import (
+    add_inclination_angles,
+    determining_joints,
+    joint_motion,
+)
 from crane.recordings.measured_recordings import (
     check_pressures,
     check_strokes,

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.samples import Array, as_number, as_sample
 from crane.identification.mechanics.base_parameters import BaseParameters, base_parameters
-from crane.identification.mechanics.friction_laws import FrictionTerm
+from crane.identification.mechanics.force_terms import FrictionTerm
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.regression_equations import (
     Progress,

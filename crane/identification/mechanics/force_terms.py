@@ -216,6 +216,9 @@ class PreslidingFriction:
         return np.sign(v)[:, None]
 
 
+FrictionTerm = VelocityFriction | PreslidingFriction | FrictionalMemory
+
+
 class GasSpringTerm:
     """Term of a gas spring: a factor on its force with the nominal value 1.
 

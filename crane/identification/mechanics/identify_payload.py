@@ -12,7 +12,7 @@ from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics import Dynamics
-from crane.identification.estimation.regression_problem import Estimate, Prior
+from crane.identification.estimation.regression_problem import Estimate
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.equation_setup import build_equations, multi_pass_progress

@@ -23,14 +23,12 @@ from crane.formats.machine_file.machine_writer import friction_data
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.friction_laws import (
-    FrictionLawFit,
-    FrictionTerm,
-    friction_laws,
-)
+from crane.identification.mechanics.force_terms import FrictionTerm
 from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.identified_urdf import (
+from crane.identification.mechanics.identified_description import (
+    FrictionLawFit,
     divide_locked_bodies,
+    friction_laws,
     joint_combinations,
     motor_chain,
     replace_inertials,

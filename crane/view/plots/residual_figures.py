@@ -6,8 +6,11 @@ from matplotlib.figure import Figure
 
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.identification.calibration.calibration_result import CalibrationChannel
-from crane.identification.calibration.residual_dependence import ResidualDependence, group_samples
+from crane.identification.calibration.calibration_result import (
+    CalibrationChannel,
+    ResidualDependence,
+    group_samples,
+)
 from crane.view.plots.calibration_figure import HELD_OUT_COLOUR, draw_channel, mask_spans
 from crane.view.plots.curve_thinning import envelope
 from crane.view.plots.figure_text import escape_label
