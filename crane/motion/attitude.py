@@ -1,7 +1,5 @@
 """Attitude coordinates of a frame, and attitude trajectories through given angles."""
 
-from typing import Protocol
-
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
@@ -18,30 +16,6 @@ _MAX_AXIS_TILT = 0.5  # sine of the angle between the axis and the horizontal at
 _MAX_ROTATION_ANGLE = 6.0  # [rad] from the first attitude; the rotation vector is singular at 2 pi
 
 
-class AttitudeCoordinates(Protocol):
-    """Coordinates of the attitude of a frame with the rotation matrix R in the world frame.
-
-    Attributes:
-        names: Names of the coordinates.
-    """
-
-    names: tuple[str, ...]
-
-    def error(self, target: Array, rotation: Array) -> Array:
-        """Error (k,) [rad] from R (3, 3) to a target, which is a flat array."""
-
-    def rates(self, rotation: Array, angular_velocities: Array) -> Array:
-        """Rates (k, n) of the coordinates for angular velocities (3, n) in the world frame."""
-
-    def accelerations(
-        self, rotation: Array, angular_velocity: Array, angular_acceleration: Array
-    ) -> Array:
-        """Second derivatives (k,) for angular velocity and acceleration (3,) in the world."""
-
-    def format_target(self, target: Array) -> str:
-        """Text of a target for error messages."""
-
-
 class RotationCoordinates:
     """The complete rotation: three coordinates, whose rates are the angular velocity.
 
@@ -51,21 +25,21 @@ class RotationCoordinates:
     names: tuple[str, ...] = ROLL_PITCH_YAW
 
     def error(self, target: Array, rotation: Array) -> Array:
-        """See `AttitudeCoordinates`."""
+        """Error (k,) [rad] from R (3, 3) to a target, which is a flat array."""
         return np.asarray(pin.log3(target.reshape(3, 3) @ rotation.T))
 
     def rates(self, rotation: Array, angular_velocities: Array) -> Array:
-        """See `AttitudeCoordinates`."""
+        """Rates (k, n) of the coordinates for angular velocities (3, n) in the world frame."""
         return angular_velocities
 
     def accelerations(
         self, rotation: Array, angular_velocity: Array, angular_acceleration: Array
     ) -> Array:
-        """See `AttitudeCoordinates`."""
+        """Second derivatives (k,) for angular velocity and acceleration (3,) in the world."""
         return angular_acceleration
 
     def format_target(self, target: Array) -> str:
-        """See `AttitudeCoordinates`."""
+        """Text of a target for error messages."""
         angles = pin.rpy.matrixToRpy(target.reshape(3, 3))
         return "roll, pitch, yaw (" + ", ".join(f"{angle:.4g}" for angle in angles) + ") rad"
 
@@ -146,12 +120,12 @@ class InclinationCoordinate:
         return np.asarray(np.arctan2(rotation[..., 2, 0], rotation[..., 2, self._k]))
 
     def error(self, target: Array, rotation: Array) -> Array:
-        """See `AttitudeCoordinates`."""
+        """See `RotationCoordinates`."""
         difference = target - self.value(rotation)
         return np.asarray(difference - 2 * np.pi * np.round(difference / (2 * np.pi)))
 
     def rates(self, rotation: Array, angular_velocities: Array) -> Array:
-        """See `AttitudeCoordinates`."""
+        """See `RotationCoordinates`."""
         u = rotation[2]
         vertical_rates = -np.cross(rotation.T @ angular_velocities, u, axisa=0, axisc=0)
         return np.asarray(self._angle_derivative(u, vertical_rates[0], vertical_rates[self._k]))[
@@ -161,7 +135,7 @@ class InclinationCoordinate:
     def accelerations(
         self, rotation: Array, angular_velocity: Array, angular_acceleration: Array
     ) -> Array:
-        """See `AttitudeCoordinates`."""
+        """See `RotationCoordinates`."""
         u, k, w = rotation[2], self._k, rotation.T @ angular_velocity
         vertical_rate = -np.cross(w, u)
         vertical_acceleration = -np.cross(rotation.T @ angular_acceleration, u) - np.cross(
@@ -180,8 +154,11 @@ class InclinationCoordinate:
         return np.asarray((u[self._k] * x - u[0] * k) / (u[0] ** 2 + u[self._k] ** 2))
 
     def format_target(self, target: Array) -> str:
-        """See `AttitudeCoordinates`."""
+        """See `RotationCoordinates`."""
         return f"an inclination of {target[0]:.4g} rad"
+
+
+AttitudeCoordinates = RotationCoordinates | InclinationCoordinate
 
 
 def roll_pitch_yaw(angles: ArrayLike) -> Array:

@@ -69,10 +69,7 @@ class Estimate(OneLineRepr):
 
         They are values -+ t std with Student's t for `degrees_of_freedom`.
         """
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
 
 class RegressionProblem:
@@ -358,3 +355,20 @@ def condition_numbers(W: Array) -> tuple[float, float]:
 
 def _condition_number(W: Array) -> float:
     return float(np.linalg.cond(np.linalg.qr(W, mode="r")))
+
+
+def confidence_intervals(
+    values: Array, std: Array, degrees_of_freedom: float | Array, level: float
+) -> Array:
+    """Lower and upper ends (p, 2) of intervals values -+ t std with Student's t.
+
+    Args:
+        values: (p,) estimates.
+        std: (p,) standard deviations.
+        degrees_of_freedom: Degrees of freedom of the standard deviations, () or (p,).
+        level: Confidence level, 0 to 1.
+    """
+    from scipy.stats import t
+
+    half = t.ppf(0.5 + 0.5 * level, degrees_of_freedom) * std
+    return np.column_stack([values - half, values + half])

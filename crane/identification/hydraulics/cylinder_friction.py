@@ -20,8 +20,7 @@ from crane.common.threads import with_single_threaded_blas
 from crane.description import Friction
 from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import Estimate
-from crane.identification.hydraulics.cylinder_signals import joint_index
+from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.steady_samples import steady_samples
 from crane.machine import Machine
@@ -75,10 +74,7 @@ class CylinderFriction(OneLineRepr):
 
     def interval(self, level: float = 0.95) -> Array:
         """Confidence intervals (p, 2) of a level."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     @property
     def friction(self) -> Friction:
@@ -248,85 +244,3 @@ def _fit_with_stiction(
     if not linear[3] > 3 * estimate.std[3]:
         return fit_without, f"{low} show no stiction"
     return (values, dataclasses.replace(estimate, values=values)), ""
-
-
-@dataclass(frozen=True, eq=False)
-class DirectionDifference:
-    """Friction and load at strokes and speeds that occur in both directions.
-
-    Attributes:
-        stroke: (K,) middle of each bin [m] or [rad].
-        speed: (K,) mean absolute speed.
-        friction: (K,) (F_extending - F_retracting) / 2 [N] or [N m].
-        load: (K,) (F_extending + F_retracting) / 2, including friction that does not change its
-            sign.
-    """
-
-    stroke: Array
-    speed: Array
-    friction: Array
-    load: Array
-
-
-def direction_difference(
-    recording: Recording,
-    joint: str,
-    bins: int = 10,
-    settle: float = 0.3,
-    speed_tolerance: float = 0.1,
-) -> DirectionDifference:
-    """Friction as half the difference of the force between both directions of motion.
-
-    No masses are needed, but the other joints must have the same coordinates in both directions.
-    In each bin of the stroke, a straight line is fitted to the force over the stroke for each
-    direction and speed, and evaluated in the middle of the common range, so that a load that
-    depends on the stroke cancels.
-
-    Args:
-        recording: Recording with tau of the joint by (20).
-        joint: Name of the joint.
-        bins: Number of equal bins of the stroke.
-        settle: Duration of constant speed before a sample [s].
-        speed_tolerance: Relative difference of speeds that are taken as equal.
-
-    Raises:
-        RecordingError: No stroke and speed occurs in both directions.
-    """
-    i = joint_index(recording, joint)
-    x, v, force = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
-    is_steady = steady_samples(recording.time, settle, v, share=_STEADY_SHARE, relative=True) & (
-        np.abs(v) > _STANDSTILL_SHARE * np.abs(v).max()
-    )
-    edges = np.linspace(x.min(), x.max(), bins + 1)
-    rows = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        inside = is_steady & (x >= low) & (x <= high)
-        for level in _speed_levels(np.abs(v[inside]), speed_tolerance):
-            same = inside & (np.abs(np.abs(v) - level) <= speed_tolerance * level)
-            directions = [np.flatnonzero(same & (sense * v > 0)) for sense in (1, -1)]
-            if min(map(len, directions)) < 3:
-                continue
-            start, end = (max(x[w].min() for w in directions), min(x[w].max() for w in directions))
-            if end <= start:
-                continue
-            middle = 0.5 * (start + end)
-            up, down = (float(np.polyfit(x[w] - middle, force[w], 1)[-1]) for w in directions)
-            speed = float(np.mean([np.abs(v[w]).mean() for w in directions]))
-            rows.append((middle, speed, 0.5 * (up - down), 0.5 * (up + down)))
-    if not rows:
-        raise RecordingError(
-            f"'{joint}' has no stroke that it passes both ways at one steady speed, record it "
-            "extending and retracting at the same speeds"
-        )
-    return DirectionDifference(*np.array(rows).T)
-
-
-def _speed_levels(sizes: Array, speed_tolerance: float) -> list[float]:
-    """Median speeds of groups of about equal speeds."""
-    out: list[float] = []
-    rest = np.sort(sizes)
-    while len(rest):
-        group = rest[rest <= rest[0] * (1 + speed_tolerance)]
-        out.append(float(np.median(group)))
-        rest = rest[len(group) :]
-    return out

@@ -14,6 +14,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
+from crane.identification.estimation.regression_problem import confidence_intervals
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,
     cylinder_and_valve,
@@ -97,10 +98,7 @@ class OrificeCoefficients(OneLineRepr):
 
     def interval(self, level: float = 0.95) -> Array:
         """Confidence intervals (5, 2) of a level."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     def predict(self, recording: Recording, period: float | None = None) -> EquationSides:
         """Both sides of (29) on another recording, as means over windows.

@@ -11,6 +11,7 @@ from crane.description import Friction
 from crane.dynamics.joint_forces import JointForces
 from crane.identification.mechanics.model_term import (
     ForceDirection,
+    ModelTerm,
     MotionSamples,
     resolve_direction,
 )
@@ -19,7 +20,7 @@ from crane.machine import Machine
 ForceShape = Callable[[Array], Array]
 
 
-class VelocityFriction:
+class VelocityFriction(ModelTerm):
     """Friction term: known functions of the velocity along one direction times parameters.
 
     Args:
@@ -121,7 +122,7 @@ def root_friction_term(machine: Machine, direction: str | ForceDirection) -> Vel
     return VelocityFriction(machine, direction, shape)
 
 
-class FrictionalMemory:
+class FrictionalMemory(ModelTerm):
     """Frictional memory: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 at the start.
 
     The friction is larger after rest than before it, as the contact changes with a lag.
@@ -132,9 +133,6 @@ class FrictionalMemory:
         lag: Time constant [s].
         speed: Characteristic speed [m/s], [rad/s].
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(
         self, machine: Machine, direction: str | ForceDirection, lag: float, speed: float
@@ -171,7 +169,7 @@ class FrictionalMemory:
         return (np.sign(v) * np.exp(-np.abs(v) / self._speed))[:, None]
 
 
-class PreslidingFriction:
+class PreslidingFriction(ModelTerm):
     """Presliding friction: Dahl's law over the travelled distance.
 
     F = force z, dz = (1 - sign(v) z) ds / length, z = 0 at the start of a recording (Dahl, 1968).
@@ -181,9 +179,6 @@ class PreslidingFriction:
         direction: Name of a joint, or a combination.
         length: Characteristic distance [m], [rad].
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(self, machine: Machine, direction: str | ForceDirection, length: float):
         direction = resolve_direction(machine, direction)
@@ -219,16 +214,13 @@ class PreslidingFriction:
 FrictionTerm = VelocityFriction | PreslidingFriction | FrictionalMemory
 
 
-class GasSpringTerm:
+class GasSpringTerm(ModelTerm):
     """Term of a gas spring: a factor on its force with the nominal value 1.
 
     Args:
         machine: The machine.
         joint: Joint of the gas spring, or its name.
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(self, machine: Machine, joint: str):
         springs = [spring for spring in machine.gas_springs if spring.joint == joint]
@@ -245,7 +237,7 @@ class GasSpringTerm:
         ]
 
 
-class ForceElementTerm:
+class ForceElementTerm(ModelTerm):
     """Passive force of known shape along a joint or distance times a factor.
 
     Args:
@@ -255,9 +247,6 @@ class ForceElementTerm:
         name: Name of the factor.
         nominal: Nominal value of the factor.
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(
         self,

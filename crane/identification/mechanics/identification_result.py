@@ -14,7 +14,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.text_tables import format_table
-from crane.identification.estimation.regression_problem import Estimate
+from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions
@@ -94,10 +94,7 @@ class Identification(OneLineRepr):
 
     def interval(self, level: float = 0.95) -> Array:
         """Confidence intervals (r, 2) of a level."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.estimate.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        return confidence_intervals(self.values, self.std, self.estimate.degrees_of_freedom, level)
 
     @cached_property
     def marks(self) -> tuple[str, ...]:

@@ -114,7 +114,7 @@ def resolve_direction(machine: Machine, given: str | ForceDirection) -> ForceDir
     return direction
 
 
-class InertialTerm:
+class InertialTerm(ModelTerm):
     """Term of the bodies: ten parameters each about the joint frame, Y_A = gamma^T Y(q, v, a)."""
 
     def __init__(self, machine: Machine):
@@ -147,7 +147,7 @@ def body_names(machine: Machine) -> tuple[str, ...]:
     return tuple(names)
 
 
-class RotorInertiaTerm:
+class RotorInertiaTerm(ModelTerm):
     """Term of a rotor inertia along a direction s, such as that of a geared motor.
 
         tau_A = c s'' I,   c = ds/dq_A,   s'' = c^T a_A + dc^T/dt v_A.
@@ -158,9 +158,6 @@ class RotorInertiaTerm:
         machine: The machine.
         direction: Name of a joint, active or passive, or a combination of active ones.
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(self, machine: Machine, direction: str | ForceDirection):
         self.direction = direction = resolve_direction(machine, direction)

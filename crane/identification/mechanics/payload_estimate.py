@@ -9,6 +9,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.text_tables import format_table
 from crane.dynamics import Dynamics
+from crane.identification.estimation.regression_problem import confidence_intervals
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.force_delays import motion_frequency
@@ -102,13 +103,8 @@ class PayloadEstimate(OneLineRepr):
 
     def interval(self, level: float = 0.95) -> Array:
         """Confidence intervals (4, 2) of mass and centre of mass."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * np.sqrt(
-            np.diag(self.covariance)
-        )
-        values = np.append(self.mass, self.com)
-        return np.column_stack([values - half, values + half])
+        values, std = np.append(self.mass, self.com), np.sqrt(np.diag(self.covariance))
+        return confidence_intervals(values, std, self.degrees_of_freedom, level)
 
     @property
     def warning(self) -> str:
