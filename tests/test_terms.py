@@ -125,9 +125,9 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
         ({"q9.viscous": ()}, "term 'q9.viscous': 'q9' is unknown, known: q1"),
         (
             {"q1.presliding": ()},
-            "term 'q1.presliding' has 0 numbers, give the distance over which",
+            "term 'q1.presliding' has 0 values, give the characteristic distance",
         ),
-        ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 numbers, it takes none"),
+        ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 values, it takes none"),
         (
             {"q1.presliding": (-1.0,)},
             "a value of term 'q1.presliding' is -1.0, give a number above",
@@ -343,11 +343,11 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
         (["--train", "0:9"], "nothing of use lies outside of --train 0:9, so nothing judges"),
         (
             ["--train", "0:7.7", "--bandwidth", "10"],
-            "1 of 1 held-out recordings are too short for a low-pass of 10 Hz and judge",
+            "1 of 1 held-out recordings are too short for a low-pass of 10 Hz and are not used",
         ),
         (
             ["--train", "0:6", "--slow", "crank=1.03", "--bandwidth", "40"],  # else 4 rows
-            "no validation moves faster than what counts",
+            "no held-out recording moves faster than",
         ),
     ],
 )
@@ -424,12 +424,12 @@ def test_the_prior_that_predicts_is_chosen(arm):
         (
             {"bodies": ["1 %"]},
             {"prior": (0, 1)},
-            "the prior is numbers of all parameters, give it",
+            "the prior is an array of all parameters, give it",
         ),
         (
             {"bandwidth": [5.0]},
             {"method": "x"},
-            "some part of the training is not told by the oth",
+            "some fold of the training data is not determined",
         ),
     ],
 )
@@ -510,7 +510,7 @@ def test_what_is_learned_does_not_judge_and_is_learned_once(arm):
         identify(arm, [one, part], **known)
     with pytest.raises(RecordingError, match="75% of recording 2's samples are in recording 1 as"):
         identify(arm, [part, one], **known)
-    with pytest.warns(CraneWarning, match="100% of a validation's samples were learned from: its"):
+    with pytest.warns(CraneWarning, match="100% of the held-out samples are training data: their"):
         identify(arm, one, [other, part], **known)
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)  # errors of rounding are none, either
