@@ -286,7 +286,7 @@ def test_errors(mini, slider_crank, edited):
         (lambda: excite(mini, harmonics=5000), "with 3 active joints: give at most 38"),
         (
             lambda: excite(mini, step=1.0),
-            "10 samples in a period of 10 s do not determine 75 base",
+            "10 samples in a period of 10 s do not determine 75",
         ),
         (lambda: excite(slider_crank, prior=np.zeros(3)), "the prior has the shape"),
     ):

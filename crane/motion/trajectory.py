@@ -32,8 +32,8 @@ class Trajectory(OneLineRepr):
 
     Attributes:
         duration: [s].
-        tip: See above.
-        attitude: See above.
+        tip: Trajectory of the tip, None if the motion was not defined by the tip.
+        attitude: Attitude of the tip's frame, None if it was not defined.
     """
 
     duration: float

@@ -10,7 +10,7 @@ from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks, release_pages
 from crane.common.units import display_unit, format_number, format_quantity
 from crane.description.machine_lookup import without_changes
-from crane.recordings.limit_cycles import ringing
+from crane.recordings.limit_cycles import limit_cycle_message
 from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, Recording
 
 SUPPORT_PREFIX = "support_"
@@ -218,7 +218,7 @@ def summarize(recording: Recording) -> RecordingSummary:
         tip_rms_error=None if distance is None else rms(time, distance),
         stability_text=_stability_text(recording),
         balance_text=_balance_text(recording),
-        ringing=ringing(recording),
+        ringing=limit_cycle_message(recording),
         stopped=recording.stopped,
         start=recording.start,
     )

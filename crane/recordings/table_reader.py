@@ -183,11 +183,7 @@ def check_regular_file(path: Path) -> None:
 
 
 def _count_lines(path: Path) -> int:
-    """Number of lines of a text file.
-
-    Raises:
-        RecordingError: A line is too long.
-    """
+    """Number of lines of a text file; raises an error for a line that is too long."""
     line_count, line_bytes = 0, 0  # complete lines, bytes of the incomplete one
     with path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):

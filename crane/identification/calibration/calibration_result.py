@@ -107,7 +107,7 @@ class CalibrationChannel(OneLineRepr):
     Attributes:
         recording: Name of the file.
         name: Name of the column.
-        unit: Its unit.
+        unit: Unit of the channel.
         time: (N,) [s].
         train_mask: (N,) mask of the training data.
         measured: (N,) measured values.

@@ -88,7 +88,7 @@ def recording_case(
 
     Args:
         machine: The machine.
-        name: Of the file.
+        name: Name of the file.
         table: Readings of the sensors.
         known_sensors: Known sensors.
         sensors: Columns to compare.

@@ -73,7 +73,8 @@ def build_unknowns(
     """Build the unknowns of a calibration.
 
     Args:
-        fit: By name None, a start, or (start, low, high), each of which may be None; or names.
+        fit: Parameters by name: None, a start, or (start, low, high), each of which may be None;
+            or names only.
         spec: Specification of the machine.
         parameters: Parameters of the machine and its sensors by name.
         sensor_units: Units of the sensors by column.

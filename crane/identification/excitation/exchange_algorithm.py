@@ -45,7 +45,7 @@ class SignalLimits:
         margin: Margin relative to strokes, relief pressures and the pump's flow.
 
     Attributes:
-        machine: See above.
+        machine: The machine of the information.
         low: (m,) lower limits [m], [rad].
         high: (m,) upper limits [m], [rad].
         flow: Largest demand of pump flow [m3/s].

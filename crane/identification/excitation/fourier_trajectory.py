@@ -26,9 +26,9 @@ class FourierTrajectory(Trajectory):
         periods: Number of complete periods.
 
     Attributes:
-        coefficients: See above.
-        period: See above.
-        periods: See above.
+        coefficients: As given.
+        period: Period [s].
+        periods: Number of complete periods.
         lead: Duration of the parts before and after the periodic part [s].
 
     Raises:

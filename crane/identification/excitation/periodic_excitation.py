@@ -72,7 +72,7 @@ class Excitation(OneLineRepr):
         limit_usage: (5, n) used share of the limits, by `QUANTITIES`.
         noise: (n,) standard deviations of the force noise [N], [N m].
         criterion: Optimization criterion.
-        seed: Of the random references.
+        seed: Seed of the random trajectories.
         step: Step of the planned recording [s].
     """
 

@@ -52,7 +52,7 @@ class SignalExcitation(OneLineRepr):
         peak_pressures: (m,) largest pressures in the cylinders [Pa].
         signal_rates: (m,) largest rates of the signals [V/s].
         criterion: Optimization criterion.
-        seed: Of the random signals.
+        seed: Seed of the random plans.
     """
 
     machine: Machine
@@ -105,7 +105,7 @@ class SignalExcitation(OneLineRepr):
         """Write signals and expected readings as a recording without noise.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         notes = {"machine": self.machine.load_expression, "task": "excitation through the valves"}
         notes[SENSORS_NOTE] = IDEAL_SENSORS

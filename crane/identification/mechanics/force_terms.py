@@ -28,10 +28,10 @@ class VelocityFriction(ModelTerm):
         direction: Name of a joint, or a combination.
         shapes: Functions velocity (N,) -> (N,) by name of the parameter.
         nominal: Nominal values; default zero.
-        nonnegative: Names of parameters that cannot be negative.
+        nonnegative: Names of parameters that must not be negative.
 
     Attributes:
-        direction: See above.
+        direction: Direction of the friction.
         stribeck_velocities: Stribeck velocities [m/s], [rad/s].
     """
 

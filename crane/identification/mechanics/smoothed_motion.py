@@ -52,7 +52,7 @@ def smoothed_motion(
     forces and recorded loads.
 
     Args:
-        machine: What was recorded.
+        machine: The recorded machine.
         recording: Recording with all active joints of the machine.
         derivatives: Method "kalman" or "lowpass", see `differentiate`.
         cutoff: Cutoff of "lowpass" [Hz].
@@ -187,7 +187,7 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
     frame of the machine's load NAME, or at the link NAME; missing components are zero.
 
     Args:
-        machine: What was recorded.
+        machine: The recorded machine.
         recording: Recording of N samples.
         q_a: (N, n) [m], [rad].
         trust: See `smoothed_motion`.
