@@ -33,6 +33,7 @@ from crane.identification.calibration.calibration_result import (
 from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     estimate_with_profiles,
+    score_tests,
 )
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
 from crane.identification.calibration.parameter_selection import (
@@ -161,7 +162,7 @@ def calibrate(
     if not automatic:
         applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
         calibration = replace(
-            calibration, score_tests=tuple(search.score_test(applicable_extras, estimate.z))
+            calibration, score_tests=tuple(score_tests(search, applicable_extras, estimate.z))
         )
     known = dict(machine.sensors) | dict(cases[0].known_sensors)
     return replace(
@@ -260,6 +261,7 @@ def _calibration_result(
     unknowns, z, covariance = problem.unknowns, estimate.z, estimate.covariance
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = problem.values(z)
+    correlation = _correlation_matrix(covariance, len(unknowns))
     fitted = []
     for i, unknown in enumerate(unknowns):
         value, scale = values[unknown.name], unknown.scale
@@ -298,9 +300,9 @@ def _calibration_result(
         tuple(fitted),
         tuple(channels),
         problem.changes(z),
-        tuple(_correlated_pairs(unknowns, covariance)),
+        tuple(_correlated_pairs(unknowns, correlation)),
         problem.simulation_count,
-        correlation=_correlation_matrix(covariance, len(unknowns)),
+        correlation=correlation,
         states=simulated_states(problem, z),
         is_lowest_minimum=estimate.is_lowest_minimum,
     )
@@ -315,18 +317,11 @@ def _correlation_matrix(covariance: Array, count: int) -> Array:
 
 
 def _correlated_pairs(
-    unknowns: Sequence[Unknown], covariance: Array
+    unknowns: Sequence[Unknown], correlation: Array
 ) -> list[tuple[str, str, float]]:
     """Strongly correlated pairs of parameters, with their correlation."""
-    count = len(unknowns)
-    deviations = np.sqrt(np.diag(covariance))[:count]
-    found = []
-    for i in range(count):
-        for j in range(i):
-            if deviations[i] and deviations[j]:
-                correlation = float(covariance[i, j] / (deviations[i] * deviations[j]))
-                if abs(correlation) > _MAX_CORRELATION:
-                    found.append((unknowns[j].name, unknowns[i].name, correlation))
+    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
+    found = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
     return sorted(found, key=lambda pair: -abs(pair[2]))
 
 

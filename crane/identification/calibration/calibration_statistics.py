@@ -13,13 +13,15 @@ simulated, too: if F decreases there, the minimum was a local one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import CraneError
 from crane.common.samples import Array
+from crane.identification.calibration.calibration_problem import CalibrationProblem
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
 from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
@@ -38,28 +40,6 @@ _MIN_COST_REDUCTION = 0.03  # of the cost, that is reported
 _MAX_REPORTED = 5  # results that are reported
 _MAX_STEP = 2.0  # standard deviations of a change
 _MIN_INDEPENDENT_SHARE = 1e-6  # part of a derivative that is independent of the fitted parameters
-
-
-class MinimumSearch(Protocol):
-    """Result of a minimization with its linearization, see `LevenbergMarquardt`."""
-
-    low: Array
-    high: Array
-    prior: Array
-    jacobian: Array
-    residual: Array
-
-    def run(self) -> Array:
-        """Unknowns at the minimum."""
-
-    def nearest_minimum(self, z: Array) -> Array:
-        """Nearest minimum to some unknowns."""
-
-    def weighted_residuals(self, z: Array) -> Array:
-        """Weighted residuals (M,)."""
-
-    def covariance(self, z: Array) -> tuple[Array, int]:
-        """Covariance (p, p) of the scaled unknowns, and the number of blocks."""
 
 
 class ProfileEnds(NamedTuple):
@@ -108,7 +88,9 @@ class CalibrationEstimate:
     is_lowest_minimum: bool
 
 
-def estimate_with_profiles(search: MinimumSearch, parameter_count: int) -> CalibrationEstimate:
+def estimate_with_profiles(
+    search: LevenbergMarquardt, parameter_count: int
+) -> CalibrationEstimate:
     """Minimize, evaluate the ends of the intervals, and continue from lower minima.
 
     Args:
@@ -130,7 +112,7 @@ def estimate_with_profiles(search: MinimumSearch, parameter_count: int) -> Calib
 
 
 def evaluate_profile_ends(
-    search: MinimumSearch, z: Array, half_widths: Array
+    search: LevenbergMarquardt, z: Array, half_widths: Array
 ) -> tuple[list[ProfileEnds], Array | None]:
     """Evaluate the cost at the ends of the intervals.
 
@@ -172,7 +154,7 @@ def evaluate_profile_ends(
 
 
 def _refine_point(
-    search: MinimumSearch, z: Array, H: Array, free: NDArray[np.bool_]
+    search: LevenbergMarquardt, z: Array, H: Array, free: NDArray[np.bool_]
 ) -> tuple[Array, float]:
     """The better of a point and the point after a Gauss-Newton step, and its cost."""
     z = np.clip(z, search.low, search.high)
@@ -185,7 +167,7 @@ def _refine_point(
     return (refined, refined_cost) if refined_cost < cost else (z, cost)
 
 
-def _cost_and_gradient(search: MinimumSearch, z: Array) -> tuple[float, Array]:
+def _cost_and_gradient(search: LevenbergMarquardt, z: Array) -> tuple[float, Array]:
     """Half the sum of squares, infinite if the simulation fails, and its gradient by J."""
     try:
         residuals = search.weighted_residuals(z)
@@ -233,26 +215,14 @@ def correlated_directions(
 
 def _correlated_groups(correlation: Array) -> list[list[int]]:
     """Groups of linked parameters, each in at most one group."""
-    linked = np.abs(correlation) > _PAIR_CORRELATION
-    groups, remaining = [], set(range(len(correlation)))
-    while remaining:
-        group = _connected_component(linked, min(remaining))
-        remaining -= set(group)
-        groups.append(group)
-    singles = [group[0] for group in groups if len(group) == 1]
+    from scipy.sparse.csgraph import connected_components
+
+    count, labels = connected_components(np.abs(correlation) > _PAIR_CORRELATION)
+    groups = [np.flatnonzero(labels == label).tolist() for label in range(count)]
     inverse = np.linalg.pinv(correlation, rcond=1e-12, hermitian=True)
     inflated = np.sqrt(np.maximum(np.diag(inverse), 0.0)) > _MIN_INFLATION
-    pairs = [group for group in groups if len(group) > 1]
-    return [*pairs, [i for i in singles if inflated[i]]]
-
-
-def _connected_component(linked: NDArray[np.bool_], start: int) -> list[int]:
-    found, pending = {start}, [start]
-    while pending:
-        neighbours = set(np.flatnonzero(linked[pending.pop()]).tolist()) - found
-        found |= neighbours
-        pending += neighbours
-    return sorted(found)
+    singles = [group[0] for group in groups if len(group) == 1 and inflated[group[0]]]
+    return [*(group for group in groups if len(group) > 1), singles]
 
 
 @dataclass(frozen=True)
@@ -268,6 +238,33 @@ class ScoreTestResult:
     name: str
     value: float
     cost_reduction: float
+
+
+def score_tests(
+    search: LevenbergMarquardt, candidates: Sequence[Unknown], z: Array
+) -> list[ScoreTestResult]:
+    """Score tests of parameters that are not fitted, at the minimum z (p,) of a search."""
+    problem = search.problem
+    if not candidates:
+        return []
+    extended_problem = CalibrationProblem(
+        problem.machine, [*problem.unknowns, *candidates], problem.cases
+    )
+    extended_problem.smooth, extended_problem.slopes = problem.smooth, problem.slopes
+    count, candidate_count = len(problem.unknowns), len(candidates)
+    unknowns = np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
+    rows = []
+    for case, extended_case in zip(problem.cases, extended_problem.cases, strict=True):
+        if not case.train_mask.any():
+            continue
+        try:
+            _, derivatives = extended_problem.linearize(extended_case, unknowns, set(range(count)))
+        except CraneError:  # the tests are optional
+            return []
+        weighted = (derivatives * search.channel_weights(case)[:, :, None])[case.train_mask]
+        columns = weighted[:, :, count : count + candidate_count]
+        rows.append(columns.reshape(-1, candidate_count))
+    return score_test(candidates, search.jacobian, np.vstack(rows), search.residual, search.prior)
 
 
 def score_test(

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt method of a calibration, within bounds and with channel scales."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,9 +12,7 @@ from crane.identification.calibration.calibration_problem import (
     DERIVATIVE_TOLERANCE,
     CalibrationProblem,
 )
-from crane.identification.calibration.calibration_statistics import ScoreTestResult, score_test
 from crane.identification.calibration.recording_case import RecordingCase, noise_std
-from crane.identification.calibration.unknowns import Unknown
 
 Progress = Callable[[float], None]
 
@@ -50,6 +48,7 @@ class LevenbergMarquardt:
     """Levenberg-Marquardt method within bounds, with channel scales by their residuals.
 
     Attributes:
+        problem: The calibration problem.
         channel_scales: Channel scales by sensor.
         jacobian: (M, p) weighted derivatives of the training data at the minimum.
         residual: (M,) weighted residuals, likewise.
@@ -59,7 +58,7 @@ class LevenbergMarquardt:
     def __init__(
         self, problem: CalibrationProblem, progress: Progress | None, iteration_count: int = 0
     ):
-        self._problem, self._progress = problem, progress
+        self.problem, self._progress = problem, progress
         unknowns = problem.unknowns
         start_count = problem.unknown_count - len(unknowns)
         self.low = np.array(
@@ -83,7 +82,7 @@ class LevenbergMarquardt:
 
     def run(self) -> Array:
         """Run all rounds; returns the unknowns at the minimum."""
-        problem = self._problem
+        problem = self.problem
         z = self.smoothed_minimum() if self._initial_guess is None else self._initial_guess
         problem.derivative_tolerance = DERIVATIVE_TOLERANCE
         # residuals with smoothed friction do not give the final scales: they are updated
@@ -94,7 +93,7 @@ class LevenbergMarquardt:
 
     def smoothed_minimum(self) -> Array:
         """Approximate minimum with smoothed friction, and the linearization there."""
-        problem = self._problem
+        problem = self.problem
         self.channel_scales = self._max_channel_scales()
         problem.smooth, problem.derivative_tolerance = (
             float(self._has_stiction),
@@ -108,7 +107,7 @@ class LevenbergMarquardt:
 
     def nearest_minimum(self, z: Array) -> Array:
         """Nearest minimum to some unknowns, with updated channel scales."""
-        problem = self._problem
+        problem = self.problem
         problem.smooth, problem.slopes = _FINAL_SMOOTHING
         for _ in range(_MAX_WEIGHT_ROUNDS):
             z = self._minimize(z)
@@ -133,7 +132,7 @@ class LevenbergMarquardt:
         """Channel scales by the residuals."""
         noise, max_scales = self._channel_noise(), self._max_channel_scales()
         residual_rms = self._channel_rms(
-            [self._problem.residuals(case, z) for case in self._training_cases]
+            [self.problem.residuals(case, z) for case in self.training_cases]
         )
         return {
             name: min(max(noise[name], residual_rms[name]), max_scales[name])
@@ -145,13 +144,13 @@ class LevenbergMarquardt:
 
         Long motions have local minima with another number of oscillations, or without motion.
         """
-        problem, count = self._problem, len(self._problem.unknowns)
+        problem, count = self.problem, len(self.problem.unknowns)
         minima = [self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             parts = [
                 x
-                for case in self._training_cases
+                for case in self.training_cases
                 for x in case.split_training(problem.machine, _PART_DURATION)
             ]
         if parts:
@@ -174,14 +173,15 @@ class LevenbergMarquardt:
         return min(minima, key=self._cost)
 
     @property
-    def _training_cases(self) -> list[RecordingCase]:
-        return [case for case in self._problem.cases if case.train_mask.any()]
+    def training_cases(self) -> list[RecordingCase]:
+        """Recordings with training data."""
+        return [case for case in self.problem.cases if case.train_mask.any()]
 
     def _channel_noise(self) -> dict[str, float]:
         """Noise of each channel, by third differences, with a lower bound by its digits."""
         variances: dict[str, list[float]] = {}
         largest: dict[str, float] = {}
-        for case in self._training_cases:
+        for case in self.training_cases:
             for name, x in zip(case.sensors, case.measured.T, strict=True):
                 known_noise = case.known_sensors[name].noise if name in case.known_sensors else 0.0
                 variances.setdefault(name, []).append((known_noise or noise_std(x)) ** 2)
@@ -198,7 +198,7 @@ class LevenbergMarquardt:
         """
         variation_by_unit: dict[str, float] = {}
         units: dict[str, str] = {}
-        for case in self._training_cases:
+        for case in self.training_cases:
             for name, x in zip(case.sensors, case.measured[case.train_mask].T, strict=True):
                 units[name] = case.table.units[name]
                 variation_by_unit[units[name]] = max(
@@ -209,7 +209,7 @@ class LevenbergMarquardt:
     def _channel_rms(self, residuals: list[Array]) -> dict[str, float]:
         """Root mean square residual of each channel over the training data."""
         residuals_by_channel: dict[str, list[Array]] = {}
-        for case, residual in zip(self._training_cases, residuals, strict=True):
+        for case, residual in zip(self.training_cases, residuals, strict=True):
             for name, x in zip(case.sensors, residual[case.train_mask].T, strict=True):
                 residuals_by_channel.setdefault(name, []).append(x)
         return {
@@ -217,7 +217,7 @@ class LevenbergMarquardt:
             for name, x in residuals_by_channel.items()
         }
 
-    def _weights(self, case: RecordingCase) -> Array:
+    def channel_weights(self, case: RecordingCase) -> Array:
         """Weights (N, k): one over the channel scales, 0 for held-out data."""
         return case.train_mask[:, None] / np.array(
             [self.channel_scales[name] for name in case.sensors]
@@ -230,24 +230,24 @@ class LevenbergMarquardt:
             CraneError: The machine is not valid, or its simulation fails.
         """
         residuals = [
-            self._problem.residuals(case, z, training_only=True) * self._weights(case)
-            for case in self._training_cases
+            self.problem.residuals(case, z, training_only=True) * self.channel_weights(case)
+            for case in self.training_cases
         ]
         return np.concatenate(
             [
                 left[case.train_mask].ravel()
-                for left, case in zip(residuals, self._training_cases, strict=True)
+                for left, case in zip(residuals, self.training_cases, strict=True)
             ]
         )
 
     def _cost(self, z: Array) -> float:
         """Half the sum of squares, infinite if the simulation fails."""
         total = float(np.sum((self.prior * z) ** 2))
-        for case in self._training_cases:
+        for case in self.training_cases:
             try:
-                residual = self._problem.residuals(case, z, training_only=True) * self._weights(
-                    case
-                )
+                residual = self.problem.residuals(
+                    case, z, training_only=True
+                ) * self.channel_weights(case)
             except CraneError:
                 return np.inf
             total += float(np.sum(residual**2))
@@ -255,12 +255,12 @@ class LevenbergMarquardt:
 
     def _linearize(self, z: Array) -> None:
         rows, weighted, blocks = [], [], []
-        for number, case in enumerate(self._training_cases):
-            residual, derivatives = self._problem.linearize(case, z)
-            weights = self._weights(case)
+        for number, case in enumerate(self.training_cases):
+            residual, derivatives = self.problem.linearize(case, z)
+            weights = self.channel_weights(case)
             mask = case.train_mask
             rows.append(
-                (derivatives * weights[:, :, None])[mask].reshape(-1, self._problem.unknown_count)
+                (derivatives * weights[:, :, None])[mask].reshape(-1, self.problem.unknown_count)
             )
             weighted.append((residual * weights)[mask].ravel())
             time = np.repeat(case.inputs.time[mask], len(case.sensors))
@@ -268,45 +268,14 @@ class LevenbergMarquardt:
         self.jacobian, self.residual = np.vstack(rows), np.concatenate(weighted)
         self.blocks = np.concatenate(blocks)
 
-    def score_test(self, candidates: Sequence[Unknown], z: Array) -> list[ScoreTestResult]:
-        """Score tests of parameters that are not fitted, see `ScoreTestResult`."""
-        problem = self._problem
-        if not candidates:
-            return []
-        extended_problem = CalibrationProblem(
-            problem.machine, [*problem.unknowns, *candidates], problem.cases
-        )
-        extended_problem.smooth, extended_problem.slopes = problem.smooth, problem.slopes
-        count, candidate_count = len(problem.unknowns), len(candidates)
-        extended_unknowns = np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
-        rows = []
-        for case, extended_case in zip(problem.cases, extended_problem.cases, strict=True):
-            if not case.train_mask.any():
-                continue
-            try:
-                _, derivatives = extended_problem.linearize(
-                    extended_case, extended_unknowns, set(range(count))
-                )
-            except CraneError:  # the tests are optional
-                return []
-            candidate_derivatives = (derivatives * self._weights(case)[:, :, None])[
-                case.train_mask
-            ]
-            rows.append(
-                candidate_derivatives.reshape(-1, extended_problem.unknown_count)[
-                    :, count : count + candidate_count
-                ]
-            )
-        return score_test(candidates, self.jacobian, np.vstack(rows), self.residual, self.prior)
-
     def _minimize(
         self, z: Array, cost_tolerance: float = _COST_TOLERANCE, damping: float = _INITIAL_DAMPING
     ) -> Array:
         """Nearest minimum for the present channel scales."""
         cost = self._cost(z)
         if not np.isfinite(cost):  # raises the error
-            for case in self._training_cases:
-                self._problem.residuals(case, z)
+            for case in self.training_cases:
+                self.problem.residuals(case, z)
         for _ in range(_MAX_ITERATIONS):
             self._linearize(z)
             hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
@@ -377,11 +346,11 @@ class LevenbergMarquardt:
     def _block_duration(self) -> tuple[float, int]:
         """Duration of a block [s], four correlation times of the residuals, and their number."""
         correlation_time, duration = 0.0, 0.0
-        for case in self._training_cases:
+        for case in self.training_cases:
             time = case.inputs.time[case.train_mask]
             duration += float(time[-1] - time[0])
         start = 0
-        for case in self._training_cases:
+        for case in self.training_cases:
             k, count = len(case.sensors), int(case.train_mask.sum())
             rows = self.residual[start : start + k * count].reshape(count, k)
             start += k * count
