@@ -206,8 +206,8 @@ def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
         body = body_names(machine)[-1]
         raise RecordingError(
             "nothing drives what moves in this recording: it determines ratios of masses only; "
-            "give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} (--prior "
-            f"{body}.m=100+-1)"
+            f"give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} "
+            f"(--prior {body}.m=100+-1)"
         )
 
 
