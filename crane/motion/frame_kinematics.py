@@ -260,8 +260,7 @@ class FrameKinematics(OneLineRepr):
         return jacobian.reshape(6, -1)  # Pinocchio returns a vector for a single joint
 
     def _reduced_jacobian(self, q: Array) -> Array:
-        jacobian: Array = self.tree_jacobian(q) @ self.machine.closure.gamma(q)
-        return jacobian
+        return self.tree_jacobian(q) @ self.machine.closure.gamma(q)
 
     def _attitude_jacobian(self, q: Array, attitude: AttitudeCoordinates) -> Array:
         """Reduced Jacobian (3 + k, n) of position and attitude."""

@@ -88,18 +88,14 @@ def _quintic_basis() -> Array:
         [[-1.0, -1.0, -0.5, 1.0, 0.0, 0.0], [0, -1, -1, 0, 1, 0], [0, 0, -1, 0, 0, 1]]
     )
     start = np.eye(6)[:3] * np.array([1.0, 1.0, 0.5])[:, None]
-    basis: Array = np.vstack(
-        [start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2]
-    )
-    return basis
+    return np.vstack([start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2])
 
 
 def _jerk_form() -> Array:
     """Quadratic form (6, 6) of int (x''')^2 du over 0 <= u <= 1 in (x, x', x'') at both ends."""
     scale = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
     gram = np.outer(scale, scale) / np.add.outer(np.arange(3.0), np.arange(1.0, 4.0))
-    form: Array = _QUINTIC_BASIS[3:].T @ gram @ _QUINTIC_BASIS[3:]
-    return form
+    return _QUINTIC_BASIS[3:].T @ gram @ _QUINTIC_BASIS[3:]
 
 
 _QUINTIC_BASIS = _quintic_basis()

@@ -87,8 +87,7 @@ class Sway(OneLineRepr):
             columns.append(
                 (gravity(q_a + perturbation) - gravity(q_a - perturbation)) / (2.0 * step)
             )
-        stiffness: Array = np.stack(columns, axis=-1)[..., ~self._driven, :]
-        return stiffness
+        return np.stack(columns, axis=-1)[..., ~self._driven, :]
 
     def modes(self, q_a: ArrayLike) -> tuple[Array, Array]:
         """Modes of the sway with locked drives: (G - omega^2 M_ff) phi = 0.
@@ -162,18 +161,14 @@ class Sway(OneLineRepr):
                 f"the drives of '{self.machine.name}' do not move what hangs on "
                 f"{', '.join(self.machine.free)} in each direction that it sways in"
             )
-        motions: Array = stroke_lengths[:, None] * (
+        return stroke_lengths[:, None] * (
             np.linalg.pinv(matrix) @ np.concatenate(right_sides, axis=1)
         )
-        return motions
 
     def free_joint_forces(self, q_a: Array, v_a: Array, a_a: Array) -> Array:
         """Forces (N, f) of the free joints for a motion, without dry friction."""
         free = ~self._driven
-        forces: Array = (
-            self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
-        )
-        return forces
+        return self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
 
     @cached_property
     def _viscous(self) -> Array:

@@ -178,8 +178,7 @@ def _rest_to_rest_splines(time: Array) -> Array:
     count = max(10, int(np.ceil(_SPLINES_PER_SECOND * time[-1])))
     knots = np.linspace(0.0, time[-1], count + 1)
     knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, time[-1])])
-    splines: Array = BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
-    return splines
+    return BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
 
 
 def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Trajectory:

@@ -312,8 +312,7 @@ def _correlation_matrix(covariance: Array, count: int) -> Array:
     """Correlations (n, n) of the first n unknowns; 0 if a variance is zero."""
     deviations = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0))
     divisors = np.where(deviations > 0, deviations, np.inf)
-    correlation: Array = covariance[:count, :count] / np.outer(divisors, divisors)
-    return correlation
+    return covariance[:count, :count] / np.outer(divisors, divisors)
 
 
 def _correlated_pairs(
