@@ -231,7 +231,7 @@ def test_what_the_recording_cannot_say_is_said(tmp_path):
         ({"fit": ["load_*.mss"]}, "matches no number"),
         ({"fit": ["sensor.y.zero"]}, "'sensor.y.zero' is of no sensor"),
         ({"fit": ["sensor.x.gain"]}, "a sensor has no 'gain'"),
-        ({"fit": ["cylinder.x.leakage"]}, "is 0 at first, say how large it may be"),
+        ({"fit": ["cylinder.x.leakage"]}, "is 0 initially, give its range"),
         ({"fit": {"load_x.mass": (1.0, 2.0, 3.0)}}, "1 does not lie within 2 to 3"),
         ({"fit": {"load_x.mass": "much"}}, "give a start, or (start, low, high)"),
         ({"fit": ["load_x.mass"], "train": (3.0, 1.0)}, "is empty"),
@@ -522,7 +522,9 @@ def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
     machine, path, _ = fitted
     with pytest.raises(CraneError) as error:
         quiet(crane.calibrate, machine, path, ["load_x.mass"], train=(0.0, 4.0), span=(1.0, 5.0))
-    assert "what is fitted, 0 to 4 s, is not within 1 to 5 s, which is read" in str(error.value)
+    assert "the training data, 0 to 4 s, are not within the span 1 to 5 s that is" in str(
+        error.value
+    )
     ideal = tmp_path / "ideal.csv"
     ideal.write_text("# sensors: ideal\n" + path.read_text())
     with pytest.raises(CraneError) as error:

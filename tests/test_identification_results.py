@@ -204,7 +204,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
             dataclasses.replace(found, parameters=parameters),
             "'X1': viscous of friction is -1, it must not be negative, give feasible=True",
         ),
-        (dataclasses.replace(found, parameters=bodies), "the identified machine cannot be: "),
+        (dataclasses.replace(found, parameters=bodies), "the identified machine is not valid: "),
         (identify(mini, motion(mini), feasible=True, terms=spring), "the model has 'q1.spring'"),
         (
             identify(
@@ -236,7 +236,7 @@ def test_a_body_that_cannot_be_asks_for_feasible_ones(mini, found, tmp_path):
         crane.write_identified(parted, tmp_path / "out")
     link = found.model.bodies[0]
     assert re.fullmatch(
-        f"the identified machine cannot be: link '{link}' has the negative principal moment of "
+        f"the identified machine is not valid: link '{link}' has the negative principal moment of "
         r"inertia -\S+ kg m2, give feasible=True",
         str(caught.value),
     )

@@ -192,7 +192,7 @@ def test_machine_files_keep_sensors(machine, tmp_path):
             "the note 'sensor.q22.zero' is of no column, did you mean 'q2'",
         ),
         ({"sensor.q2.scale": "0"}, "the note 'sensor.q2.scale': scale of a sensor is 0"),
-        ({"sensor.q2.delay": "99"}, "is shorter than a sensor is late, 99 s, record more"),
+        ({"sensor.q2.delay": "99"}, "is shorter than the delay of a sensor, 99 s, record more"),
     ],
 )
 def test_notes_that_are_none(machine, motion, tmp_path, notes, said):

@@ -221,8 +221,8 @@ class FrameKinematics(OneLineRepr):
             if total_rank < position_rank + len(coordinates.names):
                 raise InputError(
                     f"'{machine.name}' has too few drives for {', '.join(coordinates.names)} of "
-                    f"'{self.frame}': they move it in {position_rank} directions, and turn it in "
-                    f"{total_rank - position_rank} beside"
+                    f"'{self.frame}': they move it in {position_rank} directions and rotate it "
+                    f"in {total_rank - position_rank} further ones"
                 )
             self._attitudes[name] = coordinates
         return self._attitudes[name]

@@ -68,7 +68,10 @@ class Sway(OneLineRepr):
             if np.abs(newton_step).max() < _EQUILIBRIUM_TOLERANCE**0.5 * 1e-3:
                 return q_a
         names = ", ".join(self.machine.free)
-        raise InputError(f"what {names} carry hangs nowhere still: weight has to pull them back")
+        raise InputError(
+            f"what {names} carry has no stable equilibrium nearby: choose a configuration in "
+            "which it hangs"
+        )
 
     def stiffness(self, q_a: Array) -> Array:
         """Gravitational stiffness of the free joints, dg_f/dq_A.
@@ -119,7 +122,10 @@ class Sway(OneLineRepr):
 
         squares, shapes = eigh((stiffness + stiffness.T) / 2, mass)
         if squares[0] <= 0:
-            raise InputError(f"what {', '.join(self.machine.free)} carry does not hang")
+            raise InputError(
+                f"what {', '.join(self.machine.free)} carry does not hang, choose another "
+                "configuration"
+            )
         return np.sqrt(squares), shapes, mass
 
     def pivoting_motions(self, q_a: Array) -> Array:
@@ -158,8 +164,8 @@ class Sway(OneLineRepr):
         matrix = np.concatenate(equations, axis=1) * stroke_lengths
         if (np.linalg.svd(matrix[:, : len(f)], compute_uv=False)[:, -1] < 1e-3).any():
             raise InputError(
-                f"the drives of '{self.machine.name}' do not move what hangs on "
-                f"{', '.join(self.machine.free)} in each direction that it sways in"
+                f"the drives of '{self.machine.name}' cannot move what hangs on "
+                f"{', '.join(self.machine.free)} in every direction of sway: use an input shaper"
             )
         return stroke_lengths[:, None] * (
             np.linalg.pinv(matrix) @ np.concatenate(right_sides, axis=1)

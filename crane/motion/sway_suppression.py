@@ -224,7 +224,7 @@ def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Traje
             break
         theta, previous_correction = theta - correction, correction_size
     raise InputError(
-        f"no motion of {duration:.3g} s was found that leaves what hangs without sway, the last "
+        f"no motion of {duration:.3g} s without residual sway was found, the last "
         f"correction is {previous_correction:.2g} rad: give it more time"
     )
 

@@ -201,7 +201,7 @@ def via_points(time: ArrayLike, points: ArrayLike, rates: ArrayLike | None = Non
             f"rates have the shape {given_rates.shape}, give {point_table.shape} as the points"
         )
     if times[0] != 0 or not (np.diff(times) > 0).all() or not np.isfinite(times).all():
-        raise InputError("times of via points do not increase from 0, give such")
+        raise InputError("times of via points do not increase from 0, give increasing times")
     if np.isinf(point_table).any() or np.isinf(given_rates).any():
         raise InputError("via points are infinite, give finite numbers, or NaN where one is open")
     if np.isnan(point_table[[0, -1]]).any():

@@ -215,8 +215,8 @@ class Transmission(OneLineRepr):
             or not singular_values[-1] > _SINGULARITY_TOLERANCE * singular_values[0]
         ):
             raise InputError(
-                f"{', '.join(joints) or 'no joint'} do not determine how the machine moves here, "
-                f"give {len(f_a)} independent joints"
+                f"{', '.join(joints) or 'no joint'} do not determine the motion of the machine "
+                f"here, give {len(f_a)} independent joints"
             )
         tau = np.linalg.solve(scaled_gamma.T, f_a * active_units) / joint_units
         return dict(zip(joints, tau.tolist(), strict=True))

@@ -241,7 +241,9 @@ def correct_readings(table: Table, sensors: Mapping[str, Sensor]) -> Table:
     )
     is_available = time <= time[-1] - max_delay
     if not is_available.any():
-        raise RecordingError(f"is shorter than a sensor is late, {max_delay:g} s, record more")
+        raise RecordingError(
+            f"is shorter than the delay of a sensor, {max_delay:g} s, record more"
+        )
     return Table(table.units, values[is_available], table.notes)
 
 

@@ -312,7 +312,7 @@ def _parse_header(heading: str) -> dict[str, str]:
     try:
         cells = next(csv.reader([heading]))
     except csv.Error as error:
-        raise RecordingError(f"has a header row that is none ({error}), correct it") from None
+        raise RecordingError(f"has an invalid header row ({error}), correct it") from None
     if len(cells) > MAX_COLUMNS:
         raise RecordingError(f"has {len(cells)} columns, give at most {MAX_COLUMNS}")
     if all(_parse_number(cell) is not None for cell in cells):

@@ -185,8 +185,8 @@ def _read_cases(
         raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
     if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
         raise InputError(
-            f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
-            f"{span[1]:g} s, which is read"
+            f"the training data, {train[0]:g} to {train[1]:g} s, are not within the span "
+            f"{span[0]:g} to {span[1]:g} s that is read: widen the span"
         )
     tables = [
         select_time_span(read_sensor_readings(path, machine, columns), span, path)

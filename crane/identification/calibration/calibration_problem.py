@@ -369,7 +369,7 @@ class CalibrationProblem:
                 raise InputError(
                     f"'{unknown.name}' cannot be varied about "
                     f"{unknown.start + unknown.scale * z[i]:g}, where the machine has other "
-                    "equations: begin it elsewhere"
+                    "equations: choose another start"
                 )
             return found.difference_quotient(base, side * _DIFFERENCE_STEP)
         raise AssertionError

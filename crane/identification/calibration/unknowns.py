@@ -139,7 +139,7 @@ def _build_unknown(
     elif low is not None and high is not None:
         size = high - low
     else:
-        raise InputError(f"'{name}' is 0 at first, say how large it may be: '{name}=0,LOW~HIGH'")
+        raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
     if name.endswith((".x", ".y", ".z")):
         size = min(size, 0.1)
     return _bounded_unknown(name, initial, low, high, size, ((name, parameters[name]),))

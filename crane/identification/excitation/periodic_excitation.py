@@ -360,16 +360,16 @@ def _check_size(
     min_step = max(period / max_samples, (periods + 1) * period / _MAX_SAMPLES)
     if step < min_step:
         raise InputError(
-            f"{periods} periods of {period:g} s and the ways from and to rest are "
-            f"{(periods + 1) * period / step:.3g} samples of {step:g} s, for which there is no "
-            f"room: give a step of at least {min_step:.2g} s, or fewer or shorter periods"
+            f"{periods} periods of {period:g} s and the parts from and to rest are "
+            f"{(periods + 1) * period / step:.3g} samples of {step:g} s, too many for the "
+            f"memory: give a step of at least {min_step:.2g} s, or fewer or shorter periods"
         )
     max_harmonics = max(
         1, int((max_samples / (2 * n * COARSE_SAMPLES)) ** 0.5)
     )  # one motion per derivative
     if harmonics > max_harmonics:
         raise InputError(
-            f"the number of harmonics is {harmonics}, more than there is room for with {n} active "
+            f"the number of harmonics is {harmonics}, too many for the memory with {n} active "
             f"joints: give at most {max_harmonics}"
         )
 

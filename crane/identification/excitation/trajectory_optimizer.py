@@ -132,9 +132,8 @@ class TrajectoryOptimizer:
                     break
         if not vectors:
             raise InputError(
-                f"'{self._machine.name}' cannot even stand still within its limits in "
-                f"{_MAX_TRIALS} random configurations, lastly for {reason}: check it, or lower "
-                "the margin"
+                f"'{self._machine.name}' has no reference within its limits in {_MAX_TRIALS} "
+                f"random configurations, lastly for {reason}: check it, or lower the margin"
             )
         return np.array(vectors)
 

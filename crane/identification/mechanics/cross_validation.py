@@ -77,7 +77,7 @@ def cross_validate(
     motions = prepare_motions(machine, recording, options.get("trust", False), None)
     if (shortest := min(len(motion.time) for motion in motions)) < FOLD_COUNT * _MIN_FOLD_SAMPLES:
         raise InputError(
-            f"{shortest} samples are too few for {FOLD_COUNT} parts, give at least "
+            f"{shortest} samples are too few for {FOLD_COUNT} folds, give at least "
             f"{FOLD_COUNT * _MIN_FOLD_SAMPLES}"
         )
     grid = [

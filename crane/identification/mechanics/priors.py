@@ -126,8 +126,8 @@ def check_prior(
     if given[0] == given[1] == (len(base.independent),) != (count,):
         raise InputError(
             f"the prior is about the {given[0][0]} base parameters, give means and standard "
-            f"deviations of all {count} parameters of the model (Model(machine).names), infinite "
-            "ones for those it says nothing of"
+            f"deviations of all {count} parameters of the model "
+            "(IdentificationModel(machine).names), infinite ones for those without a prior"
         )
     mean = as_sample(prior[0], count, "the prior's means", model.names)
     std = np.asarray(prior[1], dtype=np.float64)
@@ -136,7 +136,7 @@ def check_prior(
         i = int(std.argmin())
         raise InputError(
             f"the prior's deviation of '{model.names[i]}' is {std[i]:g}, give one above 0, "
-            "infinite where it says nothing"
+            "infinite without a prior"
         )
     for i, body in enumerate(model.bodies if feasible else ()):
         if not mean[10 * i] > 0:

@@ -340,7 +340,7 @@ def _check_written_machine(
         # an infeasible body is no error of the file that a user could correct
         body = None if result.feasible else _infeasible_body(bodies)
         why = f"{body}, give feasible=True" if body else error
-        raise InputError(f"the identified machine cannot be: {why}") from None
+        raise InputError(f"the identified machine is not valid: {why}") from None
     model, parameters = result.model, result.parameters
     assert parameters is not None
     at = random_samples(model, 20)
