@@ -14,9 +14,8 @@ from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine import Machine
 
 _FIELD_NAMES = ("position", "velocity", "effort")
-_SINGULARITY_TOLERANCE = (
-    1e-9  # least singular value of the map from actuators to joints, per the largest
-)
+# least singular value of the map from actuators to joints, per the largest
+_SINGULARITY_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,8 @@ from crane.recordings.timeseries import TIME, Table
 _MAX_BYTES = 2_000_000  # bytes of a column file
 _MAX_EXPRESSION_LENGTH = 1000  # characters of an expression
 _LINE_PATTERN = re.compile(r"\s*([^=\[\]]+?\s*(?:\[[^\]]*\])?)\s*=\s*(.+?)\s*")
-_OPERATORS = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
-}  # fmt: skip
+# fmt: skip
+_OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,8 @@ from crane.recordings.timeseries import TIME, Table, table_column
 
 _MIN_INDEPENDENT_SHARE = 1e-6  # least part of the motion of a joint that others do not determine
 _CONFIGURATION_TOLERANCE = 1e-6  # [rad], [characteristic length]
-_COMPARED_SAMPLES, _DERIVATIVE_SAMPLES = (
-    2000,
-    200,
-)  # samples that are compared, and samples for derivatives
+# samples that are compared, and samples for derivatives
+_COMPARED_SAMPLES, _DERIVATIVE_SAMPLES = 2000, 200
 _BLOCK_SAMPLES = 1 << 16  # samples per block
 _SAMPLE_PATTERN = re.compile(r"\(sample (\d+)\)")  # in an error message of the closure
 _LIMIT_TOLERANCE = 0.1  # of a range, for errors of sensors

@@ -47,9 +47,8 @@ from crane.recordings.recording_columns import (
 )
 from crane.recordings.timeseries import TIME, Table, check_unit
 
-REFERENCE_PREFIX = (
-    "reference_"  # before the name of the quantity that a channel is the reference of
-)
+# before the name of the quantity that a channel is the reference of
+REFERENCE_PREFIX = "reference_"
 SENSORS_NOTE, IDEAL_SENSORS = "sensors", "ideal"  # note of ideal quantities
 FREE_JOINTS_NOTE = "free"  # note of free joints
 MACHINE_NAME_NOTE = "machine name"  # note of a name that is not that of the file

@@ -34,10 +34,8 @@ _NOISE_FACTORS = (
 _RANDOM_WALK_FACTOR = 1.5  # of the random walk of integrated white noise
 _EQUIVALENT_FACTOR = 2.0  # times the residual of the best cause
 _IMPROVEMENT_SHARE = 0.8  # of the residual of a zero, below which other causes are reported
-_NEAR_BEST_FACTOR, _MAX_LISTED = (
-    1.3,
-    2,
-)  # times the residual of the best of those, and how many are listed
+# times the residual of the best of those, and how many are listed
+_NEAR_BEST_FACTOR, _MAX_LISTED = 1.3, 2
 _STANDSTILL_SHARE = 0.05  # of the expected motion
 _MIN_MOTION_FACTOR = 4.0  # times the tolerance; less motion does not determine scale and delay
 _ZERO_DERIVATIVE = 1e-6  # derivative that counts as zero

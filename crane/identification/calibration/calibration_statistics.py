@@ -26,10 +26,8 @@ from crane.identification.calibration.unknowns import Unknown
 
 _LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
 _MAX_RESTARTS = 2  # continuations from a lower minimum
-_MIN_QUADRATIC_RISE, _WIDE_INTERVAL_RISE = (
-    0.8,
-    0.6,
-)  # root of the rise of the cost over that of the linearization
+# root of the rise of the cost over that of the linearization
+_MIN_QUADRATIC_RISE, _WIDE_INTERVAL_RISE = 0.8, 0.6
 _STEEP_RISE = 3.0  # likewise, for strong nonlinearity
 _EXTRAPOLATION_FACTOR = 3.0  # half widths at which a lower minimum is searched for
 _PAIR_CORRELATION = 0.9  # correlation that links two parameters

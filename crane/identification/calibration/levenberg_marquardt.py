@@ -25,19 +25,13 @@ _SMOOTHING_SCHEDULE, _FINAL_SMOOTHING = (
 )
 _COVARIANCE_SMOOTHING = 0.1  # smoothing for derivatives of the covariance
 _MAX_ITERATIONS = 40  # iterations per round
-_COST_TOLERANCE, _INITIAL_COST_TOLERANCE = (
-    1e-4,
-    1e-2,
-)  # relative change of the cost that ends the iterations
-_MIN_RELATIVE_SCALE, _MIN_SCALE = (
-    1e-6,
-    1e-9,
-)  # least scale per largest value of a channel, and absolute [SI]
+# relative change of the cost that ends the iterations
+_COST_TOLERANCE, _INITIAL_COST_TOLERANCE = 1e-4, 1e-2
+# least scale per largest value of a channel, and absolute [SI]
+_MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
 _MAX_SCALE_SHARE = 0.2  # largest scale per variation of a channel
-_INITIAL_DAMPING, _CAUTIOUS_DAMPING = (
-    1e-3,
-    1.0,
-)  # initial damping, and that far from the minimum
+# initial damping, and that far from the minimum
+_INITIAL_DAMPING, _CAUTIOUS_DAMPING = 1e-3, 1.0
 _DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
 _PART_DURATION = 2.0  # [s] of the parts of the initial search
 _COARSE_DERIVATIVE_TOLERANCE = 1e-2  # relative error of derivatives far from the minimum

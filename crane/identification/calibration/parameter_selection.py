@@ -20,19 +20,13 @@ _INCLINATION_ZERO_STD = 0.05  # standard deviation of inclinometer zeros [rad]
 _PRESSURE_ZERO_STD = 2e5  # standard deviation of pressure sensor zeros [Pa]
 _GAS_VOLUME_SHARE = 5e-3  # of the volume of a chamber
 _LEAKAGE_FLOW_SHARE = 1e-2  # of the full flow of a valve at supply pressure
-_ORIFICES_BY_DIRECTION = {
-    1: ("c1", "c2"),
-    -1: ("c3", "c4"),
-}  # orifices of the spools of A and B, by direction
-_MAX_STIFFNESS_REDUCTION, _MAX_STIFFNESS_INCREASE = (
-    20.0,
-    4.0,
-)  # bounds of a stiffness, relative to that of the oil or the known one
+# orifices of the spools of A and B, by direction
+_ORIFICES_BY_DIRECTION = {1: ("c1", "c2"), -1: ("c3", "c4")}
+# bounds of a stiffness, relative to that of the oil or the known one
+_MAX_STIFFNESS_REDUCTION, _MAX_STIFFNESS_INCREASE = 20.0, 4.0
 _FRICTION_FORCE_SHARE = 2e-2  # of the force of a cylinder at supply pressure
-_STIFFNESS_SUFFIX, _DAMPING_SUFFIX = (
-    ".stiffness",
-    ".damping",
-)  # without stiffness the damping has no effect
+# without stiffness the damping has no effect
+_STIFFNESS_SUFFIX, _DAMPING_SUFFIX = ".stiffness", ".damping"
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,8 @@ from crane.description.sensors import SENSOR_PREFIX
 from crane.description.specification import MachineSpec
 
 SENSOR_PARAMETER_DEFAULTS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
-_ZERO_SCALES = {
-    "rad": 0.02,
-    "m": 5e-3,
-    "rad/s": 0.02,
-    "m/s": 0.01,
-    "Pa": 1e5,
-    "V": 0.05,
-}  # scales of sensor zeros
+# scales of sensor zeros
+_ZERO_SCALES = {"rad": 0.02, "m": 5e-3, "rad/s": 0.02, "m/s": 0.01, "Pa": 1e5, "V": 0.05}
 _DELAY_SCALE = 0.02  # [s]
 _MIN_SHARE = 1e-3  # lower bound of a positive parameter, per start
 # last words of parameter names with either sign

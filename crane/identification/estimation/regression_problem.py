@@ -22,12 +22,10 @@ from crane.identification.estimation.regressor import (
 
 Prior = tuple[Array, Array]
 """Means (p,) and standard deviations (p,) of the parameters; infinite where nothing is known."""
-_HUBER_THRESHOLD = (
-    1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
-)
-_MAD_TO_STD = (
-    1.482602218505602  # standard deviation over median absolute deviation of normal noise
-)
+# robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
+_HUBER_THRESHOLD = 1.345
+# standard deviation over median absolute deviation of normal noise
+_MAD_TO_STD = 1.482602218505602
 _CONVERGENCE_TOLERANCE = 1e-6  # standard deviations
 _ROUNDING_SHARE = 1e-8  # relative to the forces, error of the base parameters by rounding
 _MAX_ITERATIONS = 100

@@ -16,14 +16,10 @@ from crane.recordings.recording import Recording
 from crane.simulation.simulation_run import simulate
 
 _DEFAULT_DEVIATION = 0.3  # relative deviation of a parameter without bounds
-_FINAL_DURATION, _REST_SPEED_SHARE = (
-    0.5,
-    0.1,
-)  # [s] before the end, and share of the largest speed that counts as rest
-_SLOT_DURATION, _MIN_SLOTS = (
-    1.5,
-    4,
-)  # approximate duration of a slot [s], and least number of slots
+# [s] before the end, and share of the largest speed that counts as rest
+_FINAL_DURATION, _REST_SPEED_SHARE = 0.5, 0.1
+# approximate duration of a slot [s], and least number of slots
+_SLOT_DURATION, _MIN_SLOTS = 1.5, 4
 _RANDOM_TRIAL_SHARE = 0.25  # of all trials that are completely random
 _IDLE_SHARE = 0.25  # of all pulses that are omitted
 _MIN_OPENING, _MIN_SLOT_SHARE = 0.05, 0.25  # least opening, and least share of a slot

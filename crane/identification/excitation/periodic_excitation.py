@@ -48,9 +48,8 @@ from crane.recordings.timeseries import TIME, Table
 _NOISE_SHARE = 0.01  # default noise per force limit of a drive
 _REPORTED_PARAMETERS = 5  # parameters in the table
 _MAX_SAMPLES = 4_000_000  # samples of the recording
-_FRICTION_SMOOTHING = (
-    5e-4  # of characteristic velocities, smoothing of friction in the optimization
-)
+# of characteristic velocities, smoothing of friction in the optimization
+_FRICTION_SMOOTHING = 5e-4
 _MAX_MEMORY = 1e9  # [bytes] for the motions of an optimization
 
 Progress = Callable[[float], None]

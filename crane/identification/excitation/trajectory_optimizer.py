@@ -19,14 +19,11 @@ from crane.identification.mechanics.model_term import MotionSamples
 
 DENSE_SAMPLES = 64  # samples per period of the highest harmonic, for checks of limits
 COARSE_SAMPLES = 12  # the same for the optimization
-_SAMPLED_LIMIT = float(
-    np.cos(np.pi / DENSE_SAMPLES)
-)  # limit at samples, so that shares do not exceed 1 in between
+# limit at samples, so that shares do not exceed 1 in between
+_SAMPLED_LIMIT = float(np.cos(np.pi / DENSE_SAMPLES))
 _PEAK_INSTANTS = 33  # instants around the one with the largest share
-_RANDOM_COUNT, _MAX_TRIALS = (
-    20,
-    200,
-)  # random trajectories within the limits, and largest number of trials
+# random trajectories within the limits, and largest number of trials
+_RANDOM_COUNT, _MAX_TRIALS = 20, 200
 _MAX_BISECTIONS = 10  # of the interval of the largest amplitude
 _NORM_ORDER = 80  # order of the norm in place of the maximum over time, for derivatives
 _MAX_ITERATIONS = 150  # of sequential quadratic programming

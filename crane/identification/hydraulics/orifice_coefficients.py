@@ -36,10 +36,8 @@ PARAMETER_UNITS = ("1/Pa",) + 4 * ("m3/(s Pa^0.5)",)
 METHODS = ("weak", "chambers", "ls")
 
 _WINDOW_LENGTH = 0.1  # [s]
-_MIN_CORRELATION, _MIN_SIGNIFICANCE = (
-    0.5,
-    10.0,
-)  # of the halves of a column, see `_check_identifiable`
+# of the halves of a column, see `_check_identifiable`
+_MIN_CORRELATION, _MIN_SIGNIFICANCE = 0.5, 10.0
 _MAX_SAMPLES = 20000  # samples of method "ls"
 _UNIDENTIFIABLE_REASONS = {
     0: (

@@ -23,10 +23,8 @@ from crane.recordings.recording import Recording
 
 RecordingOrMotion = Recording | Motion
 _SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are omitted
-_DEFAULT_STICTION_SPEED = {
-    "rad": 1e-2,
-    "m": 1e-3,
-}  # [rad/s], [m/s] default end of stiction
+# [rad/s], [m/s] default end of stiction
+_DEFAULT_STICTION_SPEED = {"rad": 1e-2, "m": 1e-3}
 _SMOOTHING_FACTOR = 4.0  # times the smoothing velocity, tanh 4 = 0.9993
 _MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows are always used
 _PASSBAND_SHARE = 0.75  # of the passband of a smoother: there it passes 91 %

@@ -32,9 +32,15 @@ _SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
 _MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
 _STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
 _FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
+# fmt: skip
 _INERTIA_INDICES = {
-    "ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2),
-}  # fmt: skip
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
 _URDF_TEMPLATE = """<?xml version="1.0"?>
 <!-- The rotor of the motor that turns with {words}: its angle is theirs on the joints' side. -->
 <robot name="{name}">

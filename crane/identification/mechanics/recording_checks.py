@@ -26,10 +26,8 @@ _COMPARISON_CUTOFF = 10.0  # [Hz] of the comparison of velocities and positions
 _CORRELATION_TOLERANCE = 0.01  # of a correlation
 _MAX_DELAY = 1.0  # [s] longest delay of the search
 _MAX_OUTLIER_SHARE = 0.05  # of the samples of a column, above which it is rejected
-_COMMON_UNITS = {
-    "rad": ("deg", 180 / math.pi),
-    "m": ("mm", 1e3),
-}  # units that are confused with SI units
+# units that are confused with SI units
+_COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}
 
 
 def signal_delay(time: Array, one: Array, other: Array) -> float:

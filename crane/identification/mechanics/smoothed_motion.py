@@ -31,9 +31,8 @@ from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_U
 from crane.recordings.recording_columns import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
-_MAX_SPEED_FACTOR = (
-    30.0  # times the velocity limit of a joint, above which a recording is rejected
-)
+# times the velocity limit of a joint, above which a recording is rejected
+_MAX_SPEED_FACTOR = 30.0
 _HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
 _LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
 

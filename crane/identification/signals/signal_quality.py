@@ -16,9 +16,8 @@ _MAX_RUN = 4  # samples from the first to the last outlier of a group
 _NOISE_FACTOR = 8.0  # robust standard deviations between an outlier and its neighbours
 _STEP_FACTOR = 4.0  # times the largest step between the neighbours, likewise
 _NEIGHBOUR_COUNT = 3  # neighbours on either side
-_MAD_TO_STD = (
-    1.482602218505602  # standard deviation over median absolute deviation of normal noise
-)
+# standard deviation over median absolute deviation of normal noise
+_MAD_TO_STD = 1.482602218505602
 
 
 def spectral_edge_frequency(share: float, x: Array, step: float) -> float:

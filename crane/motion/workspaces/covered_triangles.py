@@ -12,10 +12,8 @@ from crane.motion.workspaces.workspace_patch import (
 from crane.motion.workspaces.workspace_section import WorkspaceKinematics
 
 _MAX_SIDE_STEPS = 4.0  # longest side of a fine cell, per extent and step of the grid
-_MAX_SUBDIVISIONS, _REDUCED_SUBDIVISIONS = (
-    6,
-    2,
-)  # of a coarse cell; in one of many random patches
+# of a coarse cell; in one of many random patches
+_MAX_SUBDIVISIONS, _REDUCED_SUBDIVISIONS = 6, 2
 
 CellCorner = tuple[Array, Array]  # configuration (nq,), section position (2,)
 

@@ -20,10 +20,8 @@ ObjectiveConstraint = tuple[str, Objective]  # "eq": value = 0, "ineq": value >=
 _DIFFERENCE_STEP = 1e-6  # step of differences of a determinant
 _CLOSURE_TOLERANCE = 1e-9  # residual of the loops at an extreme
 _CONSTRAINT_TOLERANCE = 1e-9  # of a constraint
-_CONTINUATION_POINTS, _NEWTON_ITERATIONS = (
-    8,
-    6,
-)  # points on the path to a singular configuration, Newton steps at each
+# points on the path to a singular configuration, Newton steps at each
+_CONTINUATION_POINTS, _NEWTON_ITERATIONS = 8, 6
 _MAX_CHORD_DEVIATION = 0.3  # distance from the chord, per length of the path
 
 

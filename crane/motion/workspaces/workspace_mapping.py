@@ -32,9 +32,8 @@ from crane.motion.workspaces.workspace_section import (
 )
 
 _MAX_SAMPLES = 1_000_000  # configurations
-_MOTION_TOLERANCE = (
-    1e-9  # derivative of the tip by a joint, per characteristic length, that counts as motion
-)
+# derivative of the tip by a joint, per characteristic length, that counts as motion
+_MOTION_TOLERANCE = 1e-9
 _MAX_GRID_JOINTS = 3  # joints of a regular grid
 _MAP_VALUES = 81  # values of each stroke of the stroke map
 _SLICE_COUNT = 9  # values of the third of three strokes
