@@ -199,10 +199,11 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
     """
     from scipy.linalg import solveh_banded  # slow to import
 
+    # an offset keeps the digits of values far from zero
     knots, offset = (
         _JerkQuadraticForm(time),
         x[0],
-    )  # an offset keeps the digits of values far from zero
+    )
     given_values = np.column_stack([x - offset, v, np.full(len(time), np.nan)])
     given_values[[0, -1], 2] = 0.0
     y = knots.scale_values(given_values)

@@ -119,9 +119,8 @@ def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
     """
     names = quantity_names(machine.tree)
     nodes = [] if machine.hydraulics is None else machine.hydraulics.node_names
-    own = {
-        f"{PRESSURE_PREFIX}{node.replace('.', '_')}" for node in nodes
-    }  # similar to the names of cylinder pressures
+    # similar to the names of cylinder pressures
+    own = {f"{PRESSURE_PREFIX}{node.replace('.', '_')}" for node in nodes}
     for name in table.units:
         if name in own or quantity_unit(machine.tree, name) is not None:
             continue

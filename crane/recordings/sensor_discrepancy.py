@@ -27,10 +27,11 @@ from crane.recordings.missing_measurements import AGREEMENT_TOLERANCE, tolerance
 from crane.recordings.recording_reader import known_sensors
 from crane.recordings.timeseries import TIME, Table, table_column
 
+# standard deviations of a significant discrepancy, and of an accepted residual
 _NOISE_FACTORS = (
     3.3,
     2.0,
-)  # standard deviations of a significant discrepancy, and of an accepted residual
+)
 _RANDOM_WALK_FACTOR = 1.5  # of the random walk of integrated white noise
 _EQUIVALENT_FACTOR = 2.0  # times the residual of the best cause
 _IMPROVEMENT_SHARE = 0.8  # of the residual of a zero, below which other causes are reported

@@ -57,9 +57,8 @@ class NoiseModel:
         # for predictable signals, rounding may put a root on the unit circle or beyond
         rate = -math.log(min(max(largest, 1e-3), 1.0))
         memory = len(series) if rate * len(series) <= 20 else math.ceil(20 / rate)
-        impulse_response = lfilter(
-            [1.0], a, np.eye(1, 4 * memory)[0]
-        )  # response of e to an impulse in u
+        # response of e to an impulse in u
+        impulse_response = lfilter([1.0], a, np.eye(1, 4 * memory)[0])
         # mean of the spectrum, by Parseval, over the spectrum at zero
         effective = float(
             len(e) * (impulse_response @ impulse_response) / impulse_response.sum() ** 2

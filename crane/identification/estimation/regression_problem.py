@@ -129,11 +129,12 @@ class RegressionProblem:
             self.mean, self.prior_root = prior_mean, np.diag(1 / std)
         if count + np.count_nonzero(self.prior_root) <= size:
             raise InputError(f"{count} rows for {size} parameters are too few, record longer")
+        # unweighted factors (g, k, k)
         self.plain = (
             W.triangular_factors(y, groups)
             if Z is None
             else triangular_factors(W, y, groups, Z=self.Z)
-        )  # unweighted factors (g, k, k)
+        )
         if not np.isfinite(self.plain).all():
             self._raise_not_finite()
         # lower bound of the noise, for convergence if equations hold to rounding

@@ -183,9 +183,8 @@ class ExchangeAlgorithm:
         self._machine = information.perturbed_machine({})
         self._step, self._rate = step, rate
         self._step_count = max(round(duration / step), 1)
-        self._slot_count = max(
-            round(duration / _SLOT_DURATION) - 2, _MIN_SLOTS
-        )  # rest before and after
+        # rest before and after
+        self._slot_count = max(round(duration / _SLOT_DURATION) - 2, _MIN_SLOTS)
         self._slot_duration = step * max(self._step_count // (self._slot_count + 2), 1)
         self._valve_count = len(require_circuit(information.machine).joints)
         self._rejection_reason = ""

@@ -363,9 +363,8 @@ def _check_size(
             f"{(periods + 1) * period / step:.3g} samples of {step:g} s, too many for the "
             f"memory: give a step of at least {min_step:.2g} s, or fewer or shorter periods"
         )
-    max_harmonics = max(
-        1, int((max_samples / (2 * n * COARSE_SAMPLES)) ** 0.5)
-    )  # one motion per derivative
+    # one motion per derivative
+    max_harmonics = max(1, int((max_samples / (2 * n * COARSE_SAMPLES)) ** 0.5))
     if harmonics > max_harmonics:
         raise InputError(
             f"the number of harmonics is {harmonics}, too many for the memory with {n} active "

@@ -87,9 +87,8 @@ class OrificeEquations:
         areas = np.array([cylinder.area_a, -cylinder.area_b])
         self.machine, self.joint, self.signals = machine, joint, signals
         self.combination = np.eye(2) if per_chamber else areas[None]
-        self._difference_weights = (
-            areas if per_chamber else np.ones(1)
-        )  # weights of the equations in (29)
+        # weights of the equations in (29)
+        self._difference_weights = areas if per_chamber else np.ones(1)
         self.windows = w = WeakFormWindows.create(len(signals.time), signals.step, window_length)
         self.is_smooth = w.are_uniform(opening_regions(signals.opening))
         states, columns = self._combined_terms(signals)

@@ -122,9 +122,8 @@ class InertialTerm(ModelTerm):
         bodies = body_names(machine)
         self.nominal = self._dynamics.parameters[: 10 * len(bodies)]
         self.names = tuple(f"{body}.{key}" for body in bodies for key in BODY_PARAMETERS)
-        self.nonnegative = (False,) * len(
-            self.names
-        )  # feasibility of a body is no matter of signs
+        # feasibility of a body is no matter of signs
+        self.nonnegative = (False,) * len(self.names)
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""

@@ -24,9 +24,8 @@ from crane.identification.signals.signal_processing import (
 
 _MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
 _BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor per block
-_CACHE_BYTES = (
-    3 << 27
-)  # bytes of filtered blocks that are held; others are computed again when needed
+# bytes of cached filtered blocks; others are computed again
+_CACHE_BYTES = 3 << 27
 Progress = Callable[[float], None]
 _MAX_ITERATIONS = 31
 _CONVERGENCE_TOLERANCE = 1e-2  # of a standard deviation

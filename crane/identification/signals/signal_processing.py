@@ -17,9 +17,8 @@ _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
 _MAX_JITTER = 0.01  # steps
 _STEP_TOLERANCE = 1e-3  # steps, by which one may differ from the others
-_WINDOW_COEFFICIENTS = np.array(
-    [0.35875, 0.48829, 0.14128, 0.01168]
-)  # Blackman and Harris, about its middle
+# Blackman and Harris, about its middle
+_WINDOW_COEFFICIENTS = np.array([0.35875, 0.48829, 0.14128, 0.01168])
 _WINDOW_LENGTH = 1.3332  # over 1 / cutoff
 
 
