@@ -109,7 +109,7 @@ def test_limits_hold_between_samples(mini, found):
     v, _, tau = keeps(found, mini)
     assert (v <= 0.95).all() and (tau <= 0.95).all()
     assert v.max() > 0.93  # and they are used
-    assert found.used.max() <= 1 and found.used.max() > 0.99
+    assert found.limit_usage.max() <= 1 and found.limit_usage.max() > 0.99
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def naive(excitation):
     K, n = excitation.trajectory.harmonics, len(excitation.machine.active)
     w = 2 * np.pi / excitation.trajectory.period
     table = np.zeros((1 + 2 * K, n))
-    table[0] = excitation.limits.middle
+    table[0] = excitation.limits.stroke_middle
     for i in range(n):
         k = i % K + 1
         table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half[i])
@@ -166,7 +166,7 @@ def information_of(excitation, path):
     model = IdentificationModel(excitation.machine)
     time = path.lead + np.arange(0, path.period, excitation.step)
     W = model.regressor(model.samples(*path(time)))[:, :, excitation.base.independent]
-    W = (W / excitation.noise[:, None]).reshape(-1, excitation.base.rank) * excitation.scale
+    W = (W / excitation.noise[:, None]).reshape(-1, excitation.base.rank) * excitation.prior_std
     values = np.linalg.eigvalsh(path.periods * W.T @ W)
     return np.log1p(np.maximum(values, 0)).sum()
 
@@ -174,11 +174,22 @@ def information_of(excitation, path):
 def test_it_tells_more_than_random_and_naive_references(found):
     """Per parameter, the volume of the ellipsoid shrinks at least by a factor of two."""
     rank = found.base.rank
-    assert information_of(found, found.trajectory) == pytest.approx(found.after.logdet, rel=1e-3)
-    assert found.after.logdet - found.before.logdet > 2 * np.log(2) * rank
-    assert found.after.logdet - information_of(found, naive(found)) > 2 * np.log(2) * rank
-    assert found.after.condition < found.before.condition / 10
-    assert found.after.smallest > 10 * found.before.smallest
+    assert information_of(found, found.trajectory) == pytest.approx(
+        found.optimized_information.logdet, rel=1e-3
+    )
+    assert (
+        found.optimized_information.logdet - found.initial_information.logdet
+        > 2 * np.log(2) * rank
+    )
+    assert (
+        found.optimized_information.logdet - information_of(found, naive(found))
+        > 2 * np.log(2) * rank
+    )
+    assert found.optimized_information.condition < found.initial_information.condition / 10
+    assert (
+        found.optimized_information.smallest_singular_value
+        > 10 * found.initial_information.smallest_singular_value
+    )
 
 
 @pytest.mark.long
@@ -210,7 +221,7 @@ def test_predicted_deviations_are_those_of_least_squares(mini, found):
     norms = np.linalg.norm(W, axis=0)
     noise = np.random.default_rng(0).normal(size=(len(W), 600))
     errors = np.linalg.lstsq(W / norms, noise, rcond=0)[0] / norms[:, None]
-    assert errors.std(axis=1) == pytest.approx(found.after.std, rel=0.15)
+    assert errors.std(axis=1) == pytest.approx(found.optimized_information.std, rel=0.15)
 
 
 def test_with_a_prior_deviations_are_those_after_it(slider_crank):
@@ -281,7 +292,7 @@ def test_errors(mini, slider_crank, edited):
         (lambda: excite(mini, step=1e-7), "are 4e.08 samples of 1e-07 s, .* of at least 9.4e-05"),
         (
             lambda: excite(mini, periods=10**7),
-            "no room: give a step of at least",
+            "the memory: give a step of at least",
         ),
         (lambda: excite(mini, harmonics=5000), "with 3 active joints: give at most 38"),
         (

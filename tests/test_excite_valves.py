@@ -88,7 +88,7 @@ def test_strokes_rates_and_rest_are_kept(machine, found):
 @pytest.mark.parametrize("number", ["load_x.mass", "oil.bulk_modulus", "friction.x.viscous"])
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_strokes_hold_though_a_number_is_off(machine, found, number, factor):
-    value = next(one.start for one in found.fit if one.name == number)
+    value = next(one.start for one in found.unknowns if one.name == number)
     other = crane.load(machine.path, changes={number: factor * value})
     q, _ = strokes(other, found.signals, found.run.time)
     span = machine.upper[0] - machine.lower[0]
@@ -140,7 +140,7 @@ def test_the_information_is_that_of_derivatives_by_hand(machine, found):
 
 
 def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
-    assert found.after.logdet > found.before.logdet + np.log(2)
+    assert found.optimized_information.logdet > found.initial_information.logdet + np.log(2)
     assert found.vague == ["oil.gas_exponent"]  # there is no gas
     assert found.std["oil.gas_exponent"] == np.inf
     text = found.to_text()

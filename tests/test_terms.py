@@ -112,7 +112,7 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
         at = dataclasses.replace(at, term_states=memory)
         parts.append(term.columns(at)[:, 0, 0])
     np.testing.assert_allclose(np.concatenate(parts), found, rtol=1e-13)
-    with pytest.raises(InputError, match="'q1.memory' remembers time, give the step"):
+    with pytest.raises(InputError, match="'q1.memory' depends on time, give the step"):
         term.columns(model.samples(q, v, 0 * v))
 
 
@@ -409,7 +409,7 @@ def test_the_prior_that_predicts_is_chosen(arm):
     ):
         cross_validate(arm, given, {})
     few = {name: getattr(given, name)[:200] for name in ("time", "q", "v", "a", "tau")}
-    with pytest.raises(InputError, match="200 samples are too few for 5 parts, give at least 250"):
+    with pytest.raises(InputError, match="200 samples are too few for 5 folds, give at least 250"):
         cross_validate(arm, Motion(**few), {"bandwidth": [5.0]})
 
 
