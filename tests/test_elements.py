@@ -97,7 +97,9 @@ def formula(dynamics, quantity, q, v_a, x):
     """A quantity by its formulas, without compiling them."""
     fast = dynamics.machine.closure.compiled_closure
     posture = PositionKinematics(fast.geometry, Floats(fast.geometry.constants), q.tolist())
-    loops = LoopFormulas(fast._equations, fast._structure, fast._active, fast._passive, posture)
+    loops = LoopFormulas(
+        fast._equations, fast._structure, fast._active_columns, fast._passive_columns, posture
+    )
     sweep = DynamicsFormulas(
         posture, loops, Floats(dynamics.formula_constants), q.tolist(), v_a.tolist(),
         dynamics.formula_structure,

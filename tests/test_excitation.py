@@ -157,7 +157,7 @@ def naive(excitation):
     table[0] = excitation.limits.stroke_middle
     for i in range(n):
         k = i % K + 1
-        table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half[i])
+        table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half_stroke[i])
     return FourierTrajectory(table, excitation.trajectory.period, excitation.trajectory.periods)
 
 
