@@ -267,7 +267,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     dynamics = crane.Dynamics(clad(bare(mini), 3))
     closure, n = mini.closure, 3
     tape = Tape()
-    q, posture, loops = closure.compiled_closure.trace(tape, 0, 2)
+    q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
     constants, v_a = (
         FormulaConstants(tape, 1, dynamics.formula_constants),
         tape.load_vector(3, 0, n),
