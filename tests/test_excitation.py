@@ -305,7 +305,7 @@ def test_errors(mini, slider_crank, edited):
             call()
     weak = edited("slider_crank.yaml")
     weak.model.effortLimit[weak.closure.active[0]] = 1e-6
-    with pytest.raises(InputError, match="cannot even stand still .* for the force limit of"):
+    with pytest.raises(InputError, match="has no reference .* for the force limit of"):
         excite(weak, **QUICK)
 
 
