@@ -18,9 +18,8 @@ from identify_mini_forwarder import BANDWIDTH, SLOW, rig, terms
 
 import crane
 from crane.identification.excitation.periodic_excitation import excite
-from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
 from crane.identification.mechanics.identify import METHODS, identify
-from crane.identification.mechanics.term_selection import default_terms
 
 
 def main() -> None:

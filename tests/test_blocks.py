@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import crane
-from crane.identification.estimation import estimators, regressor
+from crane.identification.estimation import regression_problem, regressor
 from crane.identification.estimation.estimators import (
     huber,
     instrumental_variables,
@@ -19,11 +19,11 @@ from crane.identification.estimation.estimators import (
     weighted_least_squares,
 )
 from crane.identification.mechanics import regression_equations
-from crane.identification.mechanics.friction_terms import PreslidingFriction
-from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import build_equations, identify
+from crane.identification.mechanics.equation_setup import build_equations
+from crane.identification.mechanics.force_terms import PreslidingFriction
+from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
+from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.regression_equations import RegressionEquations
-from crane.identification.mechanics.term_selection import default_terms
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals.signal_processing import Motion, filter_rows
 
@@ -60,7 +60,7 @@ def test_estimates_do_not_depend_on_the_blocks(estimator, prior, monkeypatch):
     whole = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     stored = regressor.StoredRegressor.__init__.__defaults__
     monkeypatch.setattr(regressor.StoredRegressor.__init__, "__defaults__", (50,))
-    monkeypatch.setattr(estimators, "_GAP_BLOCK", 7)
+    monkeypatch.setattr(regression_problem, "_GAP_BLOCK", 7)
     found = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     assert stored == (8192,)  # what the first call had: all rows in one block
     keys = ("values", "covariance", "residuals", "noise", "effective_samples")

@@ -15,11 +15,11 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.description.parameter_changes import parameters
 from crane.description.sensors import Sensor
 from crane.formats.machine_loading import MachineVariants
-from crane.identification.calibration.calibration_problem import noise_std
-from crane.identification.calibration.profile_likelihood import estimate_with_profiles
-from crane.identification.calibration.residual_dependence import residual_dependences
+from crane.identification.calibration.calibration_result import residual_dependences
+from crane.identification.calibration.calibration_statistics import estimate_with_profiles
+from crane.identification.calibration.recording_case import noise_std
 from crane.identification.calibration.unknowns import build_unknowns
-from crane.recordings import timeseries
+from crane.recordings import table_reader, timeseries
 
 pytestmark = pytest.mark.slow
 
@@ -167,7 +167,7 @@ def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
 def test_what_is_chosen_takes_no_start(fitted):
     machine, path, _ = fitted
     done = typed("calibrate", machine.path, path, "--fit", "auto=3")
-    assert done.returncode == 2 and "'auto' chooses numbers by itself" in done.stderr
+    assert done.returncode == 2 and "'auto' chooses parameters by itself" in done.stderr
 
 
 @pytest.mark.long
@@ -191,7 +191,7 @@ def test_a_common_factor_and_delays(tmp_path):
     path = recorded(machine, tmp_path / "run.csv", 3, truth={
         "cylinder.x.hose_a": 1.5 * 1.9e-4, "cylinder.x.hose_b": 1.5 * 1.9e-4
     })  # fmt: skip
-    table = timeseries.read_table(path)
+    table = table_reader.read_table(path)
     late = table.values.copy()
     late[:, 2] = np.interp(late[:, 0] - 0.03, late[:, 0], late[:, 2])
     timeseries.write_table(path, timeseries.Table(table.units, late, {}))
@@ -230,7 +230,7 @@ def test_what_the_recording_cannot_say_is_said(tmp_path):
         ({"fit": ["load_*.mss"]}, "matches no number"),
         ({"fit": ["sensor.y.zero"]}, "'sensor.y.zero' is of no sensor"),
         ({"fit": ["sensor.x.gain"]}, "a sensor has no 'gain'"),
-        ({"fit": ["cylinder.x.leakage"]}, "is 0 at first, say how large it may be"),
+        ({"fit": ["cylinder.x.leakage"]}, "is 0 initially, give its range"),
         ({"fit": {"load_x.mass": (1.0, 2.0, 3.0)}}, "1 does not lie within 2 to 3"),
         ({"fit": {"load_x.mass": "much"}}, "give a start, or (start, low, high)"),
         ({"fit": ["load_x.mass"], "train": (3.0, 1.0)}, "is empty"),
@@ -451,7 +451,7 @@ def test_a_search_that_ended_in_the_wrong_minimum_goes_on(tmp_path):
     machine = simple(tmp_path)
     truth = {"valve.x.bandwidth": 250.0, "load_x.mass": 2050.0}
     path = recorded(machine, tmp_path / "run.csv", 2, truth)
-    table, random = timeseries.read_table(path), np.random.default_rng(9002)
+    table, random = table_reader.read_table(path), np.random.default_rng(9002)
     noisy = table.values.copy()
     for k, size in ((2, 2e-4), (3, 2e4), (4, 2e4)):
         noisy[:, k] += 8.0 * size * random.normal(size=len(noisy))
@@ -481,7 +481,7 @@ def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     """Of a raw log, with its columns; what is fitted is what was put on, a pressure of 3 bar."""
     machine, path, _ = fitted
     table, log, columns = (
-        timeseries.read_table(path),
+        table_reader.read_table(path),
         tmp_path / "log.csv",
         tmp_path / "columns.txt",
     )
@@ -523,7 +523,9 @@ def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
     machine, path, _ = fitted
     with pytest.raises(CraneError) as error:
         quiet(crane.calibrate, machine, path, ["load_x.mass"], train=(0.0, 4.0), span=(1.0, 5.0))
-    assert "what is fitted, 0 to 4 s, is not within 1 to 5 s, which is read" in str(error.value)
+    assert "the training data, 0 to 4 s, are not within the span 1 to 5 s that is" in str(
+        error.value
+    )
     ideal = tmp_path / "ideal.csv"
     ideal.write_text("# sensors: ideal\n" + path.read_text())
     with pytest.raises(CraneError) as error:

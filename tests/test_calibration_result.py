@@ -3,15 +3,18 @@
 import numpy as np
 import pytest
 
-from crane.identification.calibration.calibration_result import FittedParameter
-from crane.identification.calibration.correlated_parameters import correlated_directions
-from crane.identification.calibration.profile_likelihood import (
+from crane.identification.calibration.calibration_result import (
+    FittedParameter,
+    correlation_ratio,
+    group_samples,
+)
+from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     ProfileEnds,
+    correlated_directions,
     estimate_with_profiles,
     evaluate_profile_ends,
 )
-from crane.identification.calibration.residual_dependence import correlation_ratio, group_samples
 
 
 class Fake:
@@ -75,7 +78,7 @@ def test_an_interval_that_reaches_farther_is_told():
     assert ends.remark == "reaches farther up" and lower is None
     assert other == pytest.approx((1.0, 1.0))
     one = FittedParameter("a", 1.0, 1.0, 0.8, False, True, profile_ends=ends)
-    assert one.remark == "not told by the recordings, reaches farther up"
+    assert one.remark == "not determined by the recordings, reaches farther up"
     assert ProfileEnds().remark == "" and ProfileEnds(0.9, 2.0).remark == ""
     assert ProfileEnds(1.0, 4.0).remark == "derivatives do not hold over its interval"
 

@@ -13,8 +13,11 @@ from crane.common.errors import CraneWarning, RecordingError
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.outliers import outlier_mask, replace_outliers
-from crane.identification.signals.spectral_lines import strongest_spectral_line
+from crane.identification.signals.signal_quality import (
+    outlier_mask,
+    replace_outliers,
+    strongest_spectral_line,
+)
 from crane.recordings.logs import read_log
 from crane.recordings.measured_recordings import read_measured
 

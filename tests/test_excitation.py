@@ -154,7 +154,7 @@ def naive(excitation):
     K, n = excitation.trajectory.harmonics, len(excitation.machine.active)
     w = 2 * np.pi / excitation.trajectory.period
     table = np.zeros((1 + 2 * K, n))
-    table[0] = excitation.limits.middle
+    table[0] = excitation.limits.stroke_middle
     for i in range(n):
         k = i % K + 1
         table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half_stroke[i])
@@ -166,7 +166,7 @@ def information_of(excitation, path):
     model = IdentificationModel(excitation.machine)
     time = path.lead + np.arange(0, path.period, excitation.step)
     W = model.regressor(model.samples(*path(time)))[:, :, excitation.base.independent]
-    W = (W / excitation.noise[:, None]).reshape(-1, excitation.base.rank) * excitation.scale
+    W = (W / excitation.noise[:, None]).reshape(-1, excitation.base.rank) * excitation.prior_std
     values = np.linalg.eigvalsh(path.periods * W.T @ W)
     return np.log1p(np.maximum(values, 0)).sum()
 
@@ -292,17 +292,20 @@ def test_errors(mini, slider_crank, edited):
         (lambda: excite(mini, step=1e-7), "are 4e.08 samples of 1e-07 s, .* of at least 9.4e-05"),
         (
             lambda: excite(mini, periods=10**7),
-            "no room: give a step of at least",
+            "the memory: give a step of at least",
         ),
         (lambda: excite(mini, harmonics=5000), "with 3 active joints: give at most 38"),
-        (lambda: excite(mini, step=1.0), "10 samples in a period of 10 s tell no 75 base"),
+        (
+            lambda: excite(mini, step=1.0),
+            "10 samples in a period of 10 s do not determine 75",
+        ),
         (lambda: excite(slider_crank, prior=np.zeros(3)), "the prior has the shape"),
     ):
         with pytest.raises(InputError, match=text):
             call()
     weak = edited("slider_crank.yaml")
     weak.model.effortLimit[weak.closure.active[0]] = 1e-6
-    with pytest.raises(InputError, match="cannot even stand still .* for the force limit of"):
+    with pytest.raises(InputError, match="has no reference .* for the force limit of"):
         excite(weak, **QUICK)
 
 

@@ -88,7 +88,7 @@ def test_strokes_rates_and_rest_are_kept(machine, found):
 @pytest.mark.parametrize("number", ["load_x.mass", "oil.bulk_modulus", "friction.x.viscous"])
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_strokes_hold_though_a_number_is_off(machine, found, number, factor):
-    value = next(one.start for one in found.fit if one.name == number)
+    value = next(one.start for one in found.unknowns if one.name == number)
     other = crane.load(machine.path, changes={number: factor * value})
     q, _ = strokes(other, found.signals, found.run.time)
     span = machine.upper[0] - machine.lower[0]
@@ -144,7 +144,7 @@ def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
     assert found.unidentifiable == ["oil.gas_exponent"]  # there is no gas
     assert found.std["oil.gas_exponent"] == np.inf
     text = found.to_text()
-    assert "not told by these sensors in this time: oil.gas_exponent" in text
+    assert "not determined by these sensors in this time: oil.gas_exponent" in text
     assert "load_x.mass" in text and "std, designed" in text
 
 

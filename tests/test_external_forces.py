@@ -11,7 +11,7 @@ from typed import typed
 import crane
 from crane.codegen.symbolic import scale_vector
 from crane.common.errors import CraneError
-from crane.recordings import timeseries
+from crane.recordings import table_reader
 
 BUNDLED = ("mini_forwarder", "patu655")
 
@@ -339,7 +339,7 @@ def test_loads_are_typed(pushed, tmp_path):
     command = ("simulate", pushed, "--duration", "1", "--step", "0.1", "--out", out)
     done = typed(*command, "--load", f"slide={table}")
     assert done.returncode == 0, done.stderr
-    rows = timeseries.read_table(out / "recording.csv")
+    rows = table_reader.read_table(out / "recording.csv")
     x = rows.values[-1, list(rows.units).index("x")]
     # 3 N and 1 + t N
     assert x == pytest.approx((4 * 0.5 + 1 / 6) / MASS, abs=1e-9)

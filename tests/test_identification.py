@@ -13,15 +13,19 @@ from crane.identification.mechanics.base_parameters import (
     group_parameters,
     random_samples,
 )
-from crane.identification.mechanics.force_element_terms import ForceElementTerm, GasSpringTerm
-from crane.identification.mechanics.friction_terms import (
+from crane.identification.mechanics.force_terms import (
+    ForceElementTerm,
+    GasSpringTerm,
     PreslidingFriction,
     VelocityFriction,
     friction_term,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
-from crane.identification.mechanics.model_term import ForceDirection
+from crane.identification.mechanics.model_term import (
+    ForceDirection,
+    InertialTerm,
+    RotorInertiaTerm,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 FINGERS = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}

@@ -19,13 +19,12 @@ from scipy.interpolate import CubicSpline
 import crane
 from crane import cli
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
-from crane.identification.mechanics.force_element_terms import ForceElementTerm
-from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.force_terms import ForceElementTerm, friction_term
+from crane.identification.mechanics.identification_model import default_terms
+from crane.identification.mechanics.identified_description import divide_locked_bodies
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
-from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
-from crane.identification.mechanics.locked_body_division import divide_locked_bodies
-from crane.identification.mechanics.term_selection import default_terms
+from crane.identification.mechanics.model_term import InertialTerm, body_names
 from crane.identification.signals.signal_processing import Motion
 from crane.recordings.run_folder import read_run
 
@@ -205,7 +204,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
             dataclasses.replace(found, parameters=parameters),
             "'X1': viscous of friction is -1, it must not be negative, give feasible=True",
         ),
-        (dataclasses.replace(found, parameters=bodies), "the identified machine cannot be: "),
+        (dataclasses.replace(found, parameters=bodies), "the identified machine is not valid: "),
         (identify(mini, motion(mini), feasible=True, terms=spring), "the model has 'q1.spring'"),
         (
             identify(
@@ -219,7 +218,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
         ),
         (
             identify(changed, motion(changed), prior=0.3),
-            "'mini_forwarder' was loaded with changed numbers, identify it as its files describe",
+            "'mini_forwarder' was loaded with parameter changes, identify it as its files",
         ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
@@ -237,7 +236,7 @@ def test_a_body_that_cannot_be_asks_for_feasible_ones(mini, found, tmp_path):
         crane.write_identified(parted, tmp_path / "out")
     link = found.model.bodies[0]
     assert re.fullmatch(
-        f"the identified machine cannot be: link '{link}' has the negative principal moment of "
+        f"the identified machine is not valid: link '{link}' has the negative principal moment of "
         r"inertia -\S+ kg m2, give feasible=True",
         str(caught.value),
     )
@@ -339,7 +338,7 @@ def test_what_a_motion_does_not_tell_of_a_load(mini):
     np.testing.assert_allclose(estimate.com[:2], TRUTH[1:3], atol=3e-3)
     assert np.isnan(estimate.com[2]) and np.isnan(estimate.std_com[2])
     assert estimate.directions.shape == (2, 3) and np.abs(estimate.directions[:, 2]).max() < 1e-9
-    assert re.search(r"^com z +- +not told by this motion$", estimate.to_text(), re.M)
+    assert re.search(r"^com z +- +not determined by this motion$", estimate.to_text(), re.M)
 
 
 def test_no_load_can_be_told(mini):
@@ -402,7 +401,7 @@ def test_motion_one_way_does_not_tell_friction_from_weight(mini):
     with pytest.raises(RecordingError) as caught:
         identify_payload(mini, given)
     text = str(caught.value)
-    assert text.startswith("this recording does not tell the mass (") and "\n" not in text
+    assert text.startswith("this recording does not determine the mass (") and "\n" not in text
     assert "'X1', 'X2' moved one way only, where friction looks like weight" in text
     assert "the forces at rest hold -0.0" in text
     # a long way tells a load by its levers, whatever the friction

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from crane.identification.estimation.estimators import huber, least_squares, weighted_least_squares
-from crane.identification.estimation.jackknife import Jackknife
-from crane.identification.estimation.noise_model import NoiseModel
+from crane.identification.estimation.noise_model import Jackknife, NoiseModel
 
 
 def test_leaving_out_in_closed_form_is_leaving_out():

@@ -22,7 +22,7 @@ from crane.codegen import Program
 from crane.codegen.llvm.machine_code import emit_module
 from crane.codegen.program_cache import cache_entry_name
 from crane.dynamics import compiled_dynamics as quantities
-from crane.motion.kinematics import _CompiledFrame, _CompiledPoint
+from crane.motion.compiled_frame import CompiledFrame, CompiledPoint
 
 DATA = Path(__file__).parent / "data"
 MACHINES = ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf")
@@ -84,7 +84,7 @@ def formulas(machine, fast):
             lambda p, name=name, rest=rest: quantities._build_quantity(p, name, fast, *rest),
         )
     if machine.tip:
-        for kind in (_CompiledPoint, _CompiledFrame):
+        for kind in (CompiledPoint, CompiledFrame):
             frame = kind(machine, machine.frame(machine.tip))
             frame._compiled_closure = fast
             yield kind.__name__, frame._build_program

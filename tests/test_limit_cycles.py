@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import crane
 from crane.hydraulics.circuit_elements import Supply
 from crane.hydraulics.pump_equations import least_sensing_ratio, unstable_frequency_range
-from crane.recordings.limit_cycles import limit_cycles, ringing, sustained
+from crane.recordings.limit_cycles import limit_cycle_message, limit_cycles, sustained_oscillation
 from crane.recordings.recording_summary import summarize
 
 TIME = np.arange(0.0, 10.0, 2e-3)
@@ -30,7 +30,9 @@ def lifted(folder, mass=3000.0, level=0.8, duration=4.0, **supply):
 
 @pytest.mark.parametrize(("frequency", "amplitude"), [(0.9, 3e6), (7.0, 2e6), (40.0, 5e5)])
 def test_a_sine_on_a_drift_is_found(frequency, amplitude):
-    found = sustained(TIME, 1e7 + 1e5 * TIME + amplitude * np.sin(6.3 * frequency * TIME), 1e5)
+    found = sustained_oscillation(
+        TIME, 1e7 + 1e5 * TIME + amplitude * np.sin(6.3 * frequency * TIME), 1e5
+    )
     assert found.frequency == pytest.approx(6.3 * frequency / (2 * np.pi), rel=1e-2)
     assert found.amplitude == pytest.approx(amplitude, rel=0.05)
     assert found.start < 1.0 and found.end > 8.8
@@ -42,7 +44,7 @@ def test_the_cycle_of_van_der_pol(mu):
     time = np.arange(0.0, 400.0, 0.05)
     run = solve_ivp(lambda t, y: [y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]], (0, 400), [0.01, 0.0],
                     t_eval=time, rtol=1e-8)  # fmt: skip
-    found = sustained(time, run.y[0], 0.1)
+    found = sustained_oscillation(time, run.y[0], 0.1)
     assert found.amplitude == pytest.approx(2.0, rel=0.02)
     assert found.frequency == pytest.approx(1 / (2 * np.pi * (1 + mu**2 / 16)), rel=0.012)
 
@@ -51,7 +53,7 @@ def test_the_cycle_of_van_der_pol(mu):
 def test_what_decays_is_none(damping):
     w = 2 * np.pi * 7.0
     swing = 2e6 * np.exp(-damping * w * TIME) * np.sin(w * TIME)
-    assert sustained(TIME, 1e7 + swing, 1e5) is None
+    assert sustained_oscillation(TIME, 1e7 + swing, 1e5) is None
 
 
 def test_noise_steps_and_ramps_are_none():
@@ -60,14 +62,14 @@ def test_noise_steps_and_ramps_are_none():
         2e5 * rng.standard_normal(len(TIME)), np.cumsum(1e5 * rng.standard_normal(len(TIME))),
         1e6 * np.floor(TIME), 1e6 * TIME, np.zeros(len(TIME)),
     ):  # fmt: skip
-        assert sustained(TIME, 1e7 + values, 1e5) is None
+        assert sustained_oscillation(TIME, 1e7 + values, 1e5) is None
 
 
 @pytest.mark.parametrize("harmonic", [1, 2, 3])
 def test_what_is_commanded_is_none(harmonic):
     swing, command = np.sin(2 * np.pi * 3 * harmonic * TIME), np.sin(2 * np.pi * 3 * TIME)
-    assert sustained(TIME, 2e6 * swing, 1e5, [command]) is None
-    assert sustained(TIME, 2e6 * swing, 1e5, [TIME, np.ones_like(TIME)]) is not None
+    assert sustained_oscillation(TIME, 2e6 * swing, 1e5, [command]) is None
+    assert sustained_oscillation(TIME, 2e6 * swing, 1e5, [TIME, np.ones_like(TIME)]) is not None
 
 
 def test_load_sensing_without_damping_rings_and_is_told(tmp_path):
@@ -92,7 +94,7 @@ def test_load_sensing_without_damping_rings_and_is_told(tmp_path):
 @pytest.mark.parametrize("mass", [3000.0, 10000.0])
 def test_load_sensing_as_it_is_by_default_is_quiet(tmp_path, mass, changes):
     machine, run = lifted(tmp_path, mass, **changes)
-    assert ringing(run) == "" and "ring" not in summarize(run).to_markdown()
+    assert limit_cycle_message(run) == "" and "ring" not in summarize(run).to_markdown()
     assert not crane.check(machine.path).findings
 
 
@@ -177,4 +179,4 @@ def test_bundled_machines_do_not_ring(name, task, droop):
     loaded = machine.with_external_forces(*machine.tasks[task].loads)
     duration = machine.tasks[task].duration or None
     run = crane.simulate(loaded, crane.joystick(loaded, task), duration=duration, step=5e-3)
-    assert ringing(run) == ""
+    assert limit_cycle_message(run) == ""

@@ -9,7 +9,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import RecordingError
-from crane.recordings import timeseries
+from crane.recordings import table_reader, timeseries
 from crane.recordings.logs import read_log
 from crane.recordings.recording import Recording
 
@@ -213,7 +213,7 @@ def test_channels_of_their_own_are_kept(log, tmp_path):
     text = PATU + "".join(f"{name} [bar] = 1\n" for name in own)
     done = typed("import", log, columns(tmp_path, text), "--out", tmp_path / "run.csv")
     assert (done.returncode, done.stderr) == (0, "")
-    units = timeseries.read_table(tmp_path / "run.csv").units
+    units = table_reader.read_table(tmp_path / "run.csv").units
     assert {"pressure_X_grip_a", "pressure_pump", "X_9", *own} < set(units)
 
 

@@ -32,7 +32,7 @@ def small(monkeypatch):
     """Scratch files for short recordings, too, in blocks of a few samples."""
     monkeypatch.setattr(scratch_arrays, "_MIN_FILE_ELEMENTS", 1)
     monkeypatch.setattr(scratch_arrays, "BLOCK_SIZE", 64)
-    monkeypatch.setattr("crane.recordings.timeseries._BLOCK_ROWS", 50)
+    monkeypatch.setattr("crane.recordings.timeseries.BLOCK_ROWS", 50)
 
 
 @pytest.mark.parametrize("suffix", ["csv", "npz"])

@@ -335,12 +335,12 @@ BROKEN = {
     ),
     "no slewing angle": (
         without("q1 [deg]"),
-        "nothing tells where 'q1' is, give 'q1 [rad]'; or lock what was held, where it was: "
+        "'q1' is not determined, give 'q1 [rad]'; or lock what was held, where it was: "
         "--lock q1=0 (home)",
     ),
     "one angle too few": (
         without("q2 [deg]"),
-        "nothing tells where 'X1' is, give 'X1 [m]', or a joint that moves with it "
+        "'X1' is not determined, give 'X1 [m]', or a joint that moves with it "
         "(q4, q9, q2); or lock what was held, where it was: --lock X1=0.0221 (home)",
     ),
     "angle without a unit": (
@@ -357,15 +357,13 @@ BROKEN = {
     ),
     "wrong zero": (
         lambda columns, truth: columns["q2 [deg]"].__iadd__(60.0),
-        " m, its limits are 0 and 0.03: see that zero and sign of q2, q3 are the machine's"
-        ", and that none of them counts from "
-        "the horizon (inclination_LINK)",
+        " m, its limits are 0 and 0.03: see that zero and sign of q2, q3 are the machine's, and "
+        "that none of them counts from the horizon (inclination_LINK)",
     ),
     "angles that no posture has": (
         lambda columns, truth: columns.update({"q4 [rad]": columns.pop("q2 [deg]") / 57 - 1.0}),
-        "; see that zero and sign of q3, q4 are the machine's"
-        ", and that none of them counts from "
-        "the horizon (inclination_LINK)",
+        "; see that zero and sign of q3, q4 are the machine's, and that none of them counts "
+        "from the horizon (inclination_LINK)",
     ),
 }  # fmt: skip
 
@@ -387,7 +385,7 @@ def test_everything_that_is_missing_is_told_at_once(machine, columns, tmp_path):
     with pytest.raises(RecordingError) as caught:
         read_measured(machine, write(tmp_path, columns))
     line = str(caught.value)
-    assert "nothing tells where 'q1', 'X1' are, give 'q1 [rad]', 'X1 [m]', or a joint" in line
+    assert "'q1', 'X1' are not determined, give 'q1 [rad]', 'X1 [m]', or a joint" in line
     assert "); column 'q1_force' is missing, give it in [N m]; column" in line
     assert (
         "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'; or lock"
@@ -466,9 +464,9 @@ def test_beyond_a_dead_centre(machine, columns, truth, tmp_path):
             continue
         first = int(np.argmax(q9 < in_line))
         assert str(caught.value) == (
-            f"{file}: sample {first} is beyond a dead centre, where q1, X1, X2 do not tell the "
-            "posture: see that zero and sign of q9 are the machine's, and that none of them "
-            "counts from the horizon (inclination_LINK), or cut the recording"
+            f"{file}: sample {first} is beyond a dead centre, where q1, X1, X2 do not determine "
+            "the configuration: see that zero and sign of q9 are the machine's, and that none "
+            "of them counts from the horizon (inclination_LINK), or cut the recording"
         )
 
 
@@ -495,7 +493,7 @@ def test_command_line(path, columns, tmp_path):
     identify = ("identify", path, file, "--out", "found")
     result = typed(*identify, cwd=tmp_path)
     assert result.returncode == 2 and not (tmp_path / "found").exists()
-    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]'; or lock" in result.stderr
+    assert f"error: {file}: 'q1' is not determined, give 'q1 [rad]'; or lock" in result.stderr
     result = typed(*identify, "--lock", "q1=0", cwd=tmp_path)
     assert "nothing tells" not in result.stderr
     columns["q1 [rad]"] = columns["time [ms]"] * 1e-4

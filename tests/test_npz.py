@@ -9,7 +9,7 @@ import pytest
 
 from crane.common.errors import RecordingError
 from crane.recordings import npz
-from crane.recordings.timeseries import read_table
+from crane.recordings.table_reader import read_table
 
 TIME = np.arange(5) / 100
 

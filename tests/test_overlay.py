@@ -9,7 +9,7 @@ from typed import typed
 
 from crane import simulate
 from crane.recordings.recording import Recording
-from crane.recordings.recording_differences import joint_differences
+from crane.recordings.recording_summary import joint_differences
 
 DATA = Path(__file__).parent / "data"
 

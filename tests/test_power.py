@@ -326,7 +326,7 @@ def test_the_command_writes_all(patu, tmp_path):
     assert "| X_lift: compensator |" in done.stdout
     assert "\n2 s; share" in done.stdout
     assert (tmp_path / "out/power.md").read_text() in done.stdout
-    table = crane.recordings.timeseries.read_csv(tmp_path / "out/power.csv")
+    table = crane.recordings.table_reader.read_csv(tmp_path / "out/power.csv")
     columns = dict(zip(table.units, table.values.T, strict=True))
     others = sum(x for name, x in columns.items() if name not in ("time", "supply.shaft"))
     np.testing.assert_allclose(columns["supply.shaft"], others, rtol=1e-9, atol=1e-6)

@@ -45,10 +45,10 @@ def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
     with pytest.raises(InputError) as caught:
         identify(four_bar, one_way, prior=(IdentificationModel(four_bar).nominal, bodies))
     assert str(caught.value) == (
-        "the prior says nothing of crank.coulomb, crank.coulomb_offset, crank.viscous, "
-        "crank.viscous_offset, and this motion does not tell them apart: move the joints both "
-        "ways and at several speeds, give prior=(means, deviations) with finite ones for them, "
-        "or leave the prior out, which tells of them together"
+        "there is no finite prior of crank.coulomb, crank.coulomb_offset, crank.viscous, "
+        "crank.viscous_offset, and this motion does not determine them separately: move the "
+        "joints both ways and at several speeds, give prior=(means, deviations) with finite "
+        "ones for them, or omit the prior to estimate base parameters"
     )
     std = np.array([1.0 if name.startswith("crank.") or "_arm" in name else np.inf
                     for name in names])  # fmt: skip

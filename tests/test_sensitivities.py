@@ -9,7 +9,7 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError
 from crane.formats.machine_loading import MachineVariants
-from crane.recordings import timeseries
+from crane.recordings import table_reader
 
 MASS, STIFFNESS, DAMPING = 2.0, 50.0, 0.6
 
@@ -224,7 +224,7 @@ def test_the_command_tells_what_a_motion_depends_on(tmp_path):
     assert "| link3.mass | 0.218 | 0.00218 |" in done.stdout and "X1_force [N]" in done.stdout
     names = {"sensitivities.md", "sensitivities.csv", "sensitivities.png"}
     assert {path.name for path in out.iterdir()} == names
-    table = timeseries.read_table(out / "sensitivities.csv")
+    table = table_reader.read_table(out / "sensitivities.csv")
     first = dict(zip(table.units, table.values[0], strict=True))
     assert first["X1 by start.X1"] == pytest.approx(1.0) and first["X1 by link3.mass"] == 0.0
     for options, said in (

@@ -13,12 +13,11 @@ import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description.sensors import Sensor
 from crane.formats.machine_loading import MachineVariants
-from crane.recordings import timeseries
-from crane.recordings.ideal_sensors import ideal_readings
-from crane.recordings.pin_derivatives import pin_derivatives
+from crane.recordings import table_reader, timeseries
+from crane.recordings.measured_recordings import dead_length
 from crane.recordings.recording import Recording
 from crane.recordings.recording_reader import correct_readings, read_quantities, select_time_span
-from crane.recordings.stroke_check import dead_length
+from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
 from crane.recordings.timeseries import Table
 
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -193,7 +192,7 @@ def test_machine_files_keep_sensors(machine, tmp_path):
             "the note 'sensor.q22.zero' is of no column, did you mean 'q2'",
         ),
         ({"sensor.q2.scale": "0"}, "the note 'sensor.q2.scale': scale of a sensor is 0"),
-        ({"sensor.q2.delay": "99"}, "is shorter than a sensor is late, 99 s, record more"),
+        ({"sensor.q2.delay": "99"}, "is shorter than the delay of a sensor, 99 s, record more"),
     ],
 )
 def test_notes_that_are_none(machine, motion, tmp_path, notes, said):
@@ -418,7 +417,7 @@ def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
     """One for two freedoms, and one that no posture has."""
     columns, units = motion
     for name, off, said in (
-        ("inclination_lift_boom", 0.0, "nothing tells where 'X_lift', 'X_tilt' are"),
+        ("inclination_lift_boom", 0.0, "'X_lift', 'X_tilt' are not determined"),
         ("inclination_tilt_boom", 1.6, "see that zero and sign of inclination_tilt_boom are"),
     ):
         names = ["time", name, "X_lift_force", "X_tilt_force"] + ["X_lift"] * bool(off)
@@ -455,7 +454,7 @@ def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
 def test_a_delay_reads_beyond_the_window(machine, motion, tmp_path):
     """The end of a window holds what a late sensor says after it."""
     path = written(tmp_path, motion, [])
-    table = timeseries.read_table(path)
+    table = table_reader.read_table(path)
     late = {"X_lift": Sensor(delay=0.1)}
     cut = select_time_span(correct_readings(table, late), (3.0, 5.0), path)
     assert cut.values[-1, 1] == pytest.approx(
@@ -525,7 +524,7 @@ def test_a_raw_log_is_read_by_the_sensors_of_its_machine(machine, tmp_path):
         read_quantities(LIFTING, machine.replace(sensors=known))
     two = read_quantities(LIFTING, machine, columns)
     assert one.units == two.units and np.array_equal(one.values, two.values)
-    raw = timeseries.read_log_arrays(LIFTING)
+    raw = table_reader.read_log_arrays(LIFTING)
     at = list(one.units).index("inclination_tilt_boom")
     np.testing.assert_allclose(one.values[:, at], np.deg2rad(raw["z2_deg"]) + 0.085, atol=1e-12)
     # what crane wrote is no log
@@ -572,7 +571,7 @@ def test_all_that_a_log_lacks_is_told_at_once(tmp_path):
     done = typed("simulate", "patu655", "--inputs", LIFTING, "--columns", columns,
                  "--out", tmp_path / "out")  # fmt: skip
     assert done.returncode == 2 and "no signal of a valve, give at least one of" in done.stderr
-    assert "nothing tells where 'slew', 'X_ext' are, give 'slew [rad]', 'X_ext [m]'" in done.stderr
+    assert "'slew', 'X_ext' are not determined, give 'slew [rad]', 'X_ext [m]'" in done.stderr
     assert "--lock slew=0 (home) --lock X_ext=0.1 (home)" in done.stderr
     few = [
         x for x in COLUMNS.splitlines() if not re.match("voltage|pressure_(supply|X_lift_b)", x)
@@ -581,6 +580,6 @@ def test_all_that_a_log_lacks_is_told_at_once(tmp_path):
     done = typed("circuit", "patu655", LIFTING, "--columns", columns, "--joint", "X_lift")
     for said in (
         "columns are missing: 'pressure_X_lift_b', 'pressure_supply', 'voltage_X_lift' or 'spool_",
-        "nothing tells where 'slew', 'X_ext' are", "--lock slew=0 (home) --lock X_ext=0.1 (home)",
+        "'slew', 'X_ext' are not determined", "--lock slew=0 (home) --lock X_ext=0.1 (home)",
     ):  # fmt: skip
         assert done.returncode == 2 and said in done.stderr

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics import recording_checks
-from crane.identification.mechanics.force_checks import check_forces
+from crane.identification.mechanics.force_comparison import check_forces
 from crane.identification.mechanics.recording_checks import check_recording, check_samples
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals

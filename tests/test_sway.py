@@ -108,8 +108,8 @@ def test_sway_alone_tells_ratios(machine):
     with pytest.raises(CraneError) as caught:
         crane.identify(stands, noisy(run, 1e-4))
     assert str(caught.value).startswith(
-        "nothing drives what moves in this recording: it tells ratios of masses, not masses; say "
-        "what one is known to be, as prior={'grapple.m': "
+        "nothing drives what moves in this recording: it determines ratios of masses only; give "
+        "a prior of one mass, as prior={'grapple.m': "
     )
     for angle, share in ((0.0, 1e-5), (1e-4, 0.01)):
         for scale in (1.0, 2.0):  # of all masses

@@ -20,18 +20,21 @@ from crane.identification.mechanics.cross_validation import (
     format_trials,
     identify_options,
 )
-from crane.identification.mechanics.force_checks import check_shared_samples
-from crane.identification.mechanics.friction_laws import friction_laws
-from crane.identification.mechanics.friction_terms import (
+from crane.identification.mechanics.force_comparison import check_shared_samples
+from crane.identification.mechanics.force_terms import (
     FrictionalMemory,
     PreslidingFriction,
     friction_term,
     root_friction_term,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identified_description import friction_laws
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertial_terms import InertialTerm, RotorInertiaTerm
-from crane.identification.mechanics.model_term import ForceDirection
+from crane.identification.mechanics.model_term import (
+    ForceDirection,
+    InertialTerm,
+    RotorInertiaTerm,
+)
 from crane.identification.mechanics.priors import prior_from_names
 from crane.identification.signals.signal_processing import Motion
 
@@ -109,7 +112,7 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
         at = dataclasses.replace(at, term_states=memory)
         parts.append(term.columns(at)[:, 0, 0])
     np.testing.assert_allclose(np.concatenate(parts), found, rtol=1e-13)
-    with pytest.raises(InputError, match="'q1.memory' remembers time, give the step"):
+    with pytest.raises(InputError, match="'q1.memory' depends on time, give the step"):
         term.columns(model.samples(q, v, 0 * v))
 
 
@@ -122,24 +125,24 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
         ({"q9.viscous": ()}, "term 'q9.viscous': 'q9' is unknown, known: q1"),
         (
             {"q1.presliding": ()},
-            "term 'q1.presliding' has 0 numbers, give the distance over which",
+            "term 'q1.presliding' has 0 values, give the characteristic distance",
         ),
-        ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 numbers, it takes none"),
+        ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 values, it takes none"),
         (
             {"q1.presliding": (-1.0,)},
-            "a number of term 'q1.presliding' is -1.0, give a number above",
+            "a value of term 'q1.presliding' is -1.0, give a number above",
         ),
         (
             {"q1.stiction": (0.1, 0.0)},
-            "a number of term 'q1.stiction' is 0.0, give a number above 0",
+            "a value of term 'q1.stiction' is 0.0, give a number above 0",
         ),
         (
             {"q*.stiction": (np.nan,)},
-            "a number of term 'q*.stiction' is nan, give a number above 0",
+            "a value of term 'q*.stiction' is nan, give a number above 0",
         ),
         (
             {"q1.memory": (np.inf, 1.0)},
-            "a number of term 'q1.memory' is inf, give a number above 0",
+            "a value of term 'q1.memory' is inf, give a number above 0",
         ),
         ({"nan*q5+q6.viscous": ()}, "'nan*q5+q6': 'nan' is no factor, write q5+0.5*q6"),
         ({"0*q5+q6.viscous": ()}, "'0*q5+q6': '0' is no factor, write q5+0.5*q6"),
@@ -340,11 +343,11 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
         (["--train", "0:9"], "nothing of use lies outside of --train 0:9, so nothing judges"),
         (
             ["--train", "0:7.7", "--bandwidth", "10"],
-            "1 of 1 validations are too short for a low-pass of 10 Hz and judge",
+            "1 of 1 held-out recordings are too short for a low-pass of 10 Hz and are not used",
         ),
         (
             ["--train", "0:6", "--slow", "crank=1.03", "--bandwidth", "40"],  # else 4 rows
-            "no validation moves faster than what counts",
+            "no held-out recording moves faster than",
         ),
     ],
 )
@@ -401,10 +404,12 @@ def test_the_prior_that_predicts_is_chosen(arm):
     assert [trial.settings["bodies"] for trial in trials] == ["1 %", "10000 %"]
     assert trials[0].mean_error < trials[1].mean_error and trials[0].errors.shape == (FOLD_COUNT,)
     assert "bodies=1 %" in format_trials(trials).splitlines()[2]
-    with pytest.raises(InputError, match="nothing is tried, give values such as bandwidth=2,5,10"):
+    with pytest.raises(
+        InputError, match="there are no candidates, give values such as bandwidth=2,5,10"
+    ):
         cross_validate(arm, given, {})
     few = {name: getattr(given, name)[:200] for name in ("time", "q", "v", "a", "tau")}
-    with pytest.raises(InputError, match="200 samples are too few for 5 parts, give at least 250"):
+    with pytest.raises(InputError, match="200 samples are too few for 5 folds, give at least 250"):
         cross_validate(arm, Motion(**few), {"bandwidth": [5.0]})
 
 
@@ -419,12 +424,12 @@ def test_the_prior_that_predicts_is_chosen(arm):
         (
             {"bodies": ["1 %"]},
             {"prior": (0, 1)},
-            "the prior is numbers of all parameters, give it",
+            "the prior is an array of all parameters, give it",
         ),
         (
             {"bandwidth": [5.0]},
             {"method": "x"},
-            "some part of the training is not told by the oth",
+            "some fold of the training data is not determined",
         ),
     ],
 )
@@ -505,7 +510,7 @@ def test_what_is_learned_does_not_judge_and_is_learned_once(arm):
         identify(arm, [one, part], **known)
     with pytest.raises(RecordingError, match="75% of recording 2's samples are in recording 1 as"):
         identify(arm, [part, one], **known)
-    with pytest.warns(CraneWarning, match="100% of a validation's samples were learned from: its"):
+    with pytest.warns(CraneWarning, match="100% of the held-out samples are training data: their"):
         identify(arm, one, [other, part], **known)
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)  # errors of rounding are none, either

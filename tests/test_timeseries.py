@@ -7,16 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crane.common.errors import RecordingError
-from crane.recordings import timeseries
-from crane.recordings.timeseries import (
-    Table,
-    accepted_units,
-    read_csv,
-    read_log_arrays,
-    read_npz,
-    read_table,
-    write_table,
-)
+from crane.recordings import table_reader
+from crane.recordings.table_reader import read_csv, read_log_arrays, read_npz, read_table
+from crane.recordings.timeseries import Table, accepted_units, write_table
 
 GOOD = "time [s],a [m],b\n0,1,2\n0.5,3,4\n"
 
@@ -228,15 +221,15 @@ def test_lines_across_blocks_are_counted(tmp_path, monkeypatch, end):
     """Whatever the size of the blocks that are looked at, and however lines end."""
     (tmp_path / "table.csv").write_text(GOOD.replace("\n", end), newline="")
     for size in range(16, 40):  # the header row has 16 characters
-        monkeypatch.setattr("crane.recordings.timeseries._BLOCK_BYTES", size)
-        assert timeseries._count_lines(tmp_path / "table.csv") in (3, 4)
-    monkeypatch.setattr("crane.recordings.timeseries._BLOCK_BYTES", 15)
+        monkeypatch.setattr("crane.recordings.table_reader._BLOCK_BYTES", size)
+        assert table_reader._count_lines(tmp_path / "table.csv") in (3, 4)
+    monkeypatch.setattr("crane.recordings.table_reader._BLOCK_BYTES", 15)
     with pytest.raises(RecordingError, match="line 1 has more than 15 bytes"):
-        timeseries._count_lines(tmp_path / "table.csv")
+        table_reader._count_lines(tmp_path / "table.csv")
 
 
 def test_more_numbers_than_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("crane.recordings.timeseries.MAX_NUMBERS", 8)
+    monkeypatch.setattr("crane.recordings.table_reader.MAX_NUMBERS", 8)
     with pytest.raises(RecordingError, match="holds 3 lines of 3 columns, give at most 8 numbers"):
         read_text(tmp_path, GOOD + "1,2,3\n")
     assert len(read_text(tmp_path, GOOD).values) == 2

@@ -242,14 +242,14 @@ def test_an_update_is_little_work_so_that_a_thousand_fit_into_a_second():
         (lambda t: t.joint_to_actuator({"boom": 1.0}), "joint 'boom' is unknown, known: "),
         (lambda t: t.joint_to_actuator({"q2": np.nan}), "effort of q2 is nan, "),
         (lambda t: t.actuator_to_joint({"q2": 1.0}, ["q3"]), "'q2' is not active, known: "),
-        (lambda t: t.actuator_to_joint({}, ["slew", "q2"]), "slew, q2 do not determine how the "
-         "machine moves here, give 4 independent joints"),
+        (lambda t: t.actuator_to_joint({}, ["slew", "q2"]),
+         "slew, q2 do not determine the motion of the machine here, give 4 independent joints"),
         (lambda t: t.actuator_to_joint({}, ["slew", "q2", "lift_barrel", "X_ext"]), "slew, q2, "
-         "lift_barrel, X_ext do not determine how the machine moves here, give 4 independent"),
+         "lift_barrel, X_ext do not determine the motion of the machine here, give 4 independent"),
         (lambda t: t.wrench_to_actuator([1.0, 0, 0]), "the wrench on 'tip' has the shape (3,)"),
         (lambda t: t.wrench_to_actuator([0.0] * 6, "hook"), "frame 'hook' is unknown, "),
         (lambda t: crane.Transmission(t.machine).wrench_to_actuator([0.0] * 6),
-         "the posture is not known yet, update it with slew, X_lift, X_tilt, X_ext"),
+         "the configuration is not known yet, update it with slew, X_lift, X_tilt, X_ext"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_one_line(act, error):

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 import crane
 from crane.common.errors import DescriptionError, InputError, UnreachableTipError
 from crane.motion.attitude import InclinationCoordinate, roll_pitch_yaw
-from crane.motion.piecewise_polynomial import PiecewisePolynomial
-from crane.motion.quintic_splines import least_jerk
+from crane.motion.quintic_splines import PiecewisePolynomial, least_jerk
 
 PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
 TIMES = [0.0, 0.4, 1.5, 2.0]
@@ -396,7 +395,7 @@ def test_what_cannot_be_reached_is_told_with_time_and_amount(excavator):
     ("name", "attitude", "line"),
     [
         ("mini_forwarder", "inclination", "too few drives for inclination of 'link7_tip': they "
-         "move it in 3 directions, and turn it in 0 beside"),
+         "move it in 3 directions and rotate it in 0 further ones"),
         ("excavator", "rotation", "too few drives for roll, pitch, yaw of 'bucket_lip'"),
         ("patu655_grapple", "inclination", "the joint that turns it is upright at home"),
         ("kr300", "inclination", "'flange' of 'kr300' has no inclination: its drives tilt"),

@@ -53,7 +53,7 @@ def view(
     The page of a run plays its motion, and plots its forces and all recorded quantities.
     """
     from crane.common.atomic_output import portable_file_name
-    from crane.recordings.recording_differences import joint_differences
+    from crane.recordings.recording_summary import joint_differences
     from crane.view.page.report_page import open_in_browser, report
     from crane.view.result_files import PAGE
 

@@ -16,7 +16,8 @@ from crane.hydraulics import Hydraulics, PDGains
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.flow_equations import LAMINAR_PRESSURE_DROP
 from crane.machine import Machine
-from crane.motion.sway import Sway, retime, suppress_sway
+from crane.motion.sway import Sway
+from crane.motion.sway_suppression import retime, suppress_sway
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 

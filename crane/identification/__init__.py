@@ -1,1 +1,1 @@
-"""Parameters of closed machines from recordings."""
+"""Identification and calibration of machines from recordings, and design of excitations."""

@@ -1,11 +1,18 @@
-"""Where a machine's parts are for given strokes: kinematics, trajectories, workspaces."""
+"""Kinematics of frames, trajectories, transmissions, sway suppression and workspaces."""
 
-from crane.motion.attitude import AttitudeTrajectory, via_attitudes
+from crane.motion.attitude import via_attitudes
 from crane.motion.kinematics import Kinematics
 from crane.motion.path_reader import read_path
-from crane.motion.sway import Sway, retime, suppress_sway
+from crane.motion.sway import Sway
+from crane.motion.sway_suppression import retime, suppress_sway
 from crane.motion.task_trajectories import task_trajectory, tip_trajectory
-from crane.motion.trajectory import Trajectory, point_to_point, polynomial, via_points
+from crane.motion.trajectory import (
+    AttitudeTrajectory,
+    Trajectory,
+    point_to_point,
+    polynomial,
+    via_points,
+)
 from crane.motion.transmission import JointState, Transmission
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Where a reference leaves the limits of joints, told before it is tried."""
+"""Violations of joint limits by a trajectory, found before a simulation runs."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from crane.common.samples import Array
 from crane.machine import Machine
 from crane.motion.trajectory import Trajectory
 
-_LIMIT_TOLERANCE = 1e-6  # [rad], [machine's size]
-_VELOCITY_LIMIT_TOLERANCE = 1e-6  # of a velocity limit
+_LIMIT_TOLERANCE = 1e-6  # [rad], of the characteristic length
+_VELOCITY_LIMIT_TOLERANCE = 1e-6  # relative to a velocity limit
 _TIME_TOLERANCE = 1e-6  # [s]
 _MIN_SAMPLES, _SAMPLES_PER_SECOND, _MAX_SAMPLES = 100, 100, 20000  # samples
 
@@ -19,28 +19,28 @@ ColumnFunction = Callable[[Array], Array]
 
 
 def limit_tolerances(machine: Machine) -> Array:
-    """By how much the coordinates of all joints may pass a limit [m], [rad], which is rounding."""
+    """Tolerances [m], [rad] by which the coordinates of all joints may exceed a limit."""
     return _LIMIT_TOLERANCE * machine.closure.units
 
 
 def limit_violation_message(
     machine: Machine, reference: Trajectory, end_time: float = np.inf
 ) -> str:
-    """What to say of a reference that leaves the limits of an active joint, else nothing.
+    """Message about a reference that leaves the limits of an active joint, or "".
 
     Args:
         machine: The machine.
         reference: Reference of its active joints.
-        end_time: End of what is looked at [s].
+        end_time: End of the interval that is checked [s].
     """
     lower_bounds, upper_bounds = reference.bounds()
     if lower_bounds.shape != machine.lower.shape:
-        return ""  # of another machine, which is told elsewhere
+        return ""  # of another machine; the caller reports that
     tolerances = limit_tolerances(machine)[machine.closure.active]
     if (
         np.maximum(machine.lower - lower_bounds, upper_bounds - machine.upper) <= tolerances
     ).all():
-        return ""  # without a look where it turns
+        return ""  # within the limits by its bounds alone
     times = np.unique(
         np.minimum(
             np.append(reference.extremum_times(), _sample_times(reference, end_time)), end_time
@@ -54,22 +54,21 @@ def limit_violation_message(
     joint, others_text = machine.active[violation.joint_index], _others_text(violation.other_count)
     return (
         f"the reference of {_violation_text(machine, joint, violation)}{others_text}: keep it "
-        f"within, or widen the "
-        "limits"
+        "within, or widen the limits"
     )
 
 
 def passive_limit_violation_message(
     machine: Machine, reference: Trajectory, end_time: float = np.inf
 ) -> str:
-    """What to say of a reference that takes other joints beyond their limits, else nothing.
+    """Message about a reference that violates other limits, or "".
 
-    Those are the passive ones, closed loop by loop, and the velocities of all.
+    Those are the limits of passive joints, and the velocity limits of all joints.
 
     Args:
         machine: The machine.
         reference: Reference of its active joints.
-        end_time: End of what is looked at [s].
+        end_time: End of the interval that is checked [s].
     """
     closure, times = machine.closure, _sample_times(reference, end_time)
     if reference.position(times).shape[1] != len(machine.active):
@@ -93,14 +92,13 @@ def passive_limit_violation_message(
             limit_tolerances(machine)[passive],
         )
     except ClosureError:
-        return ""  # a dead centre, or beyond the reach: the run tells which
+        return ""  # a dead centre or an unreachable position: the simulation reports it
     if violation is not None:
         joint = machine.joints[passive[violation.joint_index]]
+        text = _violation_text(machine, joint, violation, "to")
         return (
-            f"the reference takes "
-            f"{_violation_text(machine, joint, violation, 'to')}"
-            f"{_others_text(violation.other_count)}: keep "
-            "it within, or widen the limits"
+            f"the reference takes {text}{_others_text(violation.other_count)}: keep it within, or "
+            "widen the limits"
         )
     velocity_limits = np.array(
         [
@@ -130,7 +128,7 @@ def passive_limit_violation_message(
 
 
 class _LimitViolation(NamedTuple):
-    """Where a column is farthest beyond its limits."""
+    """Largest violation of the limits of a quantity."""
 
     joint_index: int
     value: float
@@ -143,7 +141,7 @@ class _LimitViolation(NamedTuple):
     def find(
         cls, times: Array, evaluate: ColumnFunction, lower: Array, upper: Array, tolerances: Array
     ) -> "_LimitViolation | None":
-        """The worst of what has columns (N, n), as a share of what lies between the limits."""
+        """Largest violation of columns (N, n), relative to the range between their limits."""
         q = evaluate(times)
         excess = np.maximum(lower - q, q - upper)
         if not q.shape[1] or not (excess > tolerances).any():
@@ -169,7 +167,7 @@ class _LimitViolation(NamedTuple):
 def _largest_excess(
     times: Array, excess: Array, k: int, evaluate: Callable[[float], float]
 ) -> tuple[float, float]:
-    """When it is farthest beyond, around sample k, and by how much."""
+    """Time [s] and size of the largest excess near sample k."""
     from scipy.optimize import minimize_scalar
 
     interval = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
@@ -182,7 +180,7 @@ def _largest_excess(
 def _violation_interval(
     times: Array, excess: Array, k: int, evaluate: Callable[[float], float]
 ) -> str:
-    """From when to when it is beyond around sample k, with what it is at any time."""
+    """Text of the interval around sample k in which the limit is exceeded."""
     from scipy.optimize import brentq
 
     first = last = k
@@ -207,8 +205,8 @@ def _violation_text(
     unit = machine.unit(joint)
     return (
         f"'{joint}' {verb} {violation.value:.6g} {unit} at t = {violation.time:.4g} s, beyond "
-        f"its limit "
-        f"{violation.limit:.6g} {unit}{_limit_location(machine, joint)} {violation.interval_text}"
+        f"its limit {violation.limit:.6g} {unit}{_limit_location(machine, joint)} "
+        f"{violation.interval_text}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Motions from files: points, or samples of a motion that somebody recorded or computed."""
+"""Trajectories from CSV and npz files of points or of recorded samples."""
 
 import warnings
 from collections.abc import Sequence
@@ -18,17 +18,18 @@ from crane.common.errors import (
 from crane.common.samples import Array
 from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES
 from crane.machine import Machine
-from crane.motion.attitude import INCLINATION, AttitudeTrajectory, via_attitudes
+from crane.motion.attitude import INCLINATION, via_attitudes
 from crane.motion.limit_violations import limit_violation_message
 from crane.motion.quintic_splines import estimate_noise, quintic_polynomials, smooth_samples
 from crane.motion.task_trajectories import add_free_joints, tip_trajectory
-from crane.motion.trajectory import Trajectory, via_points
+from crane.motion.trajectory import AttitudeTrajectory, Trajectory, via_points
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX
-from crane.recordings.timeseries import TIME, Table, check_unit, read_table
+from crane.recordings.table_reader import read_table
+from crane.recordings.timeseries import TIME, Table, check_unit
 
-_MIN_NOISY_SAMPLES = 50  # samples, from which on they may be noisy
-_NOISE_THRESHOLD = 1e-7  # scatter of a column, as a share of its range, that is no noise
-_TIP_PREFIX = "tip_"  # of the tip's columns in recordings
+_MIN_NOISY_SAMPLES = 50  # samples; fewer are taken as exact points
+_NOISE_THRESHOLD = 1e-7  # noise relative to the range of a column; less is rounding
+_TIP_PREFIX = "tip_"  # of columns of the tip in recordings
 _UNITS = {
     **dict.fromkeys(TIP_COORDINATES, "m"),
     **dict.fromkeys(ATTITUDE_COORDINATES[0] + ATTITUDE_COORDINATES[1], "rad"),
@@ -36,26 +37,27 @@ _UNITS = {
 
 
 def read_path(machine: Machine, path: str | Path) -> Trajectory:
-    """The motion that a CSV or npz file gives as points in time.
+    """Read a trajectory from the points in a CSV or npz file.
 
-    Its columns are time [s] and all driven joints [m], [rad], as a recording has them; or the
-    tip's x, y, z [m], and `inclination` or `roll`, `pitch`, `yaw` [rad] of its frame. Points are
-    passed with least jerk (`via_points`), from rest to rest. Columns of many samples that scatter
-    are smoothed (`crane.motion.quintic_splines`), which a warning tells with how much they scatter
-    and up to which frequency they are followed.
+    Its columns are time [s] and all driven joints [m], [rad], as in a recording; or x, y, z [m] of
+    the tip, and optionally `inclination` or `roll`, `pitch`, `yaw` [rad] of its frame. The
+    trajectory passes the points with least jerk (`via_points`), from rest to rest. Columns of many
+    noisy samples are smoothed (`crane.motion.quintic_splines`); a warning gives their noise and
+    the cut-off frequency.
 
     Args:
         machine: The machine.
-        path: The file. Time may begin anywhere.
+        path: The file. Its time may start at any value.
 
     Returns:
         Trajectory of the active joints.
 
     Raises:
         RecordingError: The file cannot be read, or a unit is wrong.
-        InputError: Columns are missing or unknown, times do not increase, points are too few.
-        UnreachableTipError: The tip's path leaves the reach.
-        LimitError: It leaves the limits of a driven joint.
+        InputError: Columns are missing or unknown, times do not increase, or there are too few
+            points.
+        UnreachableTipError: The path of the tip is not reachable.
+        LimitError: The trajectory leaves the limits of a driven joint.
     """
     table = read_table(path)
     try:
@@ -84,13 +86,13 @@ def read_path(machine: Machine, path: str | Path) -> Trajectory:
 
 
 class _KnotDerivatives(NamedTuple):
-    """Values, rates and second rates (K, n) at knots (K,)."""
+    """Values, velocities and accelerations (K, n) at knots (K,)."""
 
     time: Array
     derivatives: tuple[Array, Array, Array]
 
     def trajectory(self, columns: Sequence[int]) -> Trajectory:
-        """The trajectory of some columns."""
+        """Trajectory of some of the columns."""
         indices = list(columns)
         return Trajectory(
             quintic_polynomials(self.time, *(part[:, indices] for part in self.derivatives))
@@ -98,7 +100,7 @@ class _KnotDerivatives(NamedTuple):
 
 
 def _path_columns(machine: Machine, table: Table) -> dict[str, str]:
-    """The columns of a path by what they are: driven joints, or the tip and its attitude."""
+    """Columns of a path by coordinate: driven joints, or the tip and its attitude."""
     joints, headings = machine.driven_joints, list(table.units)
     present_joints = [joint for joint in joints if joint in headings]
     is_recording = any(name.endswith((VELOCITY_SUFFIX, FORCE_SUFFIX)) for name in headings)
@@ -156,8 +158,7 @@ def _path_times(table: Table) -> Array:
         if not following > previous:
             raise InputError(
                 f"time goes from {previous:g} to {following:g} s at row {row} of its samples, "
-                f"let it "
-                "increase"
+                "let it increase"
             )
     return time - time[0]
 
@@ -169,7 +170,7 @@ def _table_column(table: Table, name: str) -> Array:
 def _fit_curve(
     time: Array, points: Array, names: Sequence[str], units: Sequence[str], path: str | Path
 ) -> _KnotDerivatives:
-    """Through points, or near samples that scatter."""
+    """Interpolate points, or smooth noisy samples."""
     messages, smoothed_columns = [], {}
     for i, (name, unit, x) in enumerate(zip(names, units, points.T, strict=True)):
         if len(x) < _MIN_NOISY_SAMPLES or np.isnan(x).any():

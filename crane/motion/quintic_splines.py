@@ -1,22 +1,67 @@
-"""Splines of fifth order: through given derivatives, with least jerk, or near noisy samples."""
+"""Piecewise polynomials and quintic splines: through derivatives, of least jerk, or smoothing."""
+
+from dataclasses import dataclass
+from math import perm
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crane.common.samples import Array
-from crane.motion.piecewise_polynomial import PiecewisePolynomial
 
 _VALUES_PER_KNOT = 3  # value, rate and second rate at a knot
-_DIVIDED_DIFFERENCE_POINTS = 7  # of a divided difference that noise alone is left of
+_DIVIDED_DIFFERENCE_POINTS = 7  # of a divided difference that contains noise alone
 _MIN_KNOT_SPACING = 0.01  # [s] between knots near samples
-_MIN_CUTOFF_PER_KNOT = 2.5e-3  # cut-off per knot: below, rounding spoils what is left
-_RELATIVE_TOLERANCE = 1e-3  # of the scatter and of the cut-off, to which both are found
+_MIN_CUTOFF_PER_KNOT = 2.5e-3  # cut-off per knot; below it rounding errors dominate
+_RELATIVE_TOLERANCE = 1e-3  # of the noise and of the cut-off frequency
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewisePolynomial:
+    """Polynomials between knots, x(t) = sum_k c_k (t - t_i)^(m - 1 - k) for t_i <= t < t_i+1.
+
+    The first and the last one extend beyond the knots. It replaces scipy's PPoly, whose import
+    takes several times as long as the evaluation of a motion.
+
+    Attributes:
+        c: (m, N - 1, n) coefficients, highest power first.
+        x: (N,) knots, increasing.
+    """
+
+    c: Array
+    x: Array
+
+    def __call__(self, time: ArrayLike, order: int = 0) -> Array:
+        """Values, or derivatives of an order, (..., n) at times (...)."""
+        t = np.asarray(time, dtype=np.float64)
+        interval = np.clip(np.searchsorted(self.x, t, "right") - 1, 0, len(self.x) - 2)
+        u = (t - self.x[interval])[..., None]
+        value, power = np.zeros((*t.shape, self.c.shape[2])), np.ones_like(u)
+        for k in range(order, len(self.c)):
+            value += self.c[-1 - k, interval] * power * float(perm(k, order))
+            power = power * u
+        return value
+
+    def derivative(self, order: int = 1) -> "PiecewisePolynomial":
+        """Derivative of an order."""
+        if order >= len(self.c):
+            return PiecewisePolynomial(np.zeros_like(self.c[:1]), self.x)
+        factors = [float(perm(k, order)) for k in range(len(self.c) - 1, order - 1, -1)]
+        return PiecewisePolynomial(
+            self.c[: len(factors)] * np.array(factors)[:, None, None], self.x
+        )
+
+    def roots(self) -> Any:
+        """Zeros between the knots: (n,) arrays of times, NaN for an interval that is zero."""
+        from scipy.interpolate import PPoly  # slow to import
+
+        return PPoly(self.c, self.x).roots(extrapolate=False)
 
 
 def quintic_polynomials(time: Array, x: Array, v: Array, a: Array) -> PiecewisePolynomial:
-    """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
+    """Quintic polynomials between knots (N,) with given values and derivatives (N, n).
 
-    With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,
+    With u = t - t_i, h = t_i+1 - t_i and the remainders of second order at u = h,
 
         d = x_i+1 - x_i - v_i h - a_i h^2/2,   e = v_i+1 - v_i - a_i h,   f = a_i+1 - a_i,
         x = x_i + v_i u + a_i u^2/2 + (10 d - 4 e h + f h^2/2) (u/h)^3
@@ -38,34 +83,32 @@ def quintic_polynomials(time: Array, x: Array, v: Array, a: Array) -> PiecewiseP
 
 
 def _quintic_basis() -> Array:
-    """(6, 6) the powers of u in a quintic, of its (x, x', x'') at u = 0 and u = 1."""
+    """Matrix (6, 6) from (x, x', x'') at u = 0 and u = 1 to the coefficients of a quintic in u."""
     d, e, f = np.array(
         [[-1.0, -1.0, -0.5, 1.0, 0.0, 0.0], [0, -1, -1, 0, 1, 0], [0, 0, -1, 0, 0, 1]]
     )
     start = np.eye(6)[:3] * np.array([1.0, 1.0, 0.5])[:, None]
-    basis: Array = np.vstack(
-        [start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2]
-    )
-    return basis
+    return np.vstack([start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2])
 
 
 def _jerk_form() -> Array:
-    """(6, 6) the integral of the squared third derivative over 0 <= u <= 1, as a form of those."""
+    """Quadratic form (6, 6) of int (x''')^2 du over 0 <= u <= 1 in (x, x', x'') at both ends."""
     scale = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
     gram = np.outer(scale, scale) / np.add.outer(np.arange(3.0), np.arange(1.0, 4.0))
-    form: Array = _QUINTIC_BASIS[3:].T @ gram @ _QUINTIC_BASIS[3:]
-    return form
+    return _QUINTIC_BASIS[3:].T @ gram @ _QUINTIC_BASIS[3:]
 
 
 _QUINTIC_BASIS = _quintic_basis()
+
 _JERK_FORM = _jerk_form()
 
 
 class _JerkQuadraticForm:
-    """The jerk of all quintics between knots, as a quadratic form in what they are at these.
+    """Integrated squared jerk of a quintic spline as a quadratic form in its values at knots.
 
-    J(y) = sum_i h_i^-5 y_i^T K y_i = y^T H y, with y_i = (x, h x', h^2 x'') at both ends of a
-    part. At each knot rates are scaled by the parts beside it, so that H is well conditioned.
+    J(y) = sum_i h_i^-5 y_i^T K y_i = y^T H y, with y_i = (x, h x', h^2 x'') at both ends of an
+    interval. Rates at each knot are scaled by the adjacent intervals, so that H is well
+    conditioned.
 
     Args:
         time: (N,) [s].
@@ -81,13 +124,13 @@ class _JerkQuadraticForm:
         self._interval_scales = (
             h[:, None, None] ** np.arange(_VALUES_PER_KNOT)
             / np.stack([knot_scales[:-1], knot_scales[1:]], axis=1)
-        ).reshape(-1, 2 * _VALUES_PER_KNOT)  # from scaled ones to those of a part
+        ).reshape(-1, 2 * _VALUES_PER_KNOT)  # from scaled values to those of an interval
         self._knot_scales = knot_scales * self.time_unit ** np.arange(_VALUES_PER_KNOT)
         all_intervals = np.arange(len(h))
         self.jerk = self.assemble_banded(all_intervals, h[:, None, None] ** -5 * _JERK_FORM)
 
     def assemble_banded(self, intervals: NDArray[np.intp], forms: Array) -> Array:
-        """Lower diagonals (6, 3 N) of a sum of forms (k, 6, 6), each of one of the parts (k,)."""
+        """Lower diagonals (6, 3 N) of the sum of forms (k, 6, 6) on intervals (k,)."""
         size = 2 * _VALUES_PER_KNOT
         band = np.zeros((size, _VALUES_PER_KNOT * len(self.time)))
         interval_scales = self._interval_scales[intervals]
@@ -98,36 +141,36 @@ class _JerkQuadraticForm:
         return band
 
     def interpolation_rows(self, time: Array) -> tuple[NDArray[np.intp], Array]:
-        """The parts (M,) that times (M,) lie in, and what (M, 6) of a part is the value there."""
+        """Intervals (M,) of times (M,), and rows (M, 6) that interpolate the value there."""
         interval = np.clip(np.searchsorted(self.time, time, "right") - 1, 0, len(self.time) - 2)
         u = (time - self.time[interval]) / np.diff(self.time)[interval]
         return interval, u[:, None] ** np.arange(2 * _VALUES_PER_KNOT) @ _QUINTIC_BASIS
 
     def apply_transpose(self, intervals: NDArray[np.intp], rows: Array, values: Array) -> Array:
-        """The sum (3 N,) of rows (M, 6) times values (M,)."""
+        """Sum (3 N,) of rows (M, 6) times values (M,)."""
         out = np.zeros(_VALUES_PER_KNOT * len(self.time))
         indices = _VALUES_PER_KNOT * intervals[:, None] + np.arange(2 * _VALUES_PER_KNOT)
         np.add.at(out, indices, rows * self._interval_scales[intervals] * values[:, None])
         return out
 
     def interpolate(self, intervals: NDArray[np.intp], rows: Array, y: Array) -> Array:
-        """Values (M,) at rows (M, 6) of scaled ones (3 N,)."""
+        """Interpolated values (M,) by rows (M, 6) of scaled knot values (3 N,)."""
         indices = _VALUES_PER_KNOT * intervals[:, None] + np.arange(2 * _VALUES_PER_KNOT)
         return np.asarray(
             np.einsum("ij,ij->i", rows * self._interval_scales[intervals], y[indices])
         )
 
     def scale_values(self, knot_values: Array) -> Array:
-        """Values and rates (N, 3) [s] in the units of H, (3 N,)."""
+        """Scaled knot values (3 N,), in the units of H, of values and rates (N, 3)."""
         return np.asarray(knot_values * self._knot_scales).ravel()
 
     def unscale_values(self, y: Array) -> Array:
-        """The way back."""
+        """Values and rates (N, 3) of scaled knot values (3 N,)."""
         return np.asarray(y.reshape(-1, _VALUES_PER_KNOT) / self._knot_scales)
 
 
 def _multiply_banded(band: Array, y: Array) -> Array:
-    """A symmetric matrix, of its lower diagonals, times a vector."""
+    """Product of a symmetric matrix, given by its lower diagonals, and a vector."""
     out: Array = band[0] * y
     for k in range(1, len(band)):
         out[k:] += band[k, :-k] * y[:-k]
@@ -136,27 +179,31 @@ def _multiply_banded(band: Array, y: Array) -> Array:
 
 
 def least_jerk(time: Array, x: Array, v: Array) -> Array:
-    """Values and rates at knots of the curve with the least integral of its squared jerk.
+    """Values and rates at knots of the curve of least integrated squared jerk.
 
-    It is of fifth order between the knots and C4 at each; C3 where a rate is given. With what is
-    given at the ends as rates and no second rates there, it is the only one that makes
+    It is of fifth order between the knots and C4 at each of them, C3 where a rate is given. With
+    the given rates and zero second rates at the ends, it is the unique minimum of
 
         J = int (x''')^2 dt
 
-    least among all curves with these values: x^(6) = 0 between the knots (Flash and Hogan, J.
-    Neurosci. 5 (1985) 1688-1703, for one knot between the ends).
+    among all curves with these values: x^(6) = 0 between the knots (Flash and Hogan, J. Neurosci.
+    5 (1985) 1688-1703, for one knot between the ends).
 
     Args:
         time: (N,) [s].
         x: (N,) values.
-        v: (N,) rates, NaN where they follow; given at both ends.
+        v: (N,) rates, NaN where they are free; given at both ends.
 
     Returns:
         (N, 3) values, rates and second rates.
     """
     from scipy.linalg import solveh_banded  # slow to import
 
-    knots, offset = _JerkQuadraticForm(time), x[0]  # what is far from zero keeps its digits
+    # an offset keeps the digits of values far from zero
+    knots, offset = (
+        _JerkQuadraticForm(time),
+        x[0],
+    )
     given_values = np.column_stack([x - offset, v, np.full(len(time), np.nan)])
     given_values[[0, -1], 2] = 0.0
     y = knots.scale_values(given_values)
@@ -164,7 +211,7 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
     y[is_unknown] = 0.0
     right_side = np.where(is_unknown, -_multiply_banded(knots.jerk, y), 0.0)
     band = knots.jerk.copy()
-    for k in range(1, len(band)):  # rows and columns of what is given
+    for k in range(1, len(band)):  # rows and columns of given values
         band[k, :-k] *= is_unknown[k:] & is_unknown[:-k]
     band[0] = np.where(is_unknown, band[0], 1.0)
     knot_values = knots.unscale_values(y + solveh_banded(band, right_side, lower=True))
@@ -173,10 +220,10 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
 
 
 def estimate_noise(time: Array, x: Array) -> float:
-    """How much samples (N,) scatter about any smooth curve: of their sixth divided differences.
+    """Standard deviation of the noise of samples (N,) of a smooth curve, by divided differences.
 
-    Differences of seven samples each, with weights whose squares add up to one, are left with the
-    noise of one sample: its root mean square.
+    Sixth divided differences of seven samples each, with weights whose squares add up to one, have
+    the variance of the noise of one sample.
     """
     i = (
         np.arange(_DIVIDED_DIFFERENCE_POINTS)
@@ -191,21 +238,21 @@ def estimate_noise(time: Array, x: Array) -> float:
 
 
 def smooth_samples(time: Array, x: Array, noise_rms: float) -> tuple[Array, Array, float]:
-    """The curve with the least jerk that is as near to samples as these scatter about it.
+    """Smoothing spline of least jerk whose residuals have the size of the noise.
 
-    It makes J + w sum (x - x_i)^2 least, w such that the root mean square of x - x_i is the
-    scatter (Reinsch, Numer. Math. 10 (1967) 177-183, there for cubic splines). Of samples every h
-    it is, far from the ends, the filter 1 / (1 + (f/f_c)^6) without delay, that of a Butterworth
-    filter of third order forwards and back, with (2 pi f_c)^6 = w / h. Samples that are closer
+    It minimizes J + w sum (x - x_i)^2, with w such that the root mean square of x - x_i is that of
+    the noise (Reinsch, Numer. Math. 10 (1967) 177-183, for cubic splines). For samples of spacing
+    h it is, far from the ends, the filter 1 / (1 + (f/f_c)^6) without delay, that of a Butterworth
+    filter of third order applied forwards and backwards, with (2 pi f_c)^6 = w / h. Samples closer
     than 10 ms share knots.
 
     Args:
         time: (N,) [s].
         x: (N,) samples.
-        noise_rms: See `estimate_noise`.
+        noise_rms: Standard deviation of the noise, see `estimate_noise`.
 
     Returns:
-        Times (K,) of the knots, values, rates and second rates there (K, 3), and f_c [Hz].
+        Times (K,) of the knots [s], values, rates and second rates there (K, 3), and f_c [Hz].
     """
     from scipy.linalg import solveh_banded  # slow to import
 

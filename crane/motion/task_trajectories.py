@@ -1,4 +1,4 @@
-"""Reference motions: piecewise polynomials in the active coordinates or in the tip's space."""
+"""Trajectories of the active joints from trajectories of the tip and from tasks."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,11 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.samples import Array
 from crane.description.specification import TIP_COORDINATES, Task, ViaPoint
 from crane.machine import Machine
-from crane.motion.attitude import INCLINATION, AttitudeTrajectory, via_attitudes
+from crane.motion.attitude import INCLINATION, via_attitudes
 from crane.motion.kinematics import Kinematics
 from crane.motion.limit_violations import limit_violation_message
-from crane.motion.piecewise_polynomial import PiecewisePolynomial
-from crane.motion.quintic_splines import quintic_polynomials
-from crane.motion.trajectory import Trajectory, polynomial, via_points
+from crane.motion.quintic_splines import PiecewisePolynomial, quintic_polynomials
+from crane.motion.trajectory import AttitudeTrajectory, Trajectory, polynomial, via_points
 
 _KNOTS_PER_SECOND = 100
 
@@ -26,26 +25,26 @@ def tip_trajectory(
     initial_guess: ArrayLike | None = None,
     attitude: Trajectory | AttitudeTrajectory | None = None,
 ) -> Trajectory:
-    """The motion of the active joints that moves the tip along a trajectory.
+    """Trajectory of the active joints that moves the tip along a trajectory.
 
-    Positions at knots every 10 ms come from inverse kinematics, and so do velocities and
-    accelerations, v_A = J^-1 x', a_A = J^-1 (x'' - bias); quintics join them. A machine with more
-    active joints than there are coordinates moves them as little as it can from knot to knot, and
-    its velocities and accelerations are those of the quintic spline through the knots.
+    Positions at knots every 10 ms, and the velocities v_A = J^-1 x' and accelerations a_A = J^-1
+    (x'' - bias) there, come from inverse kinematics; quintics connect them. For a redundant
+    machine the motion from knot to knot is minimal, and velocities and accelerations are those of
+    the quintic spline through the knots.
 
     Args:
         machine: The machine.
         tip: Trajectory of the tip in the world [m].
         initial_guess: (n,) active coordinates near the start.
-        attitude: Of the tip's frame meanwhile: its inclination (1,) [rad], or its rotation, see
-            `via_attitudes`. Left open if not given.
+        attitude: Attitude of the tip's frame over the same time: inclination (1,) [rad], or
+            rotation, see `via_attitudes`; default free.
 
     Returns:
         Trajectory of q_A, with `tip` and `attitude` set.
 
     Raises:
-        InputError: The attitude takes another time, or the machine has no drives for it.
-        UnreachableTipError: The trajectory leaves the reach.
+        InputError: The attitude has another duration, or the drives cannot set it.
+        UnreachableTipError: The trajectory is not reachable.
     """
     kinematics = Kinematics(machine)
     count = max(6, int(np.ceil(tip.duration * _KNOTS_PER_SECOND)) + 1)
@@ -83,7 +82,7 @@ def tip_trajectory(
 
 
 class _FreeJointTrajectory(Trajectory):
-    """A reference of the driven joints beside free joints that stay where they start."""
+    """Trajectory of all active joints with the free joints at constant coordinates."""
 
     def __init__(self, reference: Trajectory, driven: NDArray[np.bool_], start: Array):
         self.duration = reference.duration
@@ -119,13 +118,13 @@ class _FreeJointTrajectory(Trajectory):
 
 
 def add_free_joints(machine: Machine, reference: Trajectory) -> Trajectory:
-    """A reference of the driven joints as one of all active joints (n,).
+    """Extend a trajectory of the driven joints to all active joints (n,).
 
-    Free joints follow none. Their columns only say where they start: at home, or where those of a
-    reference of all joints do.
+    Free joints follow no reference. Their columns only give the initial coordinates: those of
+    home, or those of a trajectory of all joints.
 
     Raises:
-        InputError: It is neither of the driven joints nor of all.
+        InputError: The trajectory has another number of coordinates.
     """
     if not machine.free:
         return reference
@@ -133,8 +132,7 @@ def add_free_joints(machine: Machine, reference: Trajectory) -> Trajectory:
     if len(start) not in (len(driven_names), len(machine.active)):
         raise InputError(
             f"the reference has {len(start)} coordinates, give the {len(driven_names)} of the "
-            f"driven "
-            f"joints ({', '.join(driven_names)}) or those of all {len(machine.active)}"
+            f"driven joints ({', '.join(driven_names)}) or those of all {len(machine.active)}"
         )
     if len(start) == len(driven_names):
         start = machine.home[machine.closure.active]
@@ -142,12 +140,12 @@ def add_free_joints(machine: Machine, reference: Trajectory) -> Trajectory:
 
 
 def task_trajectory(machine: Machine, task: str) -> Trajectory:
-    """Trajectory of the active joints of a named task of the machine.
+    """Trajectory of the active joints for a task of the machine.
 
     Raises:
         InputError: The machine has no such task.
-        UnreachableTipError: It leaves the reach.
-        LimitError: It leaves the limits of an active joint.
+        UnreachableTipError: The path of the tip is not reachable.
+        LimitError: The trajectory leaves the limits of an active joint.
     """
     if task not in machine.tasks:
         raise InputError(
@@ -189,14 +187,14 @@ def _build_task_trajectory(machine: Machine, task: Task) -> Trajectory:
 
 
 def _coordinate_trajectory(task: Task, names: Sequence[str]) -> Trajectory:
-    """What a task says of some coordinates."""
+    """Trajectory of some of the coordinates of a task."""
     if task.via:
         return via_points(*_via_point_table(task.via, names))
     return polynomial([task.coefficients[name] for name in names], task.duration)
 
 
 def _via_point_table(via: Sequence[ViaPoint], names: Sequence[str]) -> tuple[Array, Array, Array]:
-    """Times (N,), coordinates and rates (N, n) of points, NaN where nothing is given."""
+    """Times (N,), coordinates and rates (N, n) of via points, NaN where none is given."""
     time = np.array([via_point.time for via_point in via])
     points, rates = (
         np.array(

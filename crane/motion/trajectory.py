@@ -1,7 +1,7 @@
-"""Curves in time: piecewise polynomials, by coefficients or through points."""
+"""Trajectories: piecewise polynomials in time, and attitudes in time."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from math import factorial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,28 +9,31 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.samples import Array, as_number, as_samples
-from crane.motion.piecewise_polynomial import PiecewisePolynomial
-from crane.motion.quintic_splines import least_jerk, quintic_polynomials
+from crane.motion.quintic_splines import PiecewisePolynomial, least_jerk, quintic_polynomials
 
-if TYPE_CHECKING:
-    from crane.motion.attitude import AttitudeTrajectory
-
-_JUMP_TOLERANCE = 1e-9  # of the largest value, what no jump is
+_JUMP_TOLERANCE = 1e-9  # of the largest value; smaller differences are rounding
+_SERIES_TERMS = 40  # of the series below, sufficient for rotations up to 6 rad
+# series of sin(w)/w, (1 - cos w)/w^2, (w - sin w)/w^3 in w^2, highest power first
+_SERIES = [
+    np.array([(-1.0) ** k / factorial(2 * k + i) for k in reversed(range(_SERIES_TERMS))])
+    for i in (1, 2, 3)
+]
+_SERIES_DERIVATIVES = [np.polyder(series) for series in _SERIES]
 
 
 class Trajectory(OneLineRepr):
-    """A motion with two derivatives; before its start and after its end it stands still.
+    """Motion with two derivatives; it is at rest before its start and after its end.
 
     Args:
         curve: Piecewise polynomial of time from 0 [s], values (n,).
-        tip: The same motion of the tip, values (3,) [m], where the trajectory was given there.
-        attitude: That of the tip's frame, where that was given: its inclination, values (1,)
-            [rad], or its rotation.
+        tip: The same motion as a trajectory of the tip (3,) [m], if it was defined by the tip.
+        attitude: Attitude of the tip's frame, if it was defined: inclination (1,) [rad] or
+            rotation.
 
     Attributes:
         duration: [s].
-        tip: See above.
-        attitude: See above.
+        tip: Trajectory of the tip, None if the motion was not defined by the tip.
+        attitude: Attitude of the tip's frame, None if it was not defined.
     """
 
     duration: float
@@ -48,30 +51,30 @@ class Trajectory(OneLineRepr):
         self._polynomials = (curve, curve.derivative(), curve.derivative(2))
 
     def _one_line(self) -> str:
-        """How long, and of how many coordinates."""
+        """Duration and number of coordinates."""
         count = np.size(self.position(0.0))
         summary = f"{self.duration:.6g} s of {format_count(count, 'coordinate')}"
         return f"{type(self).__name__}({summary}{', by its tip' * (self.tip is not None)})"
 
     def position(self, time: ArrayLike) -> Array:
-        """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""
+        """Coordinates (n,) or (N, n) at times () or (N,) [s]."""
         return np.asarray(self._polynomials[0](np.clip(time, 0.0, self.duration)))
 
     def velocity(self, time: ArrayLike) -> Array:
-        """Velocities alone, likewise."""
+        """Velocities (n,) or (N, n) at times () or (N,) [s]."""
         return self._derivative(1, time)
 
     def _derivative(self, order: int, time: ArrayLike) -> Array:
-        """A derivative; zero before and after it, where it stands still."""
+        """Derivative of an order; zero before the start and after the end."""
         clipped_time = np.clip(time, 0.0, self.duration)
         derivative: Array = np.asarray(self._polynomials[order](clipped_time))
         derivative[clipped_time != time] = 0.0
         return derivative
 
     def bounds(self) -> tuple[Array, Array]:
-        """Two vectors (n,) between which the coordinates stay, which may be farther apart.
+        """Lower and upper bounds (n,) of the coordinates, not necessarily tight.
 
-        A polynomial sum a_i u^i is no farther than sum |a_i| h^i, i > 0, from a_0 in 0 <= u <= h.
+        In 0 <= u <= h a polynomial sum a_i u^i differs from a_0 by at most sum |a_i| h^i, i > 0.
         """
         curve = self._polynomials[0]
         powers = np.vander(np.diff(curve.x), len(curve.c))[:, :-1]
@@ -79,14 +82,14 @@ class Trajectory(OneLineRepr):
         return (curve.c[-1] - max_deviation).min(axis=0), (curve.c[-1] + max_deviation).max(axis=0)
 
     def extremum_times(self) -> Array:
-        """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""
+        """Times (k,) [s] at which a coordinate may be extremal: knots, and zeros of velocities."""
         curve, rate = self._polynomials[:2]
         rest_times = [np.ravel(roots) for roots in np.ravel(rate.roots())]
         times = np.concatenate([curve.x, *rest_times])
         return np.unique(times[np.isfinite(times)])
 
     def breaks(self) -> Array:
-        """Times (k,) [s] at which coordinates, velocities or accelerations jump, and the ends."""
+        """Times (k,) [s] of jumps in coordinates, velocities or accelerations, and both ends."""
         x = self._polynomials[0].x
         is_break = np.zeros(len(x), dtype=bool)
         is_break[[0, -1]] = True
@@ -112,14 +115,15 @@ class Trajectory(OneLineRepr):
 
 
 def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Trajectory:
-    """Polynomials in time.
+    """Trajectory of one polynomial per coordinate.
 
     Args:
-        coefficients: Per coordinate, lowest power first.
+        coefficients: A list per coordinate, lowest power first.
         duration: [s].
 
     Raises:
-        InputError: No coordinates, not finite, or no duration.
+        InputError: There are no coordinates, values are not finite, or the duration is not
+            positive.
     """
     as_number(duration, "the trajectory's duration", "s", greater_than=0)
     try:
@@ -138,7 +142,7 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Traj
 
 
 def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Trajectory:
-    """Straight line from rest to rest with least jerk: s = 10 u^3 - 15 u^4 + 6 u^5, u = t/T.
+    """Straight line from rest to rest of least jerk, s = 10 u^3 - 15 u^4 + 6 u^5, u = t/T.
 
     Args:
         start: (n,) active coordinates or (3,) tip position.
@@ -146,7 +150,7 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Traject
         duration: T [s].
 
     Raises:
-        InputError: Different sizes, not finite, or no duration.
+        InputError: Sizes differ, values are not finite, or the duration is not positive.
     """
     as_number(duration, "the trajectory's duration", "s", greater_than=0)
     start_values = as_samples(np.ravel(start), np.size(start), "start")
@@ -162,20 +166,20 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Traject
 
 
 def via_points(time: ArrayLike, points: ArrayLike, rates: ArrayLike | None = None) -> Trajectory:
-    """Through given points with least jerk, from rest to rest if nothing else is said.
+    """Trajectory of least jerk through given points, by default from rest to rest.
 
-    Each coordinate follows its own spline through its own points, `crane.motion.quintic_splines`:
-    of all curves through these it has the least int (x''')^2 dt. It is C4; C3 where a rate is
-    given. Second rates are zero at both ends.
+    Each coordinate is a quintic spline through its own points (`crane.motion.quintic_splines`):
+    among all curves through them it has the least int (x''')^2 dt. It is C4, and C3 where a rate
+    is given. Accelerations are zero at both ends.
 
     Args:
         time: (N,) [s], increasing from 0.
-        points: (N, n) coordinates [m], [rad]; NaN where one is left open, at neither end.
-        rates: (N, n) their rates [m/s], [rad/s]; NaN where they follow, which at the ends is zero.
+        points: (N, n) coordinates [m], [rad]; NaN where a coordinate is free, except at the ends.
+        rates: (N, n) their rates [m/s], [rad/s]; NaN where a rate is free, at the ends for zero.
 
     Raises:
-        InputError: Fewer than two points, times that do not increase from 0, wrong shapes, an end
-            that is left open, or a rate where no point is.
+        InputError: There are fewer than two points, times do not increase from 0, shapes differ,
+            an end is incomplete, or a rate has no point.
     """
     times = np.asarray(time, dtype=np.float64)
     point_table = np.asarray(points, dtype=np.float64)
@@ -187,8 +191,7 @@ def via_points(time: ArrayLike, points: ArrayLike, rates: ArrayLike | None = Non
     ):
         raise InputError(
             f"via points have the shape {point_table.shape} at times {times.shape}, give (N, n) "
-            f"at "
-            "(N,), two at least"
+            "at (N,), two at least"
         )
     given_rates = (
         np.full_like(point_table, np.nan) if rates is None else np.array(rates, dtype=np.float64)
@@ -198,7 +201,7 @@ def via_points(time: ArrayLike, points: ArrayLike, rates: ArrayLike | None = Non
             f"rates have the shape {given_rates.shape}, give {point_table.shape} as the points"
         )
     if times[0] != 0 or not (np.diff(times) > 0).all() or not np.isfinite(times).all():
-        raise InputError("times of via points do not increase from 0, give such")
+        raise InputError("times of via points do not increase from 0, give increasing times")
     if np.isinf(point_table).any() or np.isinf(given_rates).any():
         raise InputError("via points are infinite, give finite numbers, or NaN where one is open")
     if np.isnan(point_table[[0, -1]]).any():
@@ -217,3 +220,64 @@ def via_points(time: ArrayLike, points: ArrayLike, rates: ArrayLike | None = Non
             derivatives[order, :, i] = curve(times, order)[:, 0]
         derivatives[0, given_indices, i] = x[given_indices]
     return Trajectory(quintic_polynomials(times, *derivatives))
+
+
+def _cross_product_matrices(v: Array) -> Array:
+    """Matrices [v] (N, 3, 3) of vectors v (N, 3): [v] w = v x w."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, [2, 0, 1], [1, 2, 0]] = v
+    out[:, [1, 2, 0], [2, 0, 1]] = -v
+    return out
+
+
+class AttitudeTrajectory(OneLineRepr):
+    """Attitude as a function of time, R = R_0 exp([r]) with the rotation vector r(t).
+
+    With w^2 = r^T r and the series S_1 = sin(w)/w, S_2 = (1 - cos w)/w^2, S_3 = (w - sin w)/w^3,
+
+        exp([r]) = 1 + S_1 [r] + S_2 [r]^2,    R^T w_world = J r',   J = 1 - S_2 [r] + S_3 [r]^2.
+
+    Args:
+        initial_rotation: R_0 (3, 3).
+        rotation_vector: r (3,) [rad].
+
+    Attributes:
+        duration: [s].
+    """
+
+    def __init__(self, initial_rotation: Array, rotation_vector: Trajectory):
+        self.duration = rotation_vector.duration
+        self._initial_rotation, self._rotation_vector = initial_rotation, rotation_vector
+
+    def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
+        """Rotations R (N, 3, 3), angular velocities and accelerations (N, 3) in the world frame.
+
+        Args:
+            time: () or (N,) [s]; results have no axis N for a scalar.
+        """
+        r, rate, second = self._rotation_vector(np.atleast_1d(time))
+        square, square_rate = np.einsum("ij,ij->i", r, r), 2.0 * np.einsum("ij,ij->i", r, rate)
+        sine_series, cosine_series, cubic_series = (
+            np.polyval(series, square)[:, None, None] for series in _SERIES
+        )
+        series_rate_two, series_rate_three = (
+            (np.polyval(slope, square) * square_rate)[:, None, None]
+            for slope in _SERIES_DERIVATIVES[1:]
+        )
+        vector_cross, rate_cross = _cross_product_matrices(r), _cross_product_matrices(rate)
+        jacobian = (
+            np.eye(3) - cosine_series * vector_cross + cubic_series * vector_cross @ vector_cross
+        )
+        jacobian_rate = (
+            -series_rate_two * vector_cross
+            - cosine_series * rate_cross
+            + series_rate_three * vector_cross @ vector_cross
+            + cubic_series * (vector_cross @ rate_cross + rate_cross @ vector_cross)
+        )
+        rotation = self._initial_rotation @ (
+            np.eye(3) + sine_series * vector_cross + cosine_series * vector_cross @ vector_cross
+        )
+        velocity = rotation @ jacobian @ rate[..., None]
+        acceleration = rotation @ (jacobian @ second[..., None] + jacobian_rate @ rate[..., None])
+        result = rotation, velocity[..., 0], acceleration[..., 0]
+        return result if np.ndim(time) else (result[0][0], result[1][0], result[2][0])

@@ -1,4 +1,4 @@
-"""A closed machine as a transmission between its actuators and the joints of its tree."""
+"""Transmission between the actuators of a closed machine and the joints of its tree."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,21 +14,20 @@ from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.machine import Machine
 
 _FIELD_NAMES = ("position", "velocity", "effort")
-_SINGULARITY_TOLERANCE = (
-    1e-9  # least singular value of what joints move actuators by, per the largest
-)
+# least singular value of the map from actuators to joints, per the largest
+_SINGULARITY_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class JointState:
-    """Joints of a tree, with the fields of `sensor_msgs/JointState`.
+    """State of all joints, with the fields of `sensor_msgs/JointState`.
 
     Attributes:
         name: Names of all k joints.
         position: (k,) [m], [rad].
-        velocity: (k,) [m/s], [rad/s]; empty where that of an actuator is not known.
-        effort: (k,) [N], [N m], of actuators at their own joints, of the others zero; empty
-            where that of an actuator is not known.
+        velocity: (k,) [m/s], [rad/s]; empty if that of an actuator is unknown.
+        effort: (k,) [N], [N m], forces of the actuators at their joints, zero elsewhere; empty if
+            that of an actuator is unknown.
     """
 
     name: tuple[str, ...]
@@ -40,15 +39,15 @@ class JointState:
 class Transmission(OneLineRepr):
     """Positions, velocities and forces between the actuators and the joints of the tree.
 
-    What ros2_control calls a transmission, with ratios that the loops determine. With q_A the
-    active joints, gamma = dq/dq_A in the posture, tau what acts at all joints of the tree, J that
-    of a link,
+    It is a transmission in the sense of ros2_control, with ratios that the loops determine. With
+    the active joints q_A, gamma = dq/dq_A, the forces tau at all joints of the tree, and the
+    Jacobian J and wrench w of a link,
 
         q = f(q_A),    v = gamma v_A,    f_A = gamma^T tau = gamma^T J^T w,
 
-    so that f_A^T v_A = tau^T v. `update` takes the state of actuators and closes the loops, on
-    the branch of home; forces are mapped in the posture that it left. The six freedoms of a
-    vehicle that floats are no joints here: it is where it is at home, and does not move.
+    so that f_A^T v_A = tau^T v. `update` takes the state of the actuators and closes the loops on
+    the branch of home; forces are mapped in the configuration of the last update. The six freedoms
+    of a floating base are not joints here: the base is fixed in its home placement.
 
     Args:
         machine: The machine.
@@ -57,7 +56,7 @@ class Transmission(OneLineRepr):
         machine: The machine.
         actuators: Names of the n active joints.
         joints: Names of the k joints of the tree.
-        state: The last state of all joints, None until each active joint has been heard of.
+        state: The last state of all joints; None until the position of each active joint is known.
     """
 
     def __init__(self, machine: Machine):
@@ -75,18 +74,18 @@ class Transmission(OneLineRepr):
         self._actuator_columns = np.array(
             [machine.active.index(x) for x in self.actuators], dtype=np.intp
         )
-        self._received_values = np.full((3, len(self.actuators)), np.nan)  # a row per field
+        self._received_values = np.full((3, len(self.actuators)), np.nan)  # one row per field
         self._gamma: Array | None = None
         self._jacobians = FrameJacobians(machine)
 
     def _one_line(self) -> str:
-        """From where to where, of what."""
+        """Machine, actuators, and number of joints."""
         actuators = ", ".join(self.actuators)
         return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
 
     @property
     def unknown_actuators(self) -> tuple[str, ...]:
-        """Active joints whose position no message has had yet."""
+        """Active joints whose position is not known yet."""
         return tuple(
             joint
             for joint, i in self._actuator_indices.items()
@@ -100,12 +99,12 @@ class Transmission(OneLineRepr):
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> JointState | None:
-        """Take a state of actuators, by the fields of a `sensor_msgs/JointState`.
+        """Update the state from a message about actuators, as in `sensor_msgs/JointState`.
 
-        Names come in any order, and may be some of the active joints: the others stay as they
-        were. Other joints are passed over, and so are values that are NaN, which stand for what
-        is not measured. A message says all that is known of the joints that it names: a velocity
-        or effort that it leaves out is not known any more, a position stays.
+        The names may be any of the active joints in any order; the others keep their values. Other
+        joints and values that are NaN (not measured) are ignored. A message replaces all values of
+        the joints that it names: a missing velocity or effort becomes unknown, a missing position
+        is kept.
 
         Args:
             name: Names of k joints.
@@ -114,13 +113,12 @@ class Transmission(OneLineRepr):
             effort: k forces [N], [N m], or none.
 
         Returns:
-            The state of all joints, the loops closed to rounding; None where the message has no
+            The state of all joints, with loops closed to rounding; None if the message has no
             active joint, or the position of one is not known yet.
 
         Raises:
-            InputError: A field has another length than the names, or is infinite.
-            ClosureError: No posture closes the loops there, or none on the branch. The state
-                stays as it was before the message.
+            InputError: A field has another length than the names, or an infinite value.
+            ClosureError: The loops do not close on the branch of home. The state does not change.
         """
         fields = zip((position, velocity, effort), _FIELD_NAMES, strict=True)
         field_arrays = [_field_array(values, len(name), what) for values, what in fields]
@@ -159,18 +157,18 @@ class Transmission(OneLineRepr):
         return self.state
 
     def joint_to_actuator(self, effort: Mapping[str, float]) -> dict[str, float]:
-        """Forces of the actuators that do what forces at joints of the tree do: gamma^T tau.
+        """Forces of the actuators that are equivalent to forces at joints: gamma^T tau.
 
-        Those that a controller of the tree asks for, or that its inverse dynamics says.
+        For forces of a controller or of inverse dynamics of the tree.
 
         Args:
-            effort: By joint [N], [N m], zero where a joint is not named.
+            effort: Forces by joint [N], [N m]; default zero.
 
         Returns:
-            By active joint [N], [N m].
+            Forces by active joint [N], [N m].
 
         Raises:
-            InputError: There is no such joint, or no state yet.
+            InputError: A joint is unknown, or there is no state yet.
         """
         gamma, tau = self._known_gamma(), np.zeros(len(self.joints))
         for joint, value in effort.items():
@@ -180,21 +178,21 @@ class Transmission(OneLineRepr):
     def actuator_to_joint(
         self, effort: Mapping[str, float], joints: Sequence[str]
     ) -> dict[str, float]:
-        """Forces at chosen joints that do what forces of the actuators do.
+        """Forces at chosen joints that are equivalent to forces of the actuators.
 
-        With G the rows of gamma that belong to the joints, G^T tau = f_A: moments at the pins of
-        the booms, say, in place of the forces of their cylinders.
+        They solve G^T tau = f_A with the rows G of gamma for these joints: for example moments at
+        the pins of the booms in place of cylinder forces.
 
         Args:
-            effort: By active joint [N], [N m], zero where one is not named.
-            joints: As many as there are active ones.
+            effort: Forces by active joint [N], [N m]; default zero.
+            joints: Names of as many joints as there are active ones.
 
         Returns:
             By joint [N], [N m].
 
         Raises:
             InputError: Names are unknown, there is no state yet, or the joints do not determine
-                the machine's motion in its posture.
+                the motion of the machine in this configuration.
         """
         gamma, f_a = self._known_gamma(), np.zeros(len(self._actuator_indices))
         for joint, value in effort.items():
@@ -216,27 +214,27 @@ class Transmission(OneLineRepr):
             or not singular_values[-1] > _SINGULARITY_TOLERANCE * singular_values[0]
         ):
             raise InputError(
-                f"{', '.join(joints) or 'no joint'} do not determine how the machine moves here, "
-                f"give {len(f_a)} independent joints"
+                f"{', '.join(joints) or 'no joint'} do not determine the motion of the machine "
+                f"here, give {len(f_a)} independent joints"
             )
         tau = np.linalg.solve(scaled_gamma.T, f_a * active_units) / joint_units
         return dict(zip(joints, tau.tolist(), strict=True))
 
     def wrench_to_actuator(self, wrench: ArrayLike, link: str | None = None) -> dict[str, float]:
-        """Forces of the actuators that do what a wrench on a link does: gamma^T J^T w.
+        """Forces of the actuators that are equivalent to a wrench on a link: gamma^T J^T w.
 
-        Actuators that hold against the wrench give the same with the other sign.
+        Actuators that balance the wrench exert the negative of it.
 
         Args:
             wrench: (6,) force [N] and moment about the origin of the link [N m], in the axes of
                 the root link.
-            link: The link, the tip if not given.
+            link: The link; default the tip.
 
         Returns:
-            By active joint [N], [N m].
+            Forces by active joint [N], [N m].
 
         Raises:
-            InputError: There is no such link, no tip, or no state yet.
+            InputError: The link is unknown, there is no tip, or no state yet.
         """
         gamma = self._known_gamma()
         if (frame := link or self.machine.tip) is None:
@@ -251,7 +249,7 @@ class Transmission(OneLineRepr):
     def _known_gamma(self) -> Array:
         if self._gamma is None:
             unknown_names = ", ".join(self.unknown_actuators)
-            raise InputError(f"the posture is not known yet, update it with {unknown_names}")
+            raise InputError(f"the configuration is not known yet, update it with {unknown_names}")
         return self._gamma
 
     def _joint_index(self, joint: str) -> int:
@@ -264,7 +262,7 @@ class Transmission(OneLineRepr):
 
 
 def _field_array(values: Sequence[float], count: int, label: str) -> Array:
-    """(count,) of a field, NaN where it is empty."""
+    """Values (count,) of a field, NaN if it is empty."""
     if not len(values):
         return np.full(count, np.nan)
     array = np.asarray(values, dtype=float)
@@ -278,5 +276,5 @@ def _field_array(values: Sequence[float], count: int, label: str) -> Array:
 
 
 def _known_or_empty(values: Array) -> Array:
-    """All values, or none where one is not known."""
+    """The values, or an empty array if one is unknown."""
     return np.empty(0) if np.isnan(values).any() else values

@@ -1,4 +1,4 @@
-"""Recordings: what they hold, the files they come from, the numbers that sum them up."""
+"""Recordings of machines: columns, files, logs of other programs, checks and summaries."""
 
 from crane.recordings.recording import Recording
 

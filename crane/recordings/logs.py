@@ -1,17 +1,17 @@
-"""Logs of other programs: which of their columns are which of a recording, and in what unit.
+"""Logs of other programs, converted into tables by a file of column expressions.
 
-A file of columns has a line per column of the recording, its name and unit and how it is computed
-from the arrays of the log, and notes as a recording has them:
+A column file has one line per column of the recording, with its name, its unit and an expression
+in the arrays of the log, and notes as in a recording:
 
     # machine: kr300
     time [s] = time
     q2 [deg] = motor_position_deg[1] - 90
     q2_force [N m] = gear_ratio[1] * motor_torque[1]
 
-Arrays are those of an npz file, or the columns of a CSV by the words of its header row; names that
-are no identifiers stand in quotes. a[i] is the i-th column of a table a, counted from 0, or the
-i-th number of a list. There are + - * /, brackets, numbers and pi. Notes such as
-`# sensor.q2.delay: 0.02` say what is known of the sensors, see crane.description.sensors.
+Arrays are those of an npz file, or the columns of a CSV by the names in its header row; names that
+are no identifiers are quoted. a[i] is column i of a table a, counted from 0, or element i of a
+list. Operators are + - * /, parentheses, numbers and pi. Notes such as `# sensor.q2.delay: 0.02`
+are sensor parameters, see crane.description.sensors.
 """
 
 import ast
@@ -25,25 +25,24 @@ import numpy as np
 
 from crane.common.errors import RecordingError, suggest_names
 from crane.common.package_search import read_plain_file
-from crane.recordings import timeseries
+from crane.recordings import table_reader, timeseries
 from crane.recordings.timeseries import TIME, Table
 
-_MAX_BYTES = 2_000_000  # bytes of a file of columns
+_MAX_BYTES = 2_000_000  # bytes of a column file
 _MAX_EXPRESSION_LENGTH = 1000  # characters of an expression
 _LINE_PATTERN = re.compile(r"\s*([^=\[\]]+?\s*(?:\[[^\]]*\])?)\s*=\s*(.+?)\s*")
-_OPERATORS = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
-}  # fmt: skip
+# fmt: skip
+_OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
 
 
 @dataclass(frozen=True)
 class LogColumn:
-    """A column of a recording that is computed from those of a log.
+    """Column of a recording, computed from the columns of a log.
 
     Attributes:
-        source_location: It is written, for errors.
-        heading: Its name and unit, as in 'q2 [deg]'.
-        expression: Over the columns of the log.
+        source_location: File and line of the definition.
+        heading: Name and unit, such as 'q2 [deg]'.
+        expression: Expression in the columns of the log.
     """
 
     source_location: str
@@ -52,21 +51,21 @@ class LogColumn:
 
 
 def read_log(path: str | Path, columns: str | Path) -> Table:
-    """The table of a recording from a log.
+    """Read a log as the table of a recording.
 
     Args:
-        path: The log, CSV or npz.
-        columns: A file as above.
+        path: Log, CSV or npz.
+        columns: Column file, see the module's documentation.
 
     Returns:
-        Columns in SI units, time strictly increasing.
+        Table in SI units with strictly increasing time.
 
     Raises:
-        RecordingError: A file is missing or malformed, or columns cannot be computed; the
-            message names file and lines, of all that the log does not have.
+        RecordingError: A file is missing or malformed, or columns cannot be computed; the message
+            names files and lines.
     """
     notes, lines = read_log_columns(Path(columns))
-    arrays = timeseries.read_log_arrays(Path(path))
+    arrays = table_reader.read_log_arrays(Path(path))
     missing = [(line, name) for line in lines for name in missing_names(line.expression, arrays)]
     if missing:
         messages = [f"{line.source_location}: the log has no '{name}'" for line, name in missing]
@@ -82,17 +81,17 @@ def assemble_table(
     lines: Sequence[LogColumn],
     notes: dict[str, str],
 ) -> Table:
-    """The table that lines make of the arrays of a log.
+    """Compute a table from the arrays of a log.
 
     Args:
         path: The log.
-        columns: Where the lines are written.
-        arrays: Of the log, by name.
-        lines: Its columns.
-        notes: Of the table.
+        columns: File of the column definitions, for messages.
+        arrays: Arrays of the log by name.
+        lines: Column definitions.
+        notes: Notes of the table.
 
     Raises:
-        RecordingError: A column cannot be computed, or holds what no recording does.
+        RecordingError: A column cannot be computed, or its values are not valid in a recording.
     """
     if all(timeseries.parse_heading(line.heading)[0] != TIME for line in lines):
         raise RecordingError(
@@ -112,13 +111,13 @@ def assemble_table(
         if found[line.heading].shape not in ((), (count,)):
             raise RecordingError(
                 f"{line.source_location}: '{line.heading}' has {len(found[line.heading])} "
-                f"samples, others "
-                f"have {count}, choose a column of a table by its number, as in a[0]"
+                f"samples, others have {count}, choose a column of a table by its number, as in "
+                "a[0]"
             )
     columns_by_heading = {
         name: np.broadcast_to(values, (count,)) for name, values in found.items()
     }
-    table = timeseries.table_from_columns(columns, columns_by_heading, notes)
+    table = table_reader.table_from_columns(columns, columns_by_heading, notes)
     for name, values in zip(table.units, table.values.T, strict=True):
         bad = ~np.isfinite(values)
         if name == TIME:
@@ -131,12 +130,12 @@ def assemble_table(
 
 
 def missing_names(expression: str, arrays: Container[str]) -> list[str]:
-    """Names of an expression that a log does not have."""
+    """Names in an expression that a log does not contain."""
     return [name for name in expression_names(expression) if name not in arrays and name != "pi"]
 
 
 def expression_names(expression: str) -> list[str]:
-    """Columns of a log in an expression; none of one that cannot be read."""
+    """Names of log columns in an expression; empty if it cannot be parsed."""
     try:
         nodes = list(ast.walk(ast.parse(expression, mode="eval")))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -153,10 +152,10 @@ def expression_names(expression: str) -> list[str]:
 
 
 def read_log_columns(path: Path) -> tuple[dict[str, str], list[LogColumn]]:
-    """Notes and columns of a file of columns.
+    """Read notes and column definitions from a column file.
 
     Raises:
-        RecordingError: It is missing or malformed.
+        RecordingError: The file is missing or malformed.
     """
     try:
         text = read_plain_file(path, _MAX_BYTES).decode("utf-8-sig")
@@ -184,10 +183,10 @@ def read_log_columns(path: Path) -> tuple[dict[str, str], list[LogColumn]]:
 
 
 def _evaluate_expression(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """A number () or samples (N,)."""
+    """Value () or samples (N,) of an expression."""
     try:
         tree = ast.parse(expression, mode="eval")
-        with np.errstate(all="ignore"):  # what is not finite is refused with its name
+        with np.errstate(all="ignore"):  # non-finite values are reported with their name later
             value = np.asarray(_evaluate_node(tree.body, arrays), dtype=np.float64)
     except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError):
         raise RecordingError(

@@ -1,7 +1,7 @@
-"""Where a machine was, and how fast, by whichever of its joints were measured.
+"""Configurations and velocities of a machine from measured joints and inclinations.
 
-Coordinates of active joints are taken where they are measured. The others follow from other joints
-by closing the machine's loops, velocities by v_A = gamma_A v_B with q_B what was measured.
+Measured coordinates of active joints are used directly. The others are computed from other joints
+by closing the loops, velocities by v_A = gamma_A v_B with the measured joints q_B.
 """
 
 import re
@@ -13,30 +13,30 @@ import numpy as np
 from crane.closure import Closure
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
-from crane.description.sensors import VELOCITY_SUFFIX, VELOCITY_UNITS
+from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine import Machine
-from crane.recordings.ideal_sensors import ideal_readings
 from crane.recordings.missing_measurements import MissingMeasurementError
-from crane.recordings.pin_derivatives import pin_derivatives
-from crane.recordings.recording import time_derivative
+from crane.recordings.recording_columns import time_derivative
+from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
 from crane.recordings.timeseries import TIME, Table, table_column
 
-_MIN_INDEPENDENT_SHARE = 1e-6  # least share of a joint's motion that others do not tell
-_CONFIGURATION_TOLERANCE = 1e-6  # [rad], [machine's size]
-_COMPARED_SAMPLES, _DERIVATIVE_SAMPLES = (
-    2000,
-    200,
-)  # samples that are compared, and enough for slopes
-_BLOCK_SAMPLES = 1 << 16  # samples whose postures are held
-_SAMPLE_PATTERN = re.compile(r"\(sample (\d+)\)")  # of an error of the closure
-_LIMIT_TOLERANCE = 0.1  # of a range, by which sensors may be off
+_MIN_INDEPENDENT_SHARE = 1e-6  # least part of the motion of a joint that others do not determine
+_CONFIGURATION_TOLERANCE = 1e-6  # [rad], [characteristic length]
+# samples that are compared, and samples for derivatives
+_COMPARED_SAMPLES, _DERIVATIVE_SAMPLES = 2000, 200
+_BLOCK_SAMPLES = 1 << 16  # samples per block
+_SAMPLE_PATTERN = re.compile(r"\(sample (\d+)\)")  # in an error message of the closure
+_LIMIT_TOLERANCE = 0.1  # of a range, for errors of sensors
+_MAX_ITERATIONS, _STEP_TOLERANCE = 12, 1e-11  # Newton iterations, and the last step [rad]
+_MIN_DERIVATIVE = 0.1  # least derivative of an inclination by the joint of its link
+UnknownAngles = list[tuple[str, str]]  # joint, inclination
 
 
 def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
-    """Measured joints that determine all others: active ones, then such as tell something new.
+    """Measured joints that determine the configuration, active ones first.
 
     Raises:
-        MissingError: They do not determine all.
+        MissingMeasurementError: They do not determine it.
     """
     drives = independent_joints(machine, names)
     if len(drives) == len(machine.active):
@@ -49,20 +49,17 @@ def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...
     it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
     requested = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
     alternatives = f", or a joint that moves with {it} ({', '.join(others)})" if others else ""
-    text = (
-        f"nothing tells where {', '.join(map(repr, missing))} {are}, give "
-        f"{requested}{alternatives}"
-    )
+    text = f"{', '.join(map(repr, missing))} {are} not determined, give {requested}{alternatives}"
     raise MissingMeasurementError(text, missing)
 
 
 def independent_joints(
     machine: Machine, names: Sequence[str], first: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Joints that each tell something that those before do not: the first, active ones, others.
+    """Joints that are independent of each other: `first`, then active ones, then others.
 
-    A joint tells what its row of gamma = dq/dq_A at home has in the directions that the rows
-    before it leave open.
+    A joint is independent if its row of gamma = dq/dq_A at home is linearly independent of the
+    rows before it.
     """
     gamma = machine.closure.gamma(machine.home) * _stroke_ranges(machine)
     basis = np.zeros((0, len(machine.active)))
@@ -71,7 +68,7 @@ def independent_joints(
     for joint in (*first, *sorted(measured, key=lambda x: x not in machine.active)):
         row = gamma[machine.column(joint)]
         rest = row - basis.T @ (basis @ row)
-        rest -= basis.T @ (basis @ rest)  # once more for rounding
+        rest -= basis.T @ (basis @ rest)  # a second time, against rounding errors
         size = np.linalg.norm(rest)
         if size > _MIN_INDEPENDENT_SHARE * np.linalg.norm(row):
             basis = np.vstack([basis, rest / size])
@@ -80,22 +77,22 @@ def independent_joints(
 
 
 def _stroke_ranges(machine: Machine) -> Array:
-    """Ranges (n,) of the active coordinates, 1 where they are endless."""
+    """Ranges (n,) of the active coordinates, 1 where they are unlimited."""
     span = machine.upper - machine.lower
     return np.where(np.isfinite(span), span, 1.0)
 
 
 class MeasuredConfigurations:
-    """Where the joints that are used put a machine, at some samples.
+    """Configurations of a machine at some samples, by the determining joints of a table.
 
     Args:
-        machine: What was recorded.
-        table: Its quantities.
+        machine: The recorded machine.
+        table: Table of quantities.
 
     Attributes:
-        machine: Driven by them.
-        drives: Their names.
-        sample_slice: Which samples.
+        machine: The machine with the determining joints as active joints.
+        drives: Names of the determining joints.
+        sample_slice: The samples.
         time: (N,) [s].
     """
 
@@ -107,7 +104,7 @@ class MeasuredConfigurations:
 
     @cached_property
     def machine(self) -> Machine:
-        """Driven by what is used."""
+        """The machine with the determining joints as active joints."""
         same = set(self.drives) == set(self._recorded_machine.active)
         return (
             self._recorded_machine
@@ -117,7 +114,7 @@ class MeasuredConfigurations:
 
     @cached_property
     def q_b(self) -> Array:
-        """(N, n) as measured."""
+        """Measured coordinates (N, n) of the determining joints."""
         machine = self.machine
         columns = [
             table_column(self.table, x, machine.unit(x))[self.sample_slice] for x in machine.active
@@ -126,41 +123,41 @@ class MeasuredConfigurations:
 
     @cached_property
     def q(self) -> Array:
-        """(N, nv) closed."""
+        """Closed configurations (N, nv)."""
         return self.machine.closure.solve(self.q_b)
 
     def expected_reading(self, name: str, q: Array | None = None) -> Array:
-        """(N,) of a joint or an inclination in these postures, or in others."""
+        """Ideal readings (N,) of a joint or inclination at these configurations, or at others."""
         q = self.q if q is None else q
         return ideal_readings(self.machine, q, np.zeros_like(q), [name])[name]
 
     def directional_derivative(self, name: str, q: Array, dq: Array) -> Array:
-        """(N,) of the same along changes (N, nv) of postures."""
+        """Derivatives (N,) of ideal readings along changes (N, nv) of the configurations."""
         return ideal_readings(self.machine, q, dq, [name + VELOCITY_SUFFIX])[
             name + VELOCITY_SUFFIX
         ]
 
     @cached_property
     def derivative_slice(self) -> slice:
-        """Samples enough for slopes, which are smooth."""
+        """Samples for derivatives, which are smooth."""
         return slice(None, None, max(1, len(self.time) // _DERIVATIVE_SAMPLES))
 
     @cached_property
     def link_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Of links on those that carry them [m]."""
+        """Positions of links on the links that carry them [m]."""
         return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
 
     @cached_property
     def pin_derivatives(self) -> dict[str, Array]:
-        """Derivatives of a few postures by the places of pins, see `pin_derivatives`."""
+        """Derivatives of some configurations by positions of pins, see `pin_derivatives`."""
         return pin_derivatives(self.machine, self.q[self.derivative_slice])
 
 
 def joint_motion(machine: Machine, table: Table) -> tuple[Array, Array]:
-    """Active coordinates and velocities (N, n) of what a table tells of the machine's joints.
+    """Active coordinates and velocities (N, n) from the joints in a table.
 
     Raises:
-        RecordingError: It does not tell all of them, or what the machine cannot do.
+        RecordingError: The table does not determine them, or the machine cannot move so.
     """
     return motion_from_joints(machine, determining_joints(machine, list(table.units)), table)
 
@@ -168,7 +165,7 @@ def joint_motion(machine: Machine, table: Table) -> tuple[Array, Array]:
 def motion_from_joints(
     machine: Machine, drives: tuple[str, ...], table: Table
 ) -> tuple[Array, Array]:
-    """Active coordinates and velocities (N, n) from those of the joints that were measured."""
+    """Active coordinates and velocities (N, n) from those of the determining joints."""
     time = table_column(table, TIME)
     q_b = np.column_stack([table_column(table, x, machine.unit(x)) for x in drives])
     v_b = np.empty_like(q_b)
@@ -201,10 +198,9 @@ def motion_from_joints(
             raise RecordingError(f"{_renumber_samples(start, error)}; {hint}") from None
         if (distance > _CONFIGURATION_TOLERANCE).any():
             raise RecordingError(
-                f"sample {start + int(np.argmax(distance > _CONFIGURATION_TOLERANCE))} is "
-                f"beyond a dead centre, where "
-                f"{', '.join(machine.active)} do not tell the posture: {hint}, or cut the "
-                "recording"
+                f"sample {start + int(np.argmax(distance > _CONFIGURATION_TOLERANCE))} is beyond "
+                f"a dead centre, where {', '.join(machine.active)} do not determine the "
+                f"configuration: {hint}, or cut the recording"
             )
     low, high = q_a.min(axis=0), q_a.max(axis=0)
     slack = _LIMIT_TOLERANCE * _stroke_ranges(machine)
@@ -225,16 +221,16 @@ def motion_from_joints(
 def _active_joint_motion(
     machine: Machine, closure: Closure, q_b: Array, v_b: Array
 ) -> tuple[Array, Array, Array]:
-    """q_A and v_A = gamma_A v_B, and how far from the posture q_A leads (N,).
+    """q_A, v_A = gamma_A v_B, and distances (N,) to the configurations that q_A gives.
 
     Args:
-        machine: Driven by q_A.
-        closure: Of the same machine driven by q_B.
+        machine: The machine with the active joints q_A.
+        closure: Closure of the machine with the active joints q_B.
         q_b: (N, n).
         v_b: (N, n).
 
     Raises:
-        ClosureError: No posture has these coordinates.
+        ClosureError: No configuration has these coordinates.
     """
     q = closure.solve(q_b)
     gamma = closure.gamma(q)[:, machine.closure.active]
@@ -244,12 +240,126 @@ def _active_joint_motion(
 
 
 def _renumber_samples(start: int, error: ClosureError) -> str:
-    """What an error says of a block of samples, its samples counted from the first of all."""
+    """Message of an error about a block, with sample numbers of the whole recording."""
     return _SAMPLE_PATTERN.sub(lambda found: f"(sample {start + int(found[1])})", str(error))
 
 
 def recorded_velocity(machine: Machine, joint: str, table: Table) -> Array | None:
-    """A joint's velocity (N,) where it is recorded."""
+    """Recorded velocity (N,) of a joint, None if it is not recorded."""
     if joint + VELOCITY_SUFFIX not in table.units:
         return None
     return table_column(table, joint + VELOCITY_SUFFIX, VELOCITY_UNITS[machine.unit(joint)])
+
+
+def add_inclination_angles(machine: Machine, table: Table) -> Table:
+    """Add joint angles that inclinations determine to a table.
+
+    Newton's method solves h(q(q_B)) = y with the inclinations h and the joints q_B, measured and
+    unknown ones.
+
+    Args:
+        machine: The machine.
+        table: Table of quantities.
+
+    Returns:
+        The extended table; the table itself if joints determine the configuration, or inclinations
+        do not.
+
+    Raises:
+        RecordingError: No closed configuration has these inclinations.
+    """
+    names = list(table.units)
+    try:
+        determining_joints(machine, names)
+        return table
+    except MissingMeasurementError:
+        pass
+    drives, unknown_angles = _find_unknown_angles(machine, table)
+    if len(drives) < len(machine.active):
+        return table  # the caller reports what is missing
+    try:
+        angles = _solve_angles(machine.with_active_joints(drives), table, unknown_angles)
+    except (ClosureError, MechanismError) as error:
+        listed = ", ".join(name for _, name in unknown_angles)
+        hint = f"see that zero and sign of {listed} are the machine's"
+        raise RecordingError(f"{error}; {hint}") from None
+    units = table.units | {joint: "rad" for joint, _ in unknown_angles}
+    return Table(units, np.column_stack([table.values, angles]), table.notes)
+
+
+def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...], UnknownAngles]:
+    """Independent joints of the machine, and those of them to be computed from inclinations.
+
+    An inclination determines the nearest joint below its link that it depends on and that is not
+    measured.
+    """
+    drives = independent_joints(machine, list(table.units))
+    unknown_angles: UnknownAngles = []
+    for name, unit in table.units.items():
+        if not name.startswith(INCLINATION_PREFIX) or unit != "rad":
+            continue
+        for joint in _inclining_joints(machine, name):
+            extended = independent_joints(machine, [joint], first=drives)
+            if len(extended) > len(drives):
+                drives, unknown_angles = extended, [*unknown_angles, (joint, name)]
+                break
+    return drives, unknown_angles
+
+
+def _inclining_joints(machine: Machine, name: str) -> list[str]:
+    """Joints from a link to the ground that change its inclination at home."""
+    parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
+    link, home, rate, found = (
+        name.removeprefix(INCLINATION_PREFIX),
+        machine.home[None],
+        name + VELOCITY_SUFFIX,
+        [],
+    )
+    while link in parent_joints:
+        joint = parent_joints[link]
+        if joint.name in machine.joints:
+            direction = np.zeros_like(home)
+            direction[0, machine.column(joint.name)] = 1.0
+            if (
+                abs(float(ideal_readings(machine, home, direction, [rate])[rate][0]))
+                > _MIN_DERIVATIVE
+            ):
+                found.append(joint.name)
+        link = joint.parent
+    return found
+
+
+def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) -> Array:
+    """Angles (N, k) of the unknown joints of a machine with unknown and measured active joints.
+
+    Raises:
+        ClosureError: No configuration has these inclinations.
+    """
+    count, joints = len(table.values), [joint for joint, _ in unknown_angles]
+    indices = [driven.active.index(joint) for joint in joints]
+    names = [name for _, name in unknown_angles]
+    q_b = np.tile(driven.home[driven.closure.active], (count, 1))
+    for i, joint in enumerate(driven.active):
+        if joint not in joints:
+            q_b[:, i] = table_column(table, joint, driven.unit(joint))
+    measured = np.column_stack([table_column(table, name) for name in names])
+    for _ in range(_MAX_ITERATIONS):
+        q = driven.closure.solve(q_b)
+        computed = ideal_readings(driven, q, np.zeros_like(q), names)
+        residual = measured - np.column_stack([computed[name] for name in names])
+        step = np.linalg.solve(
+            _inclination_jacobian(driven, q, names, indices), residual[:, :, None]
+        )[:, :, 0]
+        q_b[:, indices] += step
+        if np.abs(step).max() < _STEP_TOLERANCE:
+            return q_b[:, indices]
+    raise ClosureError(f"no configuration has the inclinations of {', '.join(names)}")
+
+
+def _inclination_jacobian(
+    driven: Machine, q: Array, names: list[str], indices: list[int]
+) -> Array:
+    """Derivatives (N, k, k) of inclinations by some of the active coordinates."""
+    gamma, rates = driven.closure.gamma(q), [name + VELOCITY_SUFFIX for name in names]
+    columns = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
+    return np.stack([np.column_stack([x[rate] for rate in rates]) for x in columns], axis=2)

@@ -1,14 +1,14 @@
-"""Recordings of real cranes: angles instead of strokes, pressures instead of forces.
+"""Recordings of real machines, completed from angles and pressures.
 
-A file as in crane.recordings.timeseries, of which crane.recordings.recording wants the columns X
-and X_force for every active joint X. Where they are missing, they are computed:
+A recording (crane.recordings.recording) has the columns X and X_force for every active joint X.
+Missing ones are computed:
 
-- X from the coordinates of other joints, by closing the machine's loops;
-- X_velocity from those joints' velocities, v_A = gamma_A v_B with q_B the measured coordinates;
-- X_force from pressure_X_a and pressure_X_b, which count from a vacuum, by equation (20) of the
+- X from the coordinates of other joints, by closing the loops;
+- X_velocity from the velocities of these joints, v_A = gamma_A v_B with the measured joints q_B;
+- X_force from the absolute pressures pressure_X_a and pressure_X_b by equation (20) of the
   electro-hydraulic forwarder paper, F = area_a p_a - area_b p_b.
 
-What is there is taken as it is. Everything else is a channel.
+Recorded columns are not changed. All other columns are channels.
 """
 
 import re
@@ -17,14 +17,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from crane.common.errors import CraneWarning, RecordingError, prefix_location
 from crane.common.samples import Array
-from crane.description.sensors import PRESSURE_PREFIX
+from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
 from crane.machine import Machine
-from crane.recordings.inclination_angles import add_inclination_angles
-from crane.recordings.measured_configurations import determining_joints, motion_from_joints
-from crane.recordings.missing_measurements import MissingMeasurementError, MissingMeasurements
+from crane.recordings.measured_configurations import (
+    add_inclination_angles,
+    determining_joints,
+    motion_from_joints,
+)
+from crane.recordings.missing_measurements import (
+    HELD_JOINT_TOLERANCE,
+    MissingMeasurementError,
+    MissingMeasurements,
+    tolerance,
+)
 from crane.recordings.recording import (
     FORCE_SUFFIX,
     FORCE_UNITS,
@@ -34,9 +43,8 @@ from crane.recordings.recording import (
     VELOCITY_SUFFIX,
     VELOCITY_UNITS,
     Recording,
-    check_finite,
-    free_force_message,
 )
+from crane.recordings.recording_columns import check_finite, free_force_message
 from crane.recordings.recording_reader import (
     FULL_TIME_SPAN,
     TimeSpan,
@@ -44,12 +52,12 @@ from crane.recordings.recording_reader import (
     read_quantities,
 )
 from crane.recordings.sensor_discrepancy import noise_std, warn_discrepancies
-from crane.recordings.sensor_tolerances import HELD_JOINT_TOLERANCE, tolerance
-from crane.recordings.stroke_check import check_strokes
 from crane.recordings.timeseries import TIME, Table, table_column
 
 _CHAMBER_PATTERN = re.compile("pressure_.+_[ab]")
-_NOISE_FACTOR = 6.0  # standard deviations, beyond all of a million samples
+_NOISE_FACTOR = 6.0  # standard deviations, more than the extreme of a million samples
+_STROKE_TOLERANCE = 0.02  # of a stroke, for errors of sensors
+_MAX_AXIS_DEVIATION = 0.01  # distance of the pins from the axis, per length of a cylinder
 
 
 def read_measured(
@@ -58,22 +66,22 @@ def read_measured(
     columns: str | Path | None = None,
     span: TimeSpan = FULL_TIME_SPAN,
 ) -> Recording:
-    """Read what was recorded of a machine: a full recording, or one that can be completed.
+    """Read a recording of a machine, and complete it from other measurements.
 
     Args:
-        machine: What was recorded; joints that were held are locked in it, see `load`.
+        machine: The recorded machine, with joints locked that were held, see `load`.
         path: A CSV or npz file.
-        columns: Which columns of a log are which, if not as the machine's sensors say, see
-            `crane.recordings.logs`.
-        span: From when to when [s], by the file's own clock.
+        columns: Column file of a log, see `crane.recordings.logs`; default by the sensors of the
+            machine.
+        span: Start and end [s] by the clock of the file.
 
     Returns:
-        All active joints, then other joints whose coordinate and force are recorded. A full
-        recording keeps the order of its file.
+        Recording of all active joints, then of other joints with recorded coordinate and force.
+        The joints of a complete recording are in the order of the file.
 
     Raises:
-        RecordingError: The file is malformed, does not tell all coordinates and forces, or tells
-            what the machine cannot do.
+        RecordingError: The file is malformed, does not determine all coordinates and forces, or
+            the machine cannot move so.
     """
     return complete_recording(machine, read_quantities(path, machine, columns, span), path)
 
@@ -84,20 +92,20 @@ def complete_recording(
     path: str | Path,
     required_columns: Sequence[Sequence[str]] = (),
 ) -> Recording:
-    """The same of a table of quantities that was read from a path.
+    """Complete a recording from a table of quantities.
 
     Args:
-        machine: What was recorded.
-        table: Its quantities.
-        path: For errors.
-        required_columns: Columns that have to be there besides, of each any one.
+        machine: The recorded machine.
+        table: Table of quantities.
+        path: File, for messages.
+        required_columns: Further required columns, as alternatives each.
 
     Raises:
         RecordingError: As for `read_measured`.
     """
     try:
         table = _remove_free_forces(machine, table)
-        # before anything is computed from them, to name the column as it is in the file
+        # before computations, so that the message names a column of the file
         check_finite(dict(zip(table.units, table.values.T, strict=True)))
         check_strokes(machine, table)
         complete_table = add_inclination_angles(machine, table)
@@ -110,7 +118,7 @@ def complete_recording(
         if not is_complete:
             complete_table = _complete_table(machine, complete_table, missing)
         missing.raise_collected()
-        warn_discrepancies(machine, table)  # of what was measured alone
+        warn_discrepancies(machine, table)  # of measured columns only
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
     notes = complete_table.notes | (
@@ -120,10 +128,10 @@ def complete_recording(
 
 
 def _remove_free_forces(machine: Machine, table: Table) -> Table:
-    """The table without the forces of free joints, which it names as such.
+    """Remove the zero forces of free joints from a table, and note these joints.
 
     Raises:
-        RecordingError: One is not zero.
+        RecordingError: A force is not zero.
     """
     notes = {key: text for key, text in table.notes.items() if key != FREE_JOINTS_NOTE}
     if machine.free:
@@ -140,14 +148,14 @@ def _remove_free_forces(machine: Machine, table: Table) -> Table:
 
 
 def is_measured(table: Table) -> bool:
-    """Whether a table has pressures without the force that they make, or no force at all."""
+    """Whether a table has pressures without the corresponding force, or no forces."""
     forces = {x.removesuffix(FORCE_SUFFIX) for x in table.units if x.endswith(FORCE_SUFFIX)}
     chambers = {x[len(PRESSURE_PREFIX) : -2] for x in table.units if _CHAMBER_PATTERN.fullmatch(x)}
     return not forces or not chambers <= forces
 
 
 def _complete_table(machine: Machine, table: Table, missing: MissingMeasurements) -> Table:
-    """The table with coordinates, velocities and forces of all active joints."""
+    """Complete a table with coordinates, velocities and forces of all active joints."""
     check_pressures(machine, table)
     forces: list[Array] = []
     drives: tuple[str, ...] = ()
@@ -175,9 +183,9 @@ def _complete_table(machine: Machine, table: Table, missing: MissingMeasurements
 
 
 def check_pressures(machine: Machine, table: Table) -> None:
-    """See that pressures are in units of pressure, per chamber, and count from a vacuum.
+    """Check that pressures are given per chamber, in units of pressure, as absolute pressures.
 
-    A chamber that is sucked empty reads a little less with noise; a warning says so.
+    Values slightly below zero by noise cause a warning.
     """
     for name in table.units:
         joint = name.removeprefix(PRESSURE_PREFIX)
@@ -199,8 +207,7 @@ def check_pressures(machine: Machine, table: Table) -> None:
             )
         warnings.warn(
             f"'{name}' is below a vacuum in {is_negative.sum()} of {len(is_negative)} samples, "
-            f"by up to "
-            f"{-lowest:.3g} Pa, taken as noise; to gauge pressures add 1e5 Pa",
+            f"by up to {-lowest:.3g} Pa, taken as noise; to gauge pressures add 1e5 Pa",
             CraneWarning,
             stacklevel=2,
         )
@@ -209,11 +216,11 @@ def check_pressures(machine: Machine, table: Table) -> None:
 def locked_joint_conflicts(
     machine: Machine, columns: Mapping[str, Array], units: Mapping[str, str]
 ) -> list[str]:
-    """What recorded columns (N,) say against locked joints, a text for each.
+    """Messages about recorded columns (N,) that contradict locked joints.
 
-    The middle 99 % of the samples have to lie within a fiftieth of a radian or two millimetres (of
-    a machine smaller than a metre, as many thousandths of its size) of where the joint is locked,
-    but for eight standard deviations of their noise.
+    The middle 99 % of the samples must be within 0.02 rad or 2 mm (2e-3 of the characteristic
+    length for machines below 1 m), plus eight standard deviations of noise, of the locked
+    coordinate.
     """
     messages = []
     for joint, locked_position in machine.locked_joints.items():
@@ -235,7 +242,7 @@ def locked_joint_conflicts(
 
 
 def _joint_force(machine: Machine, joint: str, table: Table) -> Array:
-    """A joint's force (N,): as recorded, or by equation (20)."""
+    """Force (N,) of a joint: recorded, or by equation (20)."""
     unit = FORCE_UNITS[machine.unit(joint)]
     if joint + FORCE_SUFFIX in table.units:
         return table_column(table, joint + FORCE_SUFFIX, unit)
@@ -261,3 +268,73 @@ def _joint_force(machine: Machine, joint: str, table: Table) -> Array:
     return cylinder.area_a * table_column(table, a, "Pa") - cylinder.area_b * table_column(
         table, b, "Pa"
     )
+
+
+def check_strokes(machine: Machine, table: Table) -> None:
+    """Reject pin-to-pin lengths of cylinders that are given as strokes.
+
+    Raises:
+        RecordingError: There are some; the message gives the dead lengths.
+    """
+    known = known_sensors(table, machine)
+    messages = []
+    for joint, lower, upper in zip(machine.active, machine.lower, machine.upper, strict=True):
+        if table.units.get(joint) != "m" or not np.isfinite([lower, upper]).all():
+            continue
+        low, high = np.quantile(table_column(table, joint), [0.005, 0.995])
+        slack = _STROKE_TOLERANCE * (upper - lower)
+        if low >= lower - slack and high <= upper + slack:
+            continue
+        pin_offset = dead_length(machine, joint)
+        if (
+            pin_offset is not None
+            and low - pin_offset >= lower - slack
+            and high - pin_offset <= upper + slack
+        ):
+            was = known.get(joint, Sensor())
+            messages.append(
+                f"'{joint}' goes from {low:.4g} to {high:.4g} m, its stroke from {lower:.4g} to "
+                f"{upper:.4g} m: from pin to pin it is {pin_offset:.4g} m longer, subtract that "
+                f"({SENSOR_PREFIX}{joint}.zero = {was.zero + was.scale * pin_offset:.6g})"
+            )
+    if messages:
+        raise RecordingError("; ".join(messages))
+
+
+def dead_length(machine: Machine, joint: str) -> float | None:
+    """Dead length of a cylinder: pin-to-pin length minus stroke [m]; None for other slides.
+
+    A pin of a body is a revolute joint on either side of it, or the end of a loop; the two pins
+    whose connecting line is closest to the axis of the slide are used.
+    """
+    slide = machine.tree.joints[joint]
+    model = machine.model
+    data = model.createData()
+    place = machine.coordinates.configuration(machine.home)
+    pin.framesForwardKinematics(model, data, place)
+    axis = data.oMf[machine.frame(slide.child)].rotation @ np.array(slide.axis)
+    bodies = machine.tree.bodies_by_link()
+    smallest_deviation, length = _MAX_AXIS_DEVIATION, None
+    for one in _pin_positions(machine, data, bodies[slide.parent], joint):
+        for two in _pin_positions(machine, data, bodies[slide.child], joint):
+            along = float(axis @ (two - one))
+            axis_distance = float(np.linalg.norm(two - one - along * axis))
+            if axis_distance < smallest_deviation * along:
+                smallest_deviation, length = axis_distance / along, along
+    return None if length is None else length - float(machine.home[machine.column(joint)])
+
+
+def _pin_positions(machine: Machine, data: pin.Data, body: str, slide: str) -> list[Array]:
+    """Positions (3,) of the pins of a body, without its slide."""
+    tree, bodies = machine.tree, machine.tree.bodies_by_link()
+    frames = [
+        joint.child
+        for joint in tree.moving_joints
+        if joint.name != slide
+        and joint.kind == "revolute"
+        and body in (joint.child, bodies[joint.parent])
+    ]
+    loops = machine.closure.equations.loops
+    ends = [end for loop in loops for end in (loop.predecessor, loop.successor)]
+    frames += [end for end in ends if bodies[end] == body]
+    return [data.oMf[machine.frame(frame)].translation.copy() for frame in frames]

@@ -1,22 +1,24 @@
-"""What a recording does not tell, said in one line with what to do about it."""
+"""Missing measurements, collected into one error, and tolerances of sensors."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 
 from crane.common.errors import RecordingError
 from crane.machine import Machine
-from crane.recordings.sensor_tolerances import HELD_JOINT_TOLERANCE, tolerance
 from crane.recordings.timeseries import Table, table_column
+
+AGREEMENT_TOLERANCE = {"rad": 5e-3, "m": 5e-4}  # between sensors of one quantity
+HELD_JOINT_TOLERANCE = {"rad": 0.02, "m": 2e-3}  # of a joint that is held
 
 
 class MissingMeasurementError(RecordingError):
-    """Nothing tells where joints are, or what drives them.
+    """Coordinates or forces of joints are not determined by a recording.
 
     Args:
-        message: What to give.
-        joints: That may have been held instead.
+        message: Message with the required columns.
+        joints: Joints that may have been held.
     """
 
     def __init__(self, message: str, joints: Iterable[str]):
@@ -25,10 +27,10 @@ class MissingMeasurementError(RecordingError):
 
 
 def check_columns_present(required: Iterable[Sequence[str]], present: Collection[str]) -> None:
-    """See that of each of these columns any one is there.
+    """Check that one of each group of alternative columns is present.
 
     Raises:
-        RecordingError: The message has all that are not.
+        RecordingError: Groups are missing; the message lists them.
     """
     absent = [" or ".join(map(repr, names)) for names in required if not set(names) & set(present)]
     if absent:
@@ -36,11 +38,11 @@ def check_columns_present(required: Iterable[Sequence[str]], present: Collection
 
 
 class MissingMeasurements:
-    """Collects what is missing, and refuses it at once.
+    """Collector of errors about missing measurements, raised as one error.
 
     Args:
-        machine: What was recorded.
-        table: What there is.
+        machine: The recorded machine.
+        table: Table of quantities.
     """
 
     def __init__(self, machine: Machine, table: Table):
@@ -49,22 +51,22 @@ class MissingMeasurements:
 
     @contextmanager
     def collect_errors(self) -> Iterator[None]:
-        """What goes wrong within is told later."""
+        """Collect a recording error of the block, to be raised later."""
         try:
             yield
         except RecordingError as error:
             self._errors.append(error)
 
     def collect_missing_columns(self, required: Iterable[Sequence[str]]) -> None:
-        """Note which columns are not there, of each of these any one."""
+        """Collect missing groups of alternative columns."""
         with self.collect_errors():
             check_columns_present(required, self._table.units)
 
     def raise_collected(self) -> None:
-        """Tell all that was noted.
+        """Raise all collected errors as one.
 
         Raises:
-            RecordingError: Something was.
+            RecordingError: There are collected errors.
         """
         if not self._errors:
             return
@@ -81,7 +83,7 @@ class MissingMeasurements:
         raise RecordingError(message)
 
     def _held_position(self, joint: str) -> str:
-        """Where a joint may have been held: as recorded, or at home; "" of one that moved."""
+        """Text of the coordinate at which a joint may have been held; "" if it moved."""
         machine, unit = self._machine, self._machine.unit(joint)
         if self._table.units.get(joint) != unit:
             return f"{machine.home[machine.column(joint)]:.4g} (home)"
@@ -91,3 +93,10 @@ class MissingMeasurements:
             if high - low <= 2 * tolerance(HELD_JOINT_TOLERANCE, machine, unit)
             else ""
         )
+
+
+def tolerance(tolerances: Mapping[str, float], machine: Machine, unit: str) -> float:
+    """Tolerance in a unit, scaled by the characteristic length for machines below 1 m."""
+    return tolerances[unit] * (
+        min(machine.closure.characteristic_length, 1.0) if unit == "m" else 1.0
+    )

@@ -1,7 +1,8 @@
-"""Columns of an npz file, written one after the other, and read with bounds.
+"""Columns in npz files, written sequentially and read with bounds.
 
-An npz is a zip of arrays, each with a header that declares its type and shape. numpy believes the
-headers; here sizes are compared with what is there, and nothing that could run is loaded.
+An npz file is a zip archive of arrays, each with a header that declares type and shape. numpy
+trusts the headers; here declared sizes are compared with the actual ones, and no objects are
+unpickled.
 """
 
 import lzma
@@ -22,7 +23,7 @@ MAX_NUMBERS = 1 << 29  # numbers in a file: 4 GiB, in scratch files
 MAX_COLUMNS = 4096
 NUMERIC_KINDS = "biuf"  # kinds of numpy's types
 _BLOCK_NUMBERS = 1 << 20  # numbers
-_MAX_COMMENT_BYTES = 65535  # bytes that a zip has for it
+_MAX_COMMENT_BYTES = 65535  # largest comment of a zip archive
 T = TypeVar("T")
 _DAMAGE_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError,
@@ -32,7 +33,7 @@ _DAMAGE_ERRORS = (
 def write_columns(
     path: Path, names: Sequence[str], columns: Sequence[Array], comment: str
 ) -> None:
-    """Write columns (N,) by name, and a comment on all of them.
+    """Write columns (N,) by name, and a comment.
 
     Raises:
         OSError: The file cannot be written.
@@ -51,23 +52,23 @@ def write_columns(
 
 
 def read_columns(path: Path) -> tuple[list[str], Array, str]:
-    """Names and values (N, columns) of the columns, in the order of the file, and its comment.
+    """Read names and values (N, columns) in the order of the file, and the comment.
 
     Raises:
         OSError: The file cannot be opened.
-        RecordingError: It is no npz file, is damaged or encrypted, or holds other than columns of
-            equal length, or too many numbers. The message does not name the file.
+        RecordingError: The file is no npz file, is damaged or encrypted, or holds other than
+            columns of equal length, or too many numbers. The message does not name the file.
     """
     return _read_archive(path, _archive_columns)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of any shape by name; of those that hold no numbers nothing but their type.
+    """Read arrays of any shape by name; non-numeric arrays are returned empty, with their type.
 
     Raises:
         OSError: The file cannot be opened.
-        RecordingError: It is no npz file, is damaged or encrypted, or holds too many numbers. The
-            message does not name the file.
+        RecordingError: The file is no npz file, is damaged or encrypted, or holds too many
+            numbers. The message does not name the file.
     """
     return _read_archive(path, _archive_arrays)
 
@@ -144,7 +145,7 @@ def _archive_arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
 def _check_sizes(
     archive: zipfile.ZipFile, types: Mapping[str, tuple[tuple[int, ...], np.dtype]]
 ) -> None:
-    """Compare what the headers declare with what is there."""
+    """Compare the sizes in the headers with the actual ones."""
     for entry in archive.infolist():
         shape, dtype = types.get(_entry_name(entry), ((0,), np.dtype(float)))
         if entry.file_size < math.prod(shape) * dtype.itemsize:
@@ -157,7 +158,7 @@ def _read_array(
     types: Mapping[str, tuple[tuple[int, ...], np.dtype]],
     values: Array,
 ) -> bool:
-    """Read an array's numbers one after the other; whether its columns stand together."""
+    """Read the numbers of an array; returns whether it is in Fortran order."""
     with archive.open(entry) as file:
         np.lib.format.read_magic(file)
         _, fortran, _ = np.lib.format.read_array_header_1_0(file)
@@ -170,14 +171,14 @@ def _entry_name(entry: zipfile.ZipInfo) -> str:
 
 
 def _read_header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type of an array, of which the data are left to be read."""
+    """Shape and type of an array from its header; the data follow in the file."""
     try:
-        if np.lib.format.read_magic(file) != (1, 0):  # others are of long headers
+        if np.lib.format.read_magic(file) != (1, 0):  # other versions have long headers
             raise ValueError("not of numbers alone")
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
     except (*_DAMAGE_ERRORS, OSError):
         raise
-    except Exception as error:  # whatever becomes of a text that is evaluated as Python's literals
+    except Exception as error:  # any error from evaluating a literal
         raise ValueError(type(error).__name__) from None
     if any(length < 0 for length in shape):
         raise RecordingError(f"'{name}' has the shape {shape}, save the file again")
@@ -191,7 +192,7 @@ def _read_column(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> 
         data = file.read(len(part) * dtype.itemsize)
         if len(data) != len(part) * dtype.itemsize:
             raise RecordingError(f"'{name}' is cut short, save the file again")
-        with np.errstate(over="ignore", invalid="ignore"):  # told by those who look at values
+        with np.errstate(over="ignore", invalid="ignore"):  # reported when values are checked
             part[:] = np.frombuffer(data, dtype)
     if file.read(1):
         raise RecordingError(f"'{name}' holds more than it declares, save the file again")

@@ -1,6 +1,6 @@
-"""What a machine did: time series of its active joints, and whatever else was recorded.
+"""Recordings: time series of the active joints of a machine and of further channels.
 
-As a file it is a CSV of SI units (see crane.recordings.timeseries):
+A recording is written as a CSV file in SI units (see crane.recordings.timeseries):
 
     # crane recording
     # machine: mini_forwarder
@@ -8,27 +8,23 @@ As a file it is a CSV of SI units (see crane.recordings.timeseries):
     # controller: PI
     time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
 
-A column X is an active joint if X_force exists, or if the line `# free: X, Y` names it: nothing
-drives such a joint, its force is zero and has no column. X_velocity may be missing and is the
-derivative of X then. X_velocity and X_force without X is an error. Every other column is a
-channel, such as the angle q2 of a joint that is not active, with q2_velocity beside it or without.
-The order of the columns is any, the joints come in the order of their displacements. The comment
-lines may be left out where no joint is free; `machine name` is there where the machine calls
-itself something else than its file, `stopped` where a run ended before its time. Other units are
-converted where crane.recordings.timeseries knows them. An npz file serves, too: one array per
-column, named like those of the CSV, and the comment lines as the comment of the archive. What a
-crane's sensors tell instead of displacements and forces, crane.recordings.measured_recordings
-turns into them.
+A column X is an active joint if X_force exists, or if the line `# free: X, Y` names it: a free
+joint has no drive, its force is zero and has no column. If X_velocity is missing, it is the
+derivative of X. X_velocity and X_force without X are an error. Every other column is a channel,
+such as the angle q2 of a passive joint, with or without q2_velocity. Columns may be in any order;
+the joints have the order of their coordinates. The comment lines are optional if no joint is free;
+`machine name` is written if the machine's name is not that of its file, `stopped` if a run ended
+early. Other units are converted by crane.recordings.table_reader. An npz file has one array per
+column, with the headings of the CSV as names, and the comment lines as the comment of the archive.
+crane.recordings.measured_recordings completes recordings of other sensors.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from crane.common import scratch_arrays
 from crane.common.errors import InputError, RecordingError, prefix_location, suggest_names
@@ -40,45 +36,54 @@ from crane.description.sensors import FORCE_SUFFIX as FORCE_SUFFIX
 from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
 from crane.description.sensors import VELOCITY_SUFFIX as VELOCITY_SUFFIX
 from crane.description.sensors import VELOCITY_UNITS as VELOCITY_UNITS
-from crane.recordings import timeseries
+from crane.recordings import table_reader, timeseries
+from crane.recordings.recording_columns import (
+    check_finite,
+    checked_array,
+    free_force_message,
+    matching_units,
+    quoted_list,
+    require_active_joints,
+    time_derivative,
+)
 from crane.recordings.timeseries import TIME, Table, check_unit
 
-REFERENCE_PREFIX = "reference_"  # before the name of what a channel is the reference of
-SENSORS_NOTE, IDEAL_SENSORS = "sensors", "ideal"  # a note of quantities themselves
-FREE_JOINTS_NOTE = "free"  # a note of joints that nothing drives
-MACHINE_NAME_NOTE = "machine name"  # a note where the machine's own is not that of its file
-START = "start"  # a note of a run that starts elsewhere than its machine's file says
-STOPPED = "stopped"  # a note of a run that ended before its time
+# before the name of the quantity that a channel is the reference of
+REFERENCE_PREFIX = "reference_"
+SENSORS_NOTE, IDEAL_SENSORS = "sensors", "ideal"  # note of ideal quantities
+FREE_JOINTS_NOTE = "free"  # note of free joints
+MACHINE_NAME_NOTE = "machine name"  # note of a name that is not that of the file
+START = "start"  # note of a run that does not start at home
+STOPPED = "stopped"  # note of a run that ended early
 _ACCELERATION_SUFFIX = "_acceleration"
-_MAX_LISTED = 40  # names in a message
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(Result):
-    """Samples of N instants of a machine with n active joints.
+    """Samples of a machine with n active joints at N instants.
 
-    The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time
-    strictly increasing. Treat them as constants. With `copy=False`, for arrays that nobody else
-    will change, those that are contiguous float64 already are kept.
+    The arrays are copied to contiguous float64 and checked: shapes, finite numbers, strictly
+    increasing time. Treat them as constants. With `copy=False` contiguous float64 arrays are not
+    copied; the caller must not change them.
 
     Attributes:
         time: Instants (N,) [s], N >= 1.
         joints: Names of the active joints, in the order of the columns below.
-        q: Active coordinates (N, n) [rad or m].
-        v: Their velocities (N, n) [rad/s or m/s].
-        tau: Their generalized forces (N, n) [N m or N].
+        q: Active coordinates (N, n) [rad], [m].
+        v: Velocities (N, n) [rad/s], [m/s].
+        tau: Generalized forces (N, n) [N m], [N].
         units: Unit of each joint's coordinate, "rad" or "m".
         channels: Further columns (N,) by name.
-        channel_units: Their units; "" where none is given.
-        machine: Name of the bundled machine or path of the machine file, "" if not known.
-        task: What it was doing, "" if not known.
-        controller: What drove it, "" if not known.
-        ideal: Whether the columns are the quantities themselves, simulated or corrected by what
-            is known of the sensors, which a file says in its note `sensors`.
-        free: Those of the joints that nothing drives, whose forces are zero.
-        machine_name: What the machine calls itself, "" if not known.
-        stopped: When and why it ended before its time, "at t = 1.2 s: ..."; "" if it did not.
-        start: How it starts where that is not what the machine's file says, "" if it is.
+        channel_units: Units of the channels; "" if none is given.
+        machine: Name of the bundled machine or path of the machine file, "" if unknown.
+        task: Name of the task, "" if unknown.
+        controller: Name of the controller, "" if unknown.
+        ideal: Whether the columns are ideal quantities, simulated or with corrected sensor errors
+            (note `sensors` of a file).
+        free: Names of the free joints, whose forces are zero.
+        machine_name: Name of the machine, "" if unknown.
+        stopped: Time and reason of an early end, "at t = 1.2 s: ..."; "" if there is none.
+        start: Description of a start other than that of the machine file, else "".
     """
 
     time: Array
@@ -110,7 +115,7 @@ class Recording(Result):
                 )
         if set(self.units) != set(joints):
             raise RecordingError(
-                f"units are for {_quoted_list(self.units)}, give {_quoted_list(joints)}"
+                f"units are for {quoted_list(self.units)}, give {quoted_list(joints)}"
             )
         for name in self.free:
             if name not in joints:
@@ -121,12 +126,12 @@ class Recording(Result):
             "joints": joints,
             "free": tuple(x for x in joints if x in self.free),
             "units": {x: self.units[x] for x in joints},
-            "time": _checked_array(TIME, self.time, (count,), copy),
-            "q": _checked_array("q", self.q, shape, copy, joints),
-            "v": _checked_array("v", self.v, shape, copy, joints),
-            "tau": _checked_array("tau", self.tau, shape, copy, joints),
+            "time": checked_array(TIME, self.time, (count,), copy),
+            "q": checked_array("q", self.q, shape, copy, joints),
+            "v": checked_array("v", self.v, shape, copy, joints),
+            "tau": checked_array("tau", self.tau, shape, copy, joints),
             "channels": {
-                name: _checked_array(f"channel '{name}'", values, (count,), copy)
+                name: checked_array(f"channel '{name}'", values, (count,), copy)
                 for name, values in self.channels.items()
             },
             "channel_units": {name: self.channel_units.get(name, "") for name in self.channels},
@@ -141,9 +146,9 @@ class Recording(Result):
         for name, count in Counter(names).items():
             if count > 1:
                 raise RecordingError(f"column '{name}' is there twice, rename or remove one")
-        if _require_active_joints(names, self.free) != self.joints:
+        if require_active_joints(names, self.free) != self.joints:
             raise RecordingError(
-                f"channels {_quoted_list(self.channels)} hold an active joint, "
+                f"channels {quoted_list(self.channels)} hold an active joint, "
                 f"rename those that end in {VELOCITY_SUFFIX} and {FORCE_SUFFIX}"
             )
         units = self._column_units()
@@ -174,7 +179,7 @@ class Recording(Result):
             )
 
     def _one_line(self) -> str:
-        """What it is of, how long, how many samples, and its columns."""
+        """Machine, duration, number of samples, and columns."""
         what = ": ".join(word for word in (self.machine, self.task) if word)
         joints = ", ".join(f"{joint} [{self.units[joint]}]" for joint in self.joints)
         return (
@@ -185,7 +190,7 @@ class Recording(Result):
         )
 
     def _column_names(self) -> list[str]:
-        """Names of all columns, in the order in which they are written."""
+        """Names of all columns in the order of a file."""
         joints = [x + suffix for suffix in ("", VELOCITY_SUFFIX) for x in self.joints]
         return [TIME, *joints, *(x + FORCE_SUFFIX for x in self._driven_joints), *self.channels]
 
@@ -194,7 +199,7 @@ class Recording(Result):
         return [x for x in self.joints if x not in self.free]
 
     def _column_units(self) -> dict[str, str]:
-        """Units of all columns.
+        """Units of all columns by name.
 
         Raises:
             RecordingError: A joint has a unit other than rad or m.
@@ -210,10 +215,10 @@ class Recording(Result):
         )
 
     def __getitem__(self, name: str) -> Array:
-        """A column (N,) by its name, as it is written: "X1", "X1_velocity", "tip_z".
+        """Column (N,) by its name in a file, such as "X1", "X1_velocity" or "tip_z".
 
         Raises:
-            InputError: There is none of this name.
+            InputError: There is no column of this name.
         """
         columns = self.columns()
         if not isinstance(name, str):
@@ -228,11 +233,11 @@ class Recording(Result):
         return columns[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Names of all columns, in the order in which they are written."""
+        """Names of all columns in the order of a file."""
         return iter(self._column_names())
 
     def columns(self) -> dict[str, Array]:
-        """All columns (N,) by name, as they are written; views, not copies."""
+        """All columns (N,) by name, in the order of a file; views, not copies."""
         forces = (
             x
             for x, joint in zip(self.tau.T, self.joints, strict=True)
@@ -242,10 +247,10 @@ class Recording(Result):
         return dict(zip(self._column_names(), columns, strict=True))
 
     def between(self, start: float, end: float) -> "Recording":
-        """What was recorded from `start` to `end` [s], both included.
+        """The samples from `start` to `end` [s], both included.
 
         Raises:
-            RecordingError: Nothing was.
+            RecordingError: There are none.
         """
         mask = (self.time >= start) & (self.time <= end)
         if not mask.any():
@@ -256,26 +261,25 @@ class Recording(Result):
         return self.at(mask)
 
     def at(self, mask: np.ndarray) -> "Recording":
-        """Only the samples of a mask (N,)."""
+        """The samples that a mask (N,) selects."""
         return replace(
             self, time=self.time[mask], q=self.q[mask], v=self.v[mask], tau=self.tau[mask],
             channels={name: values[mask] for name, values in self.channels.items()},
         )  # fmt: skip
 
     def with_noise(self, deviations: Mapping[str, float], seed: int = 0) -> "Recording":
-        """What sensors with white, normally distributed noise would have read.
+        """Add white, normally distributed noise to columns.
 
-        Velocities and accelerations are not kept: they would tell the motion without noise.
-        Velocities of joints are derivatives of the noisy coordinates instead, unless they have a
-        deviation, too.
+        Velocities and accelerations without noise are removed. Velocities of joints become
+        derivatives of the noisy coordinates, unless they have a deviation of their own.
 
         Args:
-            deviations: Standard deviations by column, as {"X1": 1e-6, "X1_force": 0.05}, in the
-                units of `columns`; others stay as they are.
-            seed: Of the random numbers.
+            deviations: Standard deviations by column, such as {"X1": 1e-6, "X1_force": 0.05}, in
+                the units of `columns`; other columns do not change.
+            seed: Seed of the random numbers.
 
         Raises:
-            InputError: There is no such column, or a deviation is no number or negative.
+            InputError: A column does not exist, or a deviation is negative or no number.
         """
         columns, rng = self.columns(), np.random.default_rng(as_seed(seed))
         del columns[TIME]
@@ -286,7 +290,9 @@ class Recording(Result):
                 raise InputError(
                     f"the noise of '{name}' is {deviation:g}, it must not be negative"
                 )
-        for name in [name for name in columns if name in deviations]:  # whatever order is given
+        for name in [
+            name for name in columns if name in deviations
+        ]:  # independent of the order of the argument
             columns[name] = columns[name] + deviations[name] * rng.normal(size=len(self.time))
         for joint in self.joints:
             if joint + VELOCITY_SUFFIX not in deviations:
@@ -305,13 +311,13 @@ class Recording(Result):
         return replace(self, q=q, v=v, tau=tau, channels=channels, channel_units=units)
 
     def error(self, joint: str) -> Array:
-        """Tracking error (N,) of a joint [rad or m]: its reference less its coordinate.
+        """Tracking error (N,) of a joint [rad], [m]: reference minus coordinate.
 
         Args:
-            joint: A joint with the channel reference_<joint>, active or with a channel of its own.
+            joint: Joint with the channel reference_<joint>, active or recorded in a channel.
 
         Raises:
-            RecordingError: It has no reference, or is not recorded.
+            RecordingError: The joint has no reference, or is not recorded.
         """
         columns = {**self.channels, **dict(zip(self.joints, self.q.T, strict=True))}
         with_reference = [x for x in columns if REFERENCE_PREFIX + x in self.channels]
@@ -326,19 +332,19 @@ class Recording(Result):
         )[:, 0]
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the recording as CSV, whole or not at all.
+        """Write the recording as CSV; an incomplete file is never left.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         columns = list(self.columns().values())
         timeseries.write_columns(path, self._column_units(), columns, self._notes())
 
     def to_npz(self, path: str | Path) -> None:
-        """Write the recording as npz, whole or not at all: smaller than a CSV, and read faster.
+        """Write the recording as npz, smaller than a CSV and faster to read.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         columns = list(self.columns().values())
         timeseries.write_npz(path, self._column_units(), columns, self._notes())
@@ -361,29 +367,29 @@ class Recording(Result):
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "Recording":
-        """Read a recording.
+        """Read a recording from a CSV file.
 
         Raises:
-            RecordingError: The file does not exist or is not such a CSV; the message names the
-                file, the line or column, and what to change.
+            RecordingError: The file does not exist or is not valid; the message names the file,
+                the line or column, and the remedy.
         """
-        return cls.from_table(timeseries.read_csv(path), path)
+        return cls.from_table(table_reader.read_csv(path), path)
 
     @classmethod
     def read(cls, path: str | Path) -> "Recording":
         """Read a recording from a CSV or npz file.
 
         Raises:
-            RecordingError: As `from_csv`, or the suffix is another one.
+            RecordingError: As for `from_csv`, or the file has another suffix.
         """
-        return cls.from_table(timeseries.read_table(path), path)
+        return cls.from_table(table_reader.read_table(path), path)
 
     @classmethod
     def from_table(cls, table: Table, path: str | Path) -> "Recording":
-        """The recording in a table that was read from a path.
+        """Convert a table that was read from a path.
 
         Raises:
-            RecordingError: A column is missing, in a wrong unit, or not a recording's.
+            RecordingError: A column is missing, has a wrong unit, or is not valid in a recording.
         """
         try:
             return cls._from_table(table)
@@ -396,11 +402,11 @@ class Recording(Result):
         free = tuple(
             filter(None, (x.strip() for x in table.notes.get(FREE_JOINTS_NOTE, "").split(",")))
         )
-        joints = _require_active_joints(list(units), free)
+        joints = require_active_joints(list(units), free)
         for joint in joints:
             unit = units[joint]
             if unit not in VELOCITY_UNITS:
-                check_unit(joint, unit, _matching_units(joint, units) or VELOCITY_UNITS)
+                check_unit(joint, unit, matching_units(joint, units) or VELOCITY_UNITS)
             if joint + VELOCITY_SUFFIX in units:
                 check_unit(
                     joint + VELOCITY_SUFFIX, units[joint + VELOCITY_SUFFIX], [VELOCITY_UNITS[unit]]
@@ -442,97 +448,3 @@ class Recording(Result):
             start=table.notes.get(START, ""),
             copy=False,
         )
-
-
-def time_derivative(x: Array, time: Array) -> Array:
-    """Central differences (N,) of x (N,); zero where time does not tell (it is refused later)."""
-    if len(x) < 2 or not (np.diff(time) > 0).all():
-        return np.zeros_like(x)
-    return np.asarray(np.gradient(x, time))
-
-
-def check_finite(columns: Mapping[str, Array]) -> None:
-    """See that columns (N,) hold finite numbers.
-
-    Raises:
-        RecordingError: One does not.
-    """
-    for name, values in columns.items():
-        if not np.isfinite(values).all():
-            sample = int(np.argmin(np.isfinite(values)))
-            raise RecordingError(
-                f"'{name}' is {values[sample]} at sample {sample}, give finite numbers"
-            )
-
-
-def _checked_array(
-    what: str, value: ArrayLike, shape: tuple[int, ...], copy: bool, names: Sequence[str] = ()
-) -> Array:
-    """A float64 array of that shape: a contiguous copy, or as it lies where none is asked for."""
-    try:
-        order: Literal["C", "K"] = "C" if copy or len(shape) == 1 else "K"
-        array = np.array(value, dtype=np.float64, order=order, copy=copy or None)
-    except (TypeError, ValueError):
-        raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
-    if array.shape != shape:
-        columns = f", a column each for {_quoted_list(names)}" if names else ""
-        raise RecordingError(f"{what} has the shape {array.shape}, give {shape}{columns}")
-    return array
-
-
-def _quoted_list(names: Iterable[str]) -> str:
-    names = list(names)
-    more = [f"{len(names) - _MAX_LISTED} more"] if len(names) > _MAX_LISTED else []
-    return ", ".join([f"'{name}'" for name in names[:_MAX_LISTED]] + more) or "none"
-
-
-def free_force_message(joint: str, tau: Array) -> str:
-    """What to say of a free joint's force (N,) that is not zero."""
-    sample = int(np.argmax(tau != 0))
-    return (
-        f"'{joint}' is free and has the force {tau[sample]:.3g} at sample {sample}: leave the "
-        "force out, or name the joint as active"
-    )
-
-
-def find_active_joints(names: Sequence[str], free: Sequence[str] = ()) -> tuple[str, ...]:
-    """The active joints among columns, by the rule in the module's docstring.
-
-    Raises:
-        RecordingError: There are velocity and force of a joint without its displacement.
-    """
-    available = set(names)
-    for stem in (x.removesuffix(FORCE_SUFFIX) for x in names if x.endswith(FORCE_SUFFIX)):
-        if stem not in available and stem + VELOCITY_SUFFIX in available:
-            raise RecordingError(
-                f"column '{stem}' is missing beside '{stem}{VELOCITY_SUFFIX}', "
-                f"'{stem}{FORCE_SUFFIX}', "
-                f"add it, or rename those if '{stem}' is not an active joint"
-            )
-    for x in free:
-        if x not in available:
-            raise RecordingError(
-                f"column '{x}' of a free joint is missing, {suggest_names(names, x)}"
-            )
-    return tuple(x for x in names if x + FORCE_SUFFIX in available or x in free)
-
-
-def _matching_units(joint: str, units: Mapping[str, str]) -> list[str]:
-    """Units of a joint that fit its velocity and force, as far as these have columns."""
-    return [
-        unit
-        for unit, rate in VELOCITY_UNITS.items()
-        if units.get(joint + VELOCITY_SUFFIX, rate) == rate
-        and units.get(joint + FORCE_SUFFIX, FORCE_UNITS[unit]) == FORCE_UNITS[unit]
-    ]
-
-
-def _require_active_joints(names: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:
-    joints = find_active_joints(names, free)
-    if not joints:
-        raise RecordingError(
-            f"no active joint among the columns {_quoted_list(names)}, give for each joint "
-            f"its displacement, force and perhaps velocity, as in q1, q1{FORCE_SUFFIX}, "
-            f"q1{VELOCITY_SUFFIX}"
-        )
-    return joints

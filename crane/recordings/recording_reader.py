@@ -1,9 +1,9 @@
-"""From a file to what a machine did: whichever log it is, by its sensors, from when to when.
+"""Reading of recordings and logs: correction of sensor readings, and selection of a time span.
 
-Every file that was recorded is read here. What a file holds are readings of sensors; what is known
-of these, from the machine and from notes of the file (`# sensor.q2.zero: 0.02`, which count
-first), turns them into quantities. A file of quantities, as a simulation writes it, says so in the
-note `# sensors: ideal` and is taken as it is.
+A recorded file contains readings of sensors. The sensor parameters of the machine and of the notes
+of the file (`# sensor.q2.zero: 0.02`, which take precedence) convert them into quantities. Files
+with the note `# sensors: ideal`, as a simulation writes it, contain quantities and are not
+changed.
 """
 
 import math
@@ -35,11 +35,11 @@ from crane.description.sensors import (
 )
 from crane.description.sensors import quantity_names as quantity_names
 from crane.machine import Machine
-from crane.recordings import logs, timeseries
+from crane.recordings import logs, table_reader
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
 from crane.recordings.timeseries import Table, table_column
 
-_ALIKE = 0.7  # likeness of names, from which on one is meant
+_ALIKE = 0.7  # similarity from which a name counts as a misspelling
 
 TimeSpan = tuple[float, float]
 FULL_TIME_SPAN: TimeSpan = (-math.inf, math.inf)
@@ -51,19 +51,19 @@ def read_quantities(
     columns: str | Path | None = None,
     span: TimeSpan = FULL_TIME_SPAN,
 ) -> Table:
-    """The quantities that a file tells, in SI units.
+    """Read the quantities of a file in SI units.
 
     Args:
         path: A recording or a log of another program, CSV or npz.
-        machine: What was recorded, whose sensors say which columns of a log are which, and by how
-            much readings are off.
-        columns: A file that says which columns of a log are which instead, see
+        machine: The recorded machine, whose sensors give the columns of a log and the errors of
+            readings.
+        columns: Column file of a log, in place of the machine's sensors, see
             `crane.recordings.logs`.
-        span: From when to when [s], by the file's own clock.
+        span: Start and end [s] by the clock of the file.
 
     Raises:
-        RecordingError: A file is missing or malformed, or has no samples in that time.
-        InputError: The span is none.
+        RecordingError: A file is missing or malformed, or has no samples in the span.
+        InputError: The span is empty.
     """
     return quantities_from_readings(
         read_sensor_readings(path, machine, columns), path, machine, span
@@ -73,7 +73,7 @@ def read_quantities(
 def quantities_from_readings(
     table: Table, path: str | Path, machine: Machine | None, span: TimeSpan
 ) -> Table:
-    """The same from readings of a path."""
+    """Correct readings of a file, and select a time span."""
     try:
         known = known_sensors(table, machine)
         if known and machine is not None:
@@ -87,10 +87,10 @@ def quantities_from_readings(
 def read_sensor_readings(
     path: str | Path, machine: Machine | None = None, columns: str | Path | None = None
 ) -> Table:
-    """The same as the sensors said it, from first to last.
+    """Read all sensor readings of a file, without correction.
 
     Raises:
-        RecordingError: A file is missing or malformed, or names a quantity of the machine wrongly.
+        RecordingError: A file is missing or malformed, or misspells a quantity of the machine.
     """
     if columns is not None:
         table = logs.read_log(path, columns)
@@ -99,29 +99,28 @@ def read_sensor_readings(
         return table
     log_sensors = {} if machine is None else {x: s for x, s in machine.sensors.items() if s.column}
     if machine is not None and log_sensors:
-        arrays = timeseries.read_log_arrays(Path(path))
+        arrays = table_reader.read_log_arrays(Path(path))
         if any(
             name in arrays
             for s in log_sensors.values()
             for name in logs.expression_names(s.column)
         ):
             return _read_machine_log(Path(path), machine, log_sensors, arrays)
-    return timeseries.read_table(path)
+    return table_reader.read_table(path)
 
 
 def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
-    """See that columns which almost have the name of a quantity of the machine have it.
+    """Check that no column misspells the name of a quantity of the machine.
 
-    Others are channels, which may be called anything.
+    Other columns are channels and may have any name.
 
     Raises:
-        RecordingError: One has not.
+        RecordingError: A column does.
     """
     names = quantity_names(machine.tree)
     nodes = [] if machine.hydraulics is None else machine.hydraulics.node_names
-    own = {
-        f"{PRESSURE_PREFIX}{node.replace('.', '_')}" for node in nodes
-    }  # much like those of cylinders
+    # similar to the names of cylinder pressures
+    own = {f"{PRESSURE_PREFIX}{node.replace('.', '_')}" for node in nodes}
     for name in table.units:
         if name in own or quantity_unit(machine.tree, name) is not None:
             continue
@@ -134,7 +133,7 @@ def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
 
 
 def _likeness(one: str, two: str) -> float:
-    """Of two names, 0 to 1, by those words in which they differ; other numbers are others."""
+    """Similarity of two names, 0 to 1, by the words that differ; 0 if digits differ."""
     if re.findall(r"\d", one) != re.findall(r"\d", two):
         return 0.0
     words, others = (name.lower().split("_") for name in (one, two))
@@ -149,7 +148,7 @@ def _likeness(one: str, two: str) -> float:
 def _read_machine_log(
     path: Path, machine: Machine, sensors: Mapping[str, Sensor], arrays: Mapping[str, np.ndarray]
 ) -> Table:
-    """The table of a log whose columns a machine's sensors name."""
+    """Table of a log whose columns the sensors of a machine define."""
     lines, missing_sensors = [], []
     for quantity, sensor in sensors.items():
         unit = sensor.unit or quantity_unit(machine.tree, quantity) or ""
@@ -173,10 +172,10 @@ def _read_machine_log(
 
 
 def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sensor]:
-    """What is known of the sensors of a table by what they measure: notes count first.
+    """Known sensors of a table by quantity; notes take precedence over the machine.
 
     Raises:
-        RecordingError: A note is none of a sensor.
+        RecordingError: A note is no valid sensor parameter.
     """
     if table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
         return {}
@@ -188,7 +187,7 @@ def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sen
 
 
 def _sensor_notes(table: Table) -> dict[str, float]:
-    """Numbers of sensors in the notes."""
+    """Sensor parameters in the notes."""
     parameters = {}
     for name, text in table.notes.items():
         if not name.startswith(SENSOR_PREFIX):
@@ -208,7 +207,7 @@ def _sensor_notes(table: Table) -> dict[str, float]:
 
 
 def _warn_conflicting_notes(table: Table, machine: Machine) -> None:
-    """Warn of numbers that the machine and a recording say differently."""
+    """Warn of sensor parameters that differ between machine and recording."""
     machine_parameters = sensor_parameters(machine.sensors)
     messages = [
         f"{name} ({value:g}, not {machine_parameters[name]:g})"
@@ -223,10 +222,10 @@ def _warn_conflicting_notes(table: Table, machine: Machine) -> None:
 
 
 def correct_readings(table: Table, sensors: Mapping[str, Sensor]) -> Table:
-    """Readings as quantities, up to when the latest sensor tells them.
+    """Convert readings into quantities, up to the last time that the most delayed sensor covers.
 
     Raises:
-        RecordingError: No sample is that early.
+        RecordingError: No sample is left.
     """
     used = {x: s for x, s in sensors.items() if x in table.units and not s.is_ideal}
     if not used:
@@ -241,16 +240,18 @@ def correct_readings(table: Table, sensors: Mapping[str, Sensor]) -> Table:
     )
     is_available = time <= time[-1] - max_delay
     if not is_available.any():
-        raise RecordingError(f"is shorter than a sensor is late, {max_delay:g} s, record more")
+        raise RecordingError(
+            f"is shorter than the delay of a sensor, {max_delay:g} s, record more"
+        )
     return Table(table.units, values[is_available], table.notes)
 
 
 def select_time_span(table: Table, span: TimeSpan, path: str | Path) -> Table:
-    """The samples from when to when [s].
+    """Select the samples of a time span [s].
 
     Raises:
         RecordingError: There are none.
-        InputError: The span is none.
+        InputError: The span is empty.
     """
     if not span[0] < span[1]:
         raise InputError(f"nothing lies from {span[0]:g} to {span[1]:g} s, give a later end")

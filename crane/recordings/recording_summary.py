@@ -1,4 +1,4 @@
-"""The few numbers that sum a recording up."""
+"""Summaries of recordings, and differences between two of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,15 +8,14 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks, release_pages
-from crane.common.units import format_quantity
+from crane.common.units import display_unit, format_number, format_quantity
 from crane.description.machine_lookup import without_changes
-from crane.recordings.limit_cycles import ringing
+from crane.recordings.limit_cycles import limit_cycle_message
 from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, Recording
 
 SUPPORT_PREFIX = "support_"
-_MIN_LIFT_DURATION = 0.05  # [s] in the air that is worth telling
-
-# Unit to read a coordinate in, and how many of it make one rad or m.
+_MIN_LIFT_DURATION = 0.05  # [s] without ground contact that is reported
+# display unit of a coordinate, and its number per rad or m
 DISPLAY_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1000.0)}
 
 
@@ -31,9 +30,9 @@ class JointSummary:
         highest: Largest coordinate.
         peak_speed: Largest absolute velocity.
         peak_force: Largest absolute force or torque; None where nothing drives the joint.
-        rms_force: Root of the time average of its square; likewise.
+        rms_force: Root mean square of the force over time; None likewise.
         peak_error: Largest distance from the reference; None without one.
-        rms_error: Root of the time average of its square; None without one.
+        rms_error: Root mean square of the error over time; None without one.
     """
 
     name: str
@@ -49,18 +48,18 @@ class JointSummary:
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """Extremes of a recording.
+    """Summary of a recording.
 
     Attributes:
-        duration: From the first sample to the last [s].
+        duration: Duration [s].
         joints: One entry per active joint.
         tip_peak_error: Largest distance of the tip from its reference [m]; None without one.
-        tip_rms_error: Root of the time average of its square [m]; None without one.
-        stability_text: How far it is from tipping, in words, "" where that is not recorded.
-        balance_text: How far the balance of energy is off, see `energy_imbalance`, likewise.
-        ringing: Pressures that swing without decaying, see `limit_cycles`, likewise.
-        stopped: When and why it ended before its time, "" if it did not.
-        start: How it starts where that is not what the machine's file says.
+        tip_rms_error: Root mean square of it over time [m]; None without one.
+        stability_text: Text of the stability margin, "" if it is not recorded.
+        balance_text: Text of the energy imbalance, see `energy_imbalance`, "" likewise.
+        ringing: Text of pressures in a limit cycle, see `limit_cycles`, "" likewise.
+        stopped: Time and reason of an early end, "" if there is none.
+        start: Description of a start other than that of the machine file, else "".
     """
 
     duration: float
@@ -74,7 +73,7 @@ class RecordingSummary:
     start: str = ""
 
     def to_markdown(self) -> str:
-        """A table with one row per joint, in degrees and millimetres, and what is to be said."""
+        """Table with one row per joint, in degrees and millimetres, and remarks below it."""
         head = (
             "joint",
             "range",
@@ -117,9 +116,9 @@ class RecordingSummary:
 
 
 def tipping_message(recording: Recording) -> str:
-    """What to say of supports that lift, or would if they could, else nothing.
+    """Message about supports that lift, or of a fixed machine that would tip, else "".
 
-    By the channels stability, stability_<line> and support_<name>, see
+    It uses the channels stability, stability_<line> and support_<name>, see
     `crane.dynamics.tipping_stability`.
     """
     time, channels = recording.time, recording.channels
@@ -142,7 +141,7 @@ def tipping_message(recording: Recording) -> str:
 
 
 def _lift_time(time: Array, force: Array) -> float | None:
-    """When what has stood is in the air for a while [s]."""
+    """Time [s] at which a support with contact force (N,) lifts, None if it does not."""
     is_lifted = (force <= 0) & np.maximum.accumulate(force > 0)
     edges = np.flatnonzero(np.diff(is_lifted.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     lift_starts = [
@@ -167,31 +166,30 @@ def _stability_text(recording: Recording) -> str:
 
 
 def result_title(machine: str, what: str = "") -> str:
-    """What results are headed with, as figures, pages and tables alike: "patu655: swing"."""
+    """Title of results in figures, pages and tables, such as "patu655: swing"."""
     return ": ".join(word for word in (machine, what) if word)
 
 
 def recorded_machine_name(recording: Recording) -> str:
-    """Name of what a recording is of: the machine's own, or else of the file that it names."""
+    """Name of the recorded machine: its own, or else that of its file."""
     return recording.machine_name or Path(without_changes(recording.machine)).stem
 
 
 def label(recording: Recording) -> str:
-    """What a recording shows: its task, and until when where it was stopped."""
+    """Label of a recording: its task, and its end if it was stopped."""
     until = f"(stopped at {recording.time[-1]:.4g} s)" if recording.stopped else ""
     return f"{recording.task} {until}".strip()
 
 
 def heading(recording: Recording) -> str:
-    """What its results are headed with."""
+    """Title of the results of a recording: machine and label."""
     return result_title(recorded_machine_name(recording), label(recording))
 
 
 def summarize(recording: Recording) -> RecordingSummary:
-    """Ranges, peaks, RMS values and tracking errors of a recording.
+    """Compute ranges, peaks, RMS values and tracking errors of a recording.
 
-    Tracking errors need the channels reference_<joint> and reference_tip_x, _y, _z beside tip_x,
-    _y, _z.
+    Tracking errors need the channels reference_<joint>, reference_tip_x, _y, _z and tip_x, _y, _z.
     """
     time, channels = recording.time, recording.channels
     joints = []
@@ -220,32 +218,32 @@ def summarize(recording: Recording) -> RecordingSummary:
         tip_rms_error=None if distance is None else rms(time, distance),
         stability_text=_stability_text(recording),
         balance_text=_balance_text(recording),
-        ringing=ringing(recording),
+        ringing=limit_cycle_message(recording),
         stopped=recording.stopped,
         start=recording.start,
     )
 
 
 def energy_imbalance(recording: Recording) -> Array | None:
-    """Energy (N,) that came from nowhere since the start [J], None where it is not recorded.
+    """Energy imbalance (N,) since the start [J], None if it is not recorded.
 
-    kinetic + potential + dissipated less work of the active forces and of the loads, less its
-    first value: zero but for the error of the integration. The work of a circuit's forces is in
-    `work`, see `oil_energy_imbalance` for where that comes from.
+    It is kinetic + potential + dissipated energy minus the work of active forces and loads, minus
+    its first value: zero except for integration errors. `work` includes the forces of a circuit;
+    `oil_energy_imbalance` is the balance of the circuit.
     """
     loads = [x for x in recording.channels if x.startswith("work_")]
     return _energy_difference(recording, ("kinetic", "potential", "dissipated"), ("work", *loads))
 
 
 def oil_energy_imbalance(recording: Recording) -> Array | None:
-    """The same of a circuit: work + hydraulic_loss + oil_energy less pump_work (N,) [J]."""
+    """Energy imbalance (N,) of a circuit [J]: work + hydraulic_loss + oil_energy - pump_work."""
     return _energy_difference(recording, ("work", "hydraulic_loss", "oil_energy"), ("pump_work",))
 
 
 def _energy_difference(
     recording: Recording, stored_channels: Sequence[str], supplied_channels: Sequence[str]
 ) -> Array | None:
-    """What channels hold [J] beyond what was given since the start; None if one is not there."""
+    """Stored minus supplied energy since the start [J]; None if a channel is missing."""
     seen, units = recording.channels, recording.channel_units
     if any(units.get(name) != "J" for name in (*stored_channels, *supplied_channels)):
         return None
@@ -272,7 +270,7 @@ def _balance_text(recording: Recording) -> str:
 
 
 def point_channel(recording: Recording, name: str) -> Array | None:
-    """The channels <name>_x, <name>_y, <name>_z as (N, 3) [m], None if one is not there."""
+    """Channels <name>_x, <name>_y, <name>_z as (N, 3) [m], None if one is missing."""
     axes = [f"{name}_{axis}" for axis in "xyz"]
     if any(axis not in recording.channels for axis in axes):
         return None
@@ -283,7 +281,7 @@ def point_channel(recording: Recording, name: str) -> Array | None:
 
 
 def tip_error(recording: Recording) -> Array | None:
-    """Distance (N,) of the tip from its reference [m], None if one is not there."""
+    """Distance (N,) of the tip from its reference [m], None if a channel is missing."""
     tip, reference = point_channel(recording, "tip"), point_channel(recording, "reference_tip")
     if tip is None or reference is None:
         return None
@@ -293,7 +291,7 @@ def tip_error(recording: Recording) -> Array | None:
 
 
 def rms(time: Array, values: Array) -> float:
-    """Root of the time average of the square, by the trapezoidal rule.
+    """Root mean square over time, by the trapezoidal rule.
 
     Args:
         time: Instants (N,) [s].
@@ -310,3 +308,58 @@ def _peak(values: Array) -> float:
 
 def _format_value(value: float | None, scale: float, unit: str) -> str:
     return "" if value is None else f"{scale * value:.3f} {unit}"
+
+
+@dataclass(frozen=True)
+class JointDifference:
+    """Largest difference of two recordings in one joint.
+
+    Attributes:
+        joint: The joint.
+        unit: Unit of its coordinate, "rad" or "m".
+        largest: Largest difference of the coordinates.
+        time: Time of it [s] by the clock of the first recording.
+    """
+
+    joint: str
+    unit: str
+    largest: float
+    time: float
+
+    @property
+    def formatted(self) -> tuple[str, str]:
+        """Texts of difference and time in display units."""
+        unit, scale = display_unit(self.unit, 0.0)
+        return f"{format_number(scale * self.largest)} {unit}", f"{self.time:.4g} s"
+
+
+def clock_shift(recording: Recording, other: Recording) -> float:
+    """Shift of the second clock [s]: 0, or a common start if the recordings do not overlap."""
+    is_disjoint = other.time[0] > recording.time[-1] or other.time[-1] < recording.time[0]
+    return float(recording.time[0] - other.time[0]) if is_disjoint else 0.0
+
+
+def joint_differences(recording: Recording, other: Recording) -> list[JointDifference]:
+    """Largest difference in each joint over the common time of two recordings.
+
+    Differences are taken at the samples of both, with linear interpolation.
+    """
+    shifted_time = other.time + clock_shift(recording, other)
+    time = np.union1d(recording.time, shifted_time)
+    start, end = max(recording.time[0], shifted_time[0]), min(recording.time[-1], shifted_time[-1])
+    time = time[(time >= start) & (time <= end)]
+    found = []
+    for joint in (x for x in recording.joints if x in other.joints):
+        release_pages()
+        one = np.interp(time, recording.time, recording.q[:, recording.joints.index(joint)])
+        distance = np.abs(
+            np.interp(time, shifted_time, other.q[:, other.joints.index(joint)]) - one
+        )
+        largest_index = int(distance.argmax())
+        unit = recording.units[joint]
+        found.append(
+            JointDifference(
+                joint, unit, float(distance[largest_index]), float(time[largest_index])
+            )
+        )
+    return found

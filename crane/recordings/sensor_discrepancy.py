@@ -1,10 +1,9 @@
-"""Sensors that say more than is needed, compared through the machine's loops.
+"""Discrepancies of redundant sensors, compared through the loops of the machine.
 
-Those that determine the posture put every other sensor where it should be. What it reads instead
-is explained by the simplest that leaves no more than noise, by least squares over the recording:
-a zero of the sensor or of one of those that determine it, then a delay, a scale, or a pin that is
-not where the file has it. Rates are compared as what they add up to, so that noise does not hide
-their zero.
+The determining sensors give the expected reading of every redundant sensor. A discrepancy is
+explained, by least squares over the recording, by the simplest cause that leaves no more than
+noise: a zero of the sensor or of a determining one, then a delay, a scale, or another position of
+a pin. Rates are compared by their integrals, so that noise does not hide their zero.
 """
 
 import warnings
@@ -23,32 +22,33 @@ from crane.description.sensors import (
     quantity_unit,
 )
 from crane.machine import Machine
-from crane.recordings.inclination_angles import add_inclination_angles
-from crane.recordings.measured_configurations import MeasuredConfigurations
+from crane.recordings.measured_configurations import MeasuredConfigurations, add_inclination_angles
+from crane.recordings.missing_measurements import AGREEMENT_TOLERANCE, tolerance
 from crane.recordings.recording_reader import known_sensors
-from crane.recordings.sensor_tolerances import AGREEMENT_TOLERANCE, tolerance
 from crane.recordings.timeseries import TIME, Table, table_column
 
+# standard deviations of a significant discrepancy, and of an accepted residual
 _NOISE_FACTORS = (
     3.3,
     2.0,
-)  # standard deviations that tell a difference, and that explain what is left
-_RANDOM_WALK_FACTOR = 1.5  # of what white noise adds up to, which it hardly spreads over
-_EQUIVALENT_FACTOR = 2.0  # times what the best explanation leaves
-_IMPROVEMENT_SHARE = 0.8  # of what a zero leaves, below which more is told
-_NEAR_BEST_FACTOR, _MAX_LISTED = 1.3, 2  # times the best of those, and how many
-_STANDSTILL_SHARE = 0.05  # of the motion that it should tell
-_MIN_MOTION_FACTOR = 4.0  # times what sensors may differ by, over which scale and delay show
-_ZERO_DERIVATIVE = 1e-6  # slope of what does not depend on something
-_MAX_ITERATIONS = 4  # of Gauss and Newton
+)
+_RANDOM_WALK_FACTOR = 1.5  # of the random walk of integrated white noise
+_EQUIVALENT_FACTOR = 2.0  # times the residual of the best cause
+_IMPROVEMENT_SHARE = 0.8  # of the residual of a zero, below which other causes are reported
+# times the residual of the best of those, and how many are listed
+_NEAR_BEST_FACTOR, _MAX_LISTED = 1.3, 2
+_STANDSTILL_SHARE = 0.05  # of the expected motion
+_MIN_MOTION_FACTOR = 4.0  # times the tolerance; less motion does not determine scale and delay
+_ZERO_DERIVATIVE = 1e-6  # derivative that counts as zero
+_MAX_ITERATIONS = 4  # Gauss-Newton iterations
 _DISPLAY_UNITS = {"rad": ("deg", 180 / np.pi), "m": ("mm", 1e3)}
 
 
 def warn_discrepancies(machine: Machine, table: Table) -> None:
-    """Warn where sensors of one quantity disagree through the machine's loops, a line each.
+    """Warn of redundant sensors that disagree with the determining ones, a line each.
 
-    Joints and inclinations that are recorded beside the joints that determine the posture, and
-    rates, are compared with where these put them.
+    Redundant joints, inclinations and rates are compared with the values that the determining
+    joints give.
     """
     known = known_sensors(table, machine)
     try:
@@ -62,14 +62,14 @@ def warn_discrepancies(machine: Machine, table: Table) -> None:
             for pair in sensors
             if (text := pair.discrepancy_message(known, list(table.units)))
         ]
-    except (ClosureError, MechanismError):  # whoever closes the loops tells it
+    except (ClosureError, MechanismError):  # the caller reports that loops do not close
         return
     for text in messages:
         warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def _redundant_columns(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str]:
-    """Columns, in units of the machine, that the posture and its motion tell as well."""
+    """Redundant columns, in units of the machine, that the determining joints give as well."""
     found = []
     for name, unit in table.units.items():
         base = name.removesuffix(VELOCITY_SUFFIX)
@@ -81,13 +81,13 @@ def _redundant_columns(machine: Machine, table: Table, drives: tuple[str, ...]) 
 
 @dataclass(frozen=True)
 class _DiscrepancyCause:
-    """What may explain a difference.
+    """Possible cause of a discrepancy.
 
     Attributes:
-        sensor_parameters: By sensor its zero, scale and delay, on top of what is known of it.
-        residual_rms: Root mean square of what it leaves.
-        description: What it is.
-        pin_positions: By name where a pin would have to be [m].
+        sensor_parameters: By sensor, zero, scale and delay relative to the known ones.
+        residual_rms: Root mean square of the remaining discrepancy.
+        description: Text of the cause.
+        pin_positions: Positions of pins by name [m].
     """
 
     sensor_parameters: dict[str, dict[str, float]]
@@ -96,7 +96,7 @@ class _DiscrepancyCause:
     pin_positions: dict[str, float] = field(default_factory=dict)
 
     def format_parameters(self, known: Mapping[str, Sensor]) -> str:
-        """As machine files, notes and options take them."""
+        """Text of the parameters as in machine files, notes and options."""
         found = []
         for name, now in self.sensor_parameters.items():
             was = known.get(name, Sensor())
@@ -112,11 +112,11 @@ class _DiscrepancyCause:
 
 
 class _RedundantSensor:
-    """One sensor beside what the others say of it.
+    """Redundant sensor, compared with the determining ones.
 
     Args:
-        configurations: Of those that are used.
-        name: Its column.
+        configurations: Configurations by the determining joints.
+        name: Column of the sensor.
     """
 
     def __init__(self, configurations: MeasuredConfigurations, name: str):
@@ -141,7 +141,7 @@ class _RedundantSensor:
             self.off = self.off - 2 * np.pi * np.round(np.median(self.off) / (2 * np.pi))
         noise = noise_std(self.off)
         self.tolerance = tolerance(AGREEMENT_TOLERANCE, configurations.machine, self.unit)
-        # of what differs, and of what a cause may leave; noise that is added up walks at random
+        # limits of a discrepancy and of a residual; integrated noise is a random walk
         self.most = max(
             self.tolerance, _NOISE_FACTORS[0] * noise, _RANDOM_WALK_FACTOR * random_walk
         )
@@ -150,18 +150,18 @@ class _RedundantSensor:
     def discrepancy_message(
         self, known: Mapping[str, Sensor], measured_columns: Sequence[str]
     ) -> str:
-        """How they disagree, and why; "" where they do not.
+        """Message about the discrepancy and its cause; "" if there is none.
 
         Args:
-            known: What is known of the sensors.
-            measured_columns: Columns that were measured, whose zeros may explain it.
+            known: Known sensors.
+            measured_columns: Measured columns, whose zeros may be the cause.
         """
         mean, spread = float(self.off.mean()), float(self.off.std())
         if abs(mean) <= self.tolerance and spread <= self.most:
             return ""
         cause = self._explanation(known, measured_columns)
         if self.is_rate and not cause:
-            return ""  # what it adds up to drifts for many reasons
+            return ""  # integrals of rates drift for many reasons
         unit, factor = _DISPLAY_UNITS[self.unit]
         used = ", ".join(self._determining_joints)
         if self.is_rate:
@@ -178,7 +178,7 @@ class _RedundantSensor:
 
     @property
     def _determining_joints(self) -> list[str]:
-        """Joints that tell it."""
+        """Determining joints that the reading depends on."""
         configurations = self._configurations
         q = configurations.q[configurations.derivative_slice]
         gamma = configurations.machine.closure.gamma(q)
@@ -190,7 +190,7 @@ class _RedundantSensor:
         return [joint for joint, slope in pairs if np.abs(slope).max() > _ZERO_DERIVATIVE]
 
     def _explanation(self, known: Mapping[str, Sensor], measured_columns: Sequence[str]) -> str:
-        """In words; of a rate "" where nothing explains it."""
+        """Text of the cause; "" for a rate without a cause."""
         own_zero, explanation_limit = self._zero_cause(), self.limit
         zeros = sorted(
             [own_zero, *self._drive_zero_causes(measured_columns)], key=lambda x: x.residual_rms
@@ -249,7 +249,7 @@ class _RedundantSensor:
     def _fit_discrepancy(
         self, columns: list[Array], discrepancy: Array | None = None
     ) -> tuple[Array, float]:
-        """Least squares of the difference (N,) over columns (N,), and what they leave."""
+        """Least-squares coefficients of columns (N,) for the discrepancy, and the residual RMS."""
         discrepancy = self.off if discrepancy is None else discrepancy
         rate_columns = [np.ones_like(self.time)] if self.is_rate else []
         A = np.column_stack([*columns, *rate_columns])
@@ -258,7 +258,7 @@ class _RedundantSensor:
 
     @property
     def _zero_column(self) -> Array:
-        """(N,) what a zero adds."""
+        """Change (N,) of the reading per zero."""
         return self.time - self.time[0] if self.is_rate else np.ones_like(self.time)
 
     def _zero_cause(self) -> _DiscrepancyCause:
@@ -268,7 +268,7 @@ class _RedundantSensor:
         )
 
     def _scale_and_delay_causes(self) -> list[_DiscrepancyCause]:
-        """A zero with a delay, and with a scale."""
+        """Causes: a zero with a scale, and a zero with a delay."""
         if np.ptp(self.expected) < _MIN_MOTION_FACTOR * self.tolerance:
             return []
         (zero, change, *_), residual_rms = self._fit_discrepancy(
@@ -285,13 +285,13 @@ class _RedundantSensor:
                 [self._zero_column, derivative], discrepancy
             )
             delay += float(change)
-        if delay > 0:  # a sensor does not know what comes
+        if delay > 0:  # a delay is causal
             numbers = {"zero": float(zero), "delay": delay}
             found.append(_DiscrepancyCause({self.name: numbers}, residual_rms, "a delay besides"))
         return found
 
     def _drive_zero_causes(self, measured_columns: Sequence[str]) -> list[_DiscrepancyCause]:
-        """Zeros of what is used, one at a time, by Gauss and Newton's method."""
+        """Causes: zeros of the determining joints, one at a time, by the Gauss-Newton method."""
         found = []
         drives = self._configurations.machine.active
         for i, joint in enumerate(drives if not self.is_rate else ()):
@@ -324,7 +324,7 @@ class _RedundantSensor:
         return found
 
     def _pin_causes(self) -> list[_DiscrepancyCause]:
-        """The place of a pin, alone or with a zero, to first order: of each the least move."""
+        """Causes: the position of a pin, alone or with a zero, to first order."""
         configurations = self._configurations
         q, time = (
             configurations.q[configurations.derivative_slice],
@@ -359,7 +359,7 @@ class _RedundantSensor:
         return [_smallest_pin_move(causes, self.limit) for causes in found.values()]
 
     def _absolute_angle_hint(self, best: _DiscrepancyCause) -> str:
-        """That an angle counts from the horizon and is taken for that of a joint, if it does."""
+        """Text about an absolute angle that is recorded as a joint angle, "" if it is none."""
         configurations, joints = self._configurations, self._configurations.machine.tree.joints
         if self.unit != "rad":
             return ""
@@ -396,7 +396,7 @@ class _RedundantSensor:
 def _smallest_pin_move(
     causes: list[tuple[float, _DiscrepancyCause]], limit: float
 ) -> _DiscrepancyCause:
-    """Of moves of one pin that explain about as much, the smallest."""
+    """The smallest of the displacements of one pin with about the same residual."""
     max_residual = max(limit, _NEAR_BEST_FACTOR * min(cause.residual_rms for _, cause in causes))
     similar = [(move, cause) for move, cause in causes if cause.residual_rms <= max_residual]
     return min(similar, key=lambda pair: (len(pair[1].sensor_parameters), pair[0]))[1]
@@ -408,6 +408,6 @@ def noise_std(x: Array) -> float:
 
 
 def _integral(time: Array, rate: Array) -> Array:
-    """Integral (N,) of a rate (N,), by trapezia."""
+    """Integral (N,) of a rate (N,) by the trapezoidal rule."""
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,60 +1,41 @@
-"""Time series as a CSV: a table of columns with names and units, the first of them time.
+"""Tables of time series: columns with names and units, and how they are written.
 
-Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
-sample. A file that is written here says by `# crane samples: N` how many there are, so that one
-that is cut short is told. A unit may be left out, for all columns but time. What is read is in SI
-units: columns in
-bar, deg, mm and others of `crane.common.units.SI_CONVERSIONS` are converted, those in other units
-stay as they are. Numbers are written with the fewest digits that give the same float64 again.
+A CSV file has comment lines `# key: value`, then one header row `time [s],name [unit],...`, then
+one row per sample. The comment `# crane samples: N` gives the number of samples, so that a
+truncated file is recognized. A unit may be omitted, except that of time. Numbers are written with
+the fewest digits that give the same float64 again.
 """
 
-import codecs
-import csv
-import io
-import itertools
-import os
 import re
-import stat
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from crane.common import scratch_arrays
 from crane.common.atomic_output import replace_file
-from crane.common.errors import RecordingError, prefix_location
+from crane.common.errors import RecordingError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.common.units import SI_CONVERSIONS
 from crane.common.units import accepted_units as accepted_units
 from crane.description.sensors import TIME as TIME
 from crane.recordings import npz
-from crane.recordings.npz import MAX_COLUMNS, MAX_NUMBERS, read_arrays, read_columns
-
-T = TypeVar("T")
 
 _NAME_PATTERN = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
-SAMPLE_COUNT_NOTE = "crane samples"  # the comment that says how many there are
-_BLOCK_ROWS = 4096
-_UTF8_ENCODING = "utf-8-sig"  # with a mark or without
-_BLOCK_BYTES = 1 << 20  # bytes, and so many at most in a line
-_MAX_HEADING_LENGTH, _MAX_NAME_LENGTH = 1 << 16, 200  # characters
-_TRUNCATION_HINT = f"copy it again, or remove '# {SAMPLE_COUNT_NOTE}' if that is meant"
-_MAX_VALUE = 1e30  # in SI units; what is computed from larger ones overflows
+SAMPLE_COUNT_NOTE = "crane samples"  # note with the number of samples
+BLOCK_ROWS = 4096
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table(OneLineRepr):
-    """Columns of a file.
+    """Table of columns with units and notes.
 
     Attributes:
-        units: Unit of each column by its name, in the order of the columns; "" where not given.
-            SI units in a table that was read, unless a unit is none of those that are converted.
+        units: Unit of each column by name, in the order of the columns; "" if none is given. A
+            table that was read has SI units, except for units that are not converted.
         values: Samples (N, columns).
-        notes: Comment lines by their key.
+        notes: Comment lines by key.
     """
 
     units: dict[str, str]
@@ -63,10 +44,10 @@ class Table(OneLineRepr):
 
 
 def check_column_name(name: str, unit: str) -> None:
-    """See that a header can hold this name and unit.
+    """Check that a header can contain a name and a unit.
 
     Raises:
-        RecordingError: It cannot.
+        RecordingError: They contain invalid characters.
     """
     words = {"name": name, "unit": unit} if unit else {"name": name}
     for what, text in words.items():
@@ -78,10 +59,10 @@ def check_column_name(name: str, unit: str) -> None:
 
 
 def table_column(table: Table, name: str, unit: str | None = None) -> Array:
-    """A column (N,), in a unit.
+    """Column (N,) of a table, optionally with a check of its unit.
 
     Raises:
-        RecordingError: It is in another one.
+        RecordingError: It has another unit.
     """
     if unit is not None:
         check_unit(name, table.units[name], accepted_units(unit))
@@ -89,10 +70,10 @@ def table_column(table: Table, name: str, unit: str | None = None) -> Array:
 
 
 def write_table(path: str | Path, table: Table) -> None:
-    """Write a table, whole or not at all; what is NaN is an empty cell.
+    """Write a table as CSV; NaN becomes an empty cell.
 
     Raises:
-        OutputError: It cannot be written there.
+        OutputError: The file cannot be written.
     """
     write_columns(path, table.units, list(table.values.T), table.notes)
 
@@ -100,10 +81,10 @@ def write_table(path: str | Path, table: Table) -> None:
 def write_columns(
     path: str | Path, units: Mapping[str, str], columns: Sequence[Array], notes: Mapping[str, str]
 ) -> None:
-    """The same of single columns (N,), of which no table has to be made.
+    """Write columns (N,) as CSV, without assembling a table.
 
     Raises:
-        OutputError: It cannot be written there.
+        OutputError: The file cannot be written.
     """
     head = [
         *_comment_lines({**notes, SAMPLE_COUNT_NOTE: str(len(columns[0]))}),
@@ -111,10 +92,10 @@ def write_columns(
     ]
     with replace_file(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(head) + "\n")
-        for start in range(0, len(columns[0]), _BLOCK_ROWS):
-            rows = np.column_stack([x[start : start + _BLOCK_ROWS] for x in columns])
+        for start in range(0, len(columns[0]), BLOCK_ROWS):
+            rows = np.column_stack([x[start : start + BLOCK_ROWS] for x in columns])
             scratch_arrays.release_pages()
-            # digits take most of the time: what stays the same has them once
+            # formatting takes most of the time: constant columns are formatted once per block
             bits = rows.view(np.int64)
             same = (bits == bits[0]).all(axis=0)
             first = zip(rows[0].tolist(), same, strict=True)
@@ -127,10 +108,10 @@ def write_columns(
 def write_npz(
     path: str | Path, units: Mapping[str, str], columns: Sequence[Array], notes: Mapping[str, str]
 ) -> None:
-    """The same as an npz file: arrays named like the columns of a CSV, notes in its comment.
+    """Write columns (N,) as npz: arrays with CSV headings as names, notes in the comment.
 
     Raises:
-        OutputError: It cannot be written there.
+        OutputError: The file cannot be written.
     """
     with replace_file(path) as part:
         npz.write_columns(part, _column_headings(units), columns, "\n".join(_comment_lines(notes)))
@@ -144,313 +125,8 @@ def _column_headings(units: Mapping[str, str]) -> list[str]:
     return [f"{x} [{unit}]" if unit else x for x, unit in units.items()]
 
 
-def read_table(path: str | Path) -> Table:
-    """Read a table from a CSV or npz file, by its suffix.
-
-    Raises:
-        RecordingError: As `read_csv` and `read_npz`, or the suffix is another one.
-    """
-    path = Path(path)
-    if path.suffix.lower() == ".csv":
-        return read_csv(path)
-    if path.suffix.lower() != ".npz":
-        missing = "" if path.exists() else "no such file, "
-        raise RecordingError(f"{path}: {missing}a recording is a .csv or .npz file, name one")
-    return read_npz(path)
-
-
-def read_csv(path: str | Path) -> Table:
-    """Read a table: columns named once, finite numbers, time strictly increasing.
-
-    Raises:
-        RecordingError: The file does not exist or is not such a table; the message names the
-            file, the line or column, and what to change.
-    """
-    path = Path(path)
-    try:
-        check_regular_file(path)
-        lines = _count_lines(path)
-        notes, heading, line = _read_header(path)
-        units = _parse_header(heading)
-        if (lines - line) * len(units) > MAX_NUMBERS:
-            raise RecordingError(
-                f"holds {lines - line} lines of {len(units)} columns, give at most "
-                f"{MAX_NUMBERS} numbers"
-            )
-        _check_last_line(path, notes)
-        values = _read_values(path, line, lines, units)
-        _check_sample_count(values, notes)
-        return _convert_to_si(
-            Table(units, values, {key: x for key, x in notes.items() if key != SAMPLE_COUNT_NOTE})
-        )
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give the path of a CSV file") from None
-
-
-def read_npz(path: Path) -> Table:
-    """Read a table from arrays (N,) of equal length, named like the columns of a CSV.
-
-    Raises:
-        RecordingError: The file does not exist, or as `crane.recordings.npz.read_columns`.
-    """
-    names, values, comment = _read_npz_file(path, read_columns)
-    lines = (line.strip() for line in comment.splitlines())
-    return _build_table(
-        path, names, values, dict(_parse_note(x) for x in lines if x.startswith("#"))
-    )
-
-
-def read_log_arrays(path: Path) -> dict[str, np.ndarray]:
-    """What an npz file or a CSV of another program holds, by name: nothing is converted.
-
-    A CSV has one header row; it separates columns by commas, semicolons or tabs. Where it is not
-    by commas, and no number has a point, decimals are behind commas. It is in UTF-8, in UTF-16
-    with its mark, or else in Windows-1252.
-
-    Raises:
-        RecordingError: The file does not exist or is none of these.
-    """
-    if path.suffix.lower() == ".npz":
-        return _read_npz_file(path, read_arrays)
-    try:
-        check_regular_file(path)
-        _count_lines(path)
-        encoding = _detect_encoding(path)
-        notes, heading, line = _read_header(path, encoding)
-        _check_last_line(path, notes, encoding)
-        separator = max(",;\t", key=heading.count)
-        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=separator))]
-        values = _read_log_values(
-            lambda: _log_rows(path, encoding, line, separator), line, separator, names
-        )
-        _check_sample_count(values, notes)
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give the path of a CSV or npz file") from None
-    except (ValueError, csv.Error) as error:  # text that is none among them
-        reason = str(error).rstrip(".")
-        raise RecordingError(f"{path}: no table of numbers ({reason}), correct it") from None
-    if values.shape[1] != len(names) or len(set(names)) < len(names):
-        raise RecordingError(
-            f"{path}: {len(set(names))} different names head {values.shape[1]} columns, name each"
-        )
-    return dict(zip(names, values.T, strict=True))
-
-
-def _read_npz_file(path: Path, read: Callable[[Path], T]) -> T:
-    try:
-        check_regular_file(path)
-        return read(path)
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
-
-
-def table_from_columns(
-    path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]
-) -> Table:
-    """A table in SI units of arrays (N,) named 'name [unit]'; the path is for errors.
-
-    Raises:
-        RecordingError: They are not named like columns.
-    """
-    return _build_table(path, list(columns), np.column_stack(list(columns.values())), notes)
-
-
-def _build_table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str]) -> Table:
-    heading = io.StringIO()
-    csv.writer(heading).writerow(names)
-    try:
-        return _convert_to_si(Table(_parse_header(heading.getvalue().rstrip()), values, notes))
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-
-
-def check_regular_file(path: Path) -> None:
-    """See that a file ends, as devices and pipes need not.
-
-    Raises:
-        OSError: It is not there.
-        RecordingError: It is no plain file.
-    """
-    if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
-        raise RecordingError("is no plain file, copy it into one")
-
-
-def _count_lines(path: Path) -> int:
-    """Number of lines of a text.
-
-    Raises:
-        RecordingError: One of them is none, by its length.
-    """
-    line_count, line_bytes = 0, 0  # lines, bytes of the one that has not ended
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            ends = block.replace(b"\r", b"\n")
-            first, last = ends.find(b"\n"), ends.rfind(b"\n")
-            line_bytes += first if first >= 0 else len(block)
-            if line_bytes > _BLOCK_BYTES:
-                what = f"line {line_count + 1} has more than {_BLOCK_BYTES} bytes"
-                raise RecordingError(f"{what}, write one line per sample")
-            line_count += block.count(b"\n") or block.count(b"\r")
-            if last >= 0:
-                line_bytes = len(block) - last - 1
-    return line_count + (line_bytes > 0)
-
-
-def _check_last_line(path: Path, notes: Mapping[str, str], encoding: str = _UTF8_ENCODING) -> None:
-    """See that the last line of a file that says how many samples it has ends.
-
-    Raises:
-        RecordingError: It may be cut inside of a number.
-    """
-    if SAMPLE_COUNT_NOTE not in notes:
-        return
-    with path.open("rb") as file:
-        file.seek(-2 if encoding == "utf-16" else -1, os.SEEK_END)
-        if file.read().strip(b"\0") not in (b"\r", b"\n"):
-            raise RecordingError(f"is cut short in its last line, {_TRUNCATION_HINT}")
-
-
-def _check_sample_count(values: Array, notes: Mapping[str, str]) -> None:
-    """See that there are as many samples as a file says.
-
-    Raises:
-        RecordingError: There are not.
-    """
-    if SAMPLE_COUNT_NOTE in notes and notes[SAMPLE_COUNT_NOTE] != str(len(values)):
-        said = notes[SAMPLE_COUNT_NOTE][:20]
-        raise RecordingError(
-            f"has {len(values)} of the {said} samples that it says, {_TRUNCATION_HINT}"
-        )
-
-
-def _convert_to_si(table: Table) -> Table:
-    units, values = dict(table.units), table.values
-    for i, (name, unit) in enumerate(table.units.items()):
-        scratch_arrays.release_pages()
-        if unit in SI_CONVERSIONS:
-            units[name], a, b = SI_CONVERSIONS[unit]
-            with np.errstate(over="ignore"):  # infinite values are refused with their name
-                values[:, i] = values[:, i] * a / b
-    for i, name in enumerate(table.units):
-        scratch_arrays.release_pages()
-        column = values[:, i]
-        is_too_large = np.isfinite(column) & (np.abs(column) > _MAX_VALUE)
-        if is_too_large.any():
-            sample = int(np.argmax(is_too_large))
-            raise RecordingError(
-                f"'{name}' is {column[sample]:.3g} at sample {sample}, beyond all that is "
-                "measured, correct it"
-            )
-    return Table(units, values, table.notes)
-
-
-def _detect_encoding(path: Path) -> str:
-    """How the text of a log is encoded."""
-    with path.open("rb") as file:
-        if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-            return "utf-16"
-    try:
-        with path.open(encoding=_UTF8_ENCODING) as text:
-            for _ in text:
-                pass
-    except UnicodeDecodeError:
-        return "cp1252"
-    return _UTF8_ENCODING
-
-
-def _log_rows(path: Path, encoding: str, header: int, separator: str) -> Iterator[str]:
-    """Lines of a log below its header row, with decimals behind points."""
-
-    def lines() -> Iterator[str]:
-        with path.open(encoding=encoding) as file:
-            yield from itertools.islice(file, header, None)
-
-    if separator == "," or any("." in line for line in lines()):
-        return lines()
-    return (line.replace(",", ".") for line in lines())
-
-
-def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, str], str, int]:
-    """Notes, the header row, and its line number."""
-    notes: dict[str, str] = {}
-    character_count = 0  # characters
-    with path.open(encoding=encoding) as file:
-        for line, text in enumerate(file, start=1):
-            character_count += len(text)
-            text = text.strip()
-            if text.startswith("#"):
-                key, value = _parse_note(text)
-                notes[key] = value
-            elif text:
-                if len(text) > _MAX_HEADING_LENGTH:
-                    raise RecordingError(
-                        f"line {line}, the header row, has {len(text)} characters, give at most "
-                        f"{_MAX_HEADING_LENGTH}"
-                    )
-                return notes, text, line
-            if character_count > _BLOCK_BYTES:
-                raise RecordingError(
-                    f"has no header row within {_BLOCK_BYTES} characters, name the columns before"
-                )
-    raise RecordingError("is empty, write a header row and one row per sample")
-
-
-def _parse_note(text: str) -> tuple[str, str]:
-    """Key and value of a line '# key: value'."""
-    key, _, value = text.removeprefix("#").partition(":")
-    return key.strip(), value.strip()
-
-
-def _parse_header(heading: str) -> dict[str, str]:
-    """Names and units of the columns from the header row."""
-    for other in (";", "\t"):
-        if other in heading and "," not in heading:
-            raise RecordingError(f"separates columns by {other!r}, use commas")
-    try:
-        cells = next(csv.reader([heading]))
-    except csv.Error as error:
-        raise RecordingError(f"has a header row that is none ({error}), correct it") from None
-    if len(cells) > MAX_COLUMNS:
-        raise RecordingError(f"has {len(cells)} columns, give at most {MAX_COLUMNS}")
-    if all(_parse_number(cell) is not None for cell in cells):
-        raise RecordingError(
-            "has no header, name the columns in the first row (without '#'), "
-            "as in 'time [s],q1 [rad],q1_velocity [rad/s],q1_force [N m]'"
-        )
-    units: dict[str, str] = {}
-    for position, cell in enumerate(cells, start=1):
-        name, unit = parse_heading(cell)
-        if not name or len(cell) > _MAX_NAME_LENGTH:
-            hint = f", at most {_MAX_NAME_LENGTH} characters" if name else ""
-            raise RecordingError(
-                f"column {position} is headed '{_shortened(cell)}', write 'name [unit]'{hint}"
-            )
-        if name in units:
-            raise RecordingError(f"column '{name}' is there twice, rename or remove one")
-        check_column_name(name, unit)
-        units[name] = unit
-    if TIME not in units:
-        raise RecordingError(
-            f"no column '{TIME}' in the header, add '{TIME} [s]', or say by a file of columns "
-            "(--columns) which column of a log is which"
-        )
-    check_unit(TIME, units[TIME], accepted_units("s"))
-    return units
-
-
 def parse_heading(cell: str) -> tuple[str, str]:
-    """Name and unit in 'name [unit]'; no name where it is something else."""
+    """Name and unit of a heading 'name [unit]'; empty if it is malformed."""
     name, bracket, unit = cell.strip().partition("[")
     if bracket:
         if not unit.endswith("]"):
@@ -461,120 +137,13 @@ def parse_heading(cell: str) -> tuple[str, str]:
     return name.strip(), unit.strip()
 
 
-def _shortened(cell: str) -> str:
-    cell = cell.strip()
-    return cell if len(cell) < 60 else cell[:60] + "..."
-
-
 def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
-    """See that a column is in one of some units.
+    """Check that a column has one of the allowed units.
 
     Raises:
-        RecordingError: It is not.
+        RecordingError: It has not.
     """
     if unit not in allowed:
         found = f"is in [{unit}]" if unit else "has no unit"
         wanted = " or ".join(f"'{column} [{x}]'" for x in allowed)
         raise RecordingError(f"column '{column}' {found}, give {wanted}")
-
-
-def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
-    """Numbers (N, columns) below the header row, which is line `header` of so many."""
-    values, count, is_valid = scratch_arrays.empty_array(lines - header, len(units)), 0, True
-    try:
-        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about blank lines alone
-            for _ in itertools.islice(file, header):
-                pass
-            for line in file:
-                block = itertools.chain([line], itertools.islice(file, _BLOCK_ROWS - 1))
-                rows = np.loadtxt(block, delimiter=",", comments=None, ndmin=2)
-                if not rows.size:
-                    continue
-                if rows.shape[1] != len(units):
-                    is_valid = False
-                    break
-                is_valid = is_valid and bool(np.isfinite(rows).all())
-                values[count : count + len(rows)] = rows
-                count += len(rows)
-                scratch_arrays.release_pages()
-    except ValueError as error:
-        _raise_first_fault(path, header, units)
-        reason = " ".join(str(error).split())[:120]
-        raise RecordingError(f"{reason}, correct the file") from None
-    if is_valid and not count:
-        raise RecordingError("has a header and no samples, write one row per sample")
-    values = values[:count]
-    if not is_valid or (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
-        _raise_first_fault(path, header, units)
-    return values
-
-
-def _read_log_values(
-    rows: Callable[[], Iterator[str]], header: int, separator: str, names: Sequence[str]
-) -> Array:
-    """Numbers (N, columns) of a log, whose rows are below its header row, line `header`.
-
-    Raises:
-        RecordingError: There are none, or a cell holds something else.
-        ValueError: Lines have not as many cells as others.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about a file without samples
-            values = np.loadtxt(rows(), delimiter=separator, comments=None, ndmin=2)
-    except ValueError:
-        _raise_invalid_cell(rows(), header, separator, names)
-        raise
-    if not values.size:
-        raise RecordingError("has a header and no samples, write one row per sample")
-    return values
-
-
-def _raise_invalid_cell(
-    rows: Iterator[str], header: int, separator: str, names: Sequence[str]
-) -> None:
-    """Raise an error about the first cell of a log that is no number."""
-    for line, text in enumerate(rows, start=header + 1):
-        cells = text.rstrip("\n").split(separator) if text.strip() else []
-        for name, cell in zip(names, cells, strict=False):
-            if _parse_number(cell) is None:
-                raise RecordingError(
-                    f"line {line}, column '{name}': '{_shortened(cell)}' is not a number, correct "
-                    f"or remove the line"
-                )
-
-
-def _parse_number(cell: str) -> float | None:
-    try:
-        return float(cell) if "_" not in cell else None
-    except ValueError:
-        return None
-
-
-def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
-    """Raise an error about the first line that is wrong."""
-    names, last = list(units), -np.inf
-    with path.open(encoding=_UTF8_ENCODING) as file:
-        for line, text in enumerate(file, start=1):
-            if line <= header or not text.strip():
-                continue
-            cells = text.rstrip("\n").split(",")
-            if len(cells) != len(names):
-                raise RecordingError(
-                    f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
-                )
-            for name, cell in zip(names, cells, strict=True):
-                value = _parse_number(cell)
-                if value is None or not np.isfinite(value):
-                    raise RecordingError(
-                        f"line {line}, column '{name}': '{_shortened(cell)}' is not a finite "
-                        f"number, correct or remove the line"
-                    )
-            now = float(cells[names.index(TIME)])
-            if now <= last:
-                raise RecordingError(
-                    f"line {line}: time goes from {last} to {now} {units[TIME]}, "
-                    f"give strictly increasing times"
-                )
-            last = now

@@ -30,8 +30,8 @@ from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory
-from crane.recordings.ideal_sensors import ideal_readings
 from crane.recordings.recording import Recording
+from crane.recordings.sensor_kinematics import ideal_readings
 from crane.recordings.timeseries import TIME, Table, accepted_units, check_unit
 
 ChannelColumn = tuple[str, Array, str]  # name, values, unit

@@ -21,18 +21,21 @@ from crane.common.samples import Array, as_number
 from crane.control import ValveDrive, ValveSignals
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine import Machine
-from crane.recordings.inclination_angles import add_inclination_angles
-from crane.recordings.measured_configurations import determining_joints, joint_motion
-from crane.recordings.measured_recordings import check_pressures, locked_joint_conflicts
-from crane.recordings.missing_measurements import MissingMeasurements
-from crane.recordings.recording import (
-    VELOCITY_SUFFIX,
-    Recording,
-    time_derivative,
+from crane.recordings.measured_configurations import (
+    add_inclination_angles,
+    determining_joints,
+    joint_motion,
 )
+from crane.recordings.measured_recordings import (
+    check_pressures,
+    check_strokes,
+    locked_joint_conflicts,
+)
+from crane.recordings.missing_measurements import MissingMeasurements
+from crane.recordings.recording import VELOCITY_SUFFIX, Recording
+from crane.recordings.recording_columns import time_derivative
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
-from crane.recordings.stroke_check import check_strokes
 from crane.recordings.timeseries import TIME, Table, table_column
 from crane.simulation.recorded_run import read_simulation, recorded_columns
 from crane.simulation.simulation_run import Progress, simulate

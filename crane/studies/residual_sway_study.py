@@ -14,7 +14,8 @@ from crane.common.units import format_table
 from crane.control import ValveFeedforward, fastest_trajectory
 from crane.formats import load
 from crane.machine import Machine
-from crane.motion.sway import SWAY_METHODS, Sway
+from crane.motion.sway import Sway
+from crane.motion.sway_suppression import SWAY_METHODS
 from crane.motion.task_trajectories import task_trajectory
 from crane.simulation import simulate
 

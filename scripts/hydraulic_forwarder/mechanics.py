@@ -6,11 +6,15 @@ import numpy as np
 
 import crane
 from crane.common.samples import Array
-from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
-from crane.identification.mechanics.model_term import ModelTerm, MotionSamples
+from crane.identification.mechanics.model_term import (
+    InertialTerm,
+    ModelTerm,
+    MotionSamples,
+    body_names,
+)
 from crane.identification.signals.signal_processing import Motion, differentiate, low_pass
 from hydraulic_forwarder.experiment import CYLINDERS, STEP, Crane, averaged
 from hydraulic_forwarder.paper import ANGLES

@@ -1,1 +1,1 @@
-"""A machine fitted to recordings through its simulation."""
+"""Calibration: parameters of a machine fitted to recordings through its simulation."""

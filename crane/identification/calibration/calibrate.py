@@ -1,4 +1,4 @@
-"""A machine's numbers from recordings, through the simulation of what drove it."""
+"""Calibration of machines: parameters fitted to recordings through the simulation."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -6,15 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, prefix_location
+from crane.common.errors import CraneError, InputError, RecordingError, prefix_location
 from crane.common.errors import suggest_names as known_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.parameter_units import parameter_unit
 from crane.description.sensors import (
+    PRESSURE_PREFIX,
     SENSOR_PREFIX,
     VALVE_SIGNAL_PREFIX,
+    VELOCITY_SUFFIX,
     Sensor,
     quantity_unit,
     sensor_parameters,
@@ -22,24 +24,23 @@ from crane.description.sensors import (
 )
 from crane.formats import load
 from crane.formats.machine_loading import MachineVariants
-from crane.identification.calibration.calibration_problem import (
-    CalibrationProblem,
-    RecordingCase,
-    recording_case,
-)
+from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.calibration_result import (
     Calibration,
     CalibrationChannel,
     FittedParameter,
 )
-from crane.identification.calibration.candidate_parameters import candidate_parameters
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
-from crane.identification.calibration.parameter_selection import select_parameters
-from crane.identification.calibration.profile_likelihood import (
+from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     estimate_with_profiles,
+    score_tests,
 )
-from crane.identification.calibration.simulated_states import simulated_states
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
+from crane.identification.calibration.parameter_selection import (
+    candidate_parameters,
+    select_parameters,
+)
+from crane.identification.calibration.recording_case import RecordingCase, recording_case
 from crane.identification.calibration.unknowns import Unknown, build_unknowns
 from crane.machine import Machine
 from crane.recordings.logs import read_log_columns
@@ -54,9 +55,9 @@ from crane.recordings.recording_reader import (
 from crane.recordings.timeseries import Table, parse_heading
 from crane.simulation.recorded_run import simulated_columns
 
-AUTO = "auto"  # what is fitted if nobody says what
-_MAX_CORRELATION = 0.95  # correlation of two numbers of which the data know a combination alone
-_MAX_STD_SHARE = 0.5  # standard deviation, of a number's size, that says nothing
+AUTO = "auto"  # selects parameters automatically
+_MAX_CORRELATION = 0.95  # correlation of pairs that are reported
+_MAX_STD_SHARE = 0.5  # standard deviation per value, above which a parameter is unidentifiable
 
 
 @with_single_threaded_blas
@@ -72,46 +73,45 @@ def calibrate(
     sensors: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Fit numbers of a machine to recordings of it, driven by its measured valve signals.
+    """Calibrate parameters of a machine to recordings with measured valve signals.
 
-    The simulation of each recording's signals (see `crane.simulation.replay`) is compared with
-    what was measured. Least squares over the numbers and over each recording's start,
+    The simulation of the signals of each recording (see `crane.simulation.replay`) is compared
+    with the measurements by least squares over the parameters and the start of each recording,
 
-        min sum_c sum_t ((y_c(t) - m_c(t)) / s_c)^2 + sum (start / its deviation)^2,
+        min sum_c sum_t ((y_c(t) - m_c(t)) / s_c)^2 + sum (start / deviation)^2,
 
-    by Levenberg and Marquardt's method within bounds, at first with friction that is smoothed over
-    millimetres per second, for what sticks when depends on everything before. A channel's s_c is
-    what is left of it, found in rounds, but no more than a fifth of its variation or its noise: no
-    channel outweighs others because its noise is small where the model is not that good, and none
-    is given up. Intervals take blocks of instants as what is independent, since what is left is no
-    white noise (Huber's sandwich over blocks).
+    The method is Levenberg-Marquardt within bounds, first with friction smoothed over some
+    millimetres per second, because the instants of sticking depend on the whole motion before. The
+    scale s_c of a channel is its residual, updated in rounds, at least its noise and at most a
+    fifth of its variation, so that no channel dominates by low noise or is neglected. Confidence
+    intervals take blocks of instants as independent, since the residuals are not white (Huber's
+    sandwich estimator over blocks).
 
     Args:
-        machine: The machine, or what `crane.load` takes; joints that were held are locked in it.
-        recordings: Of measured valve signals, CSV or npz.
-        fit: Numbers by name: None, a start, or (start, low, high). Names are those of
+        machine: The machine, or an argument of `crane.load`, with joints locked that were held.
+        recordings: Files with measured valve signals, CSV or npz.
+        fit: Parameters by name: None, a start, or (start, low, high). Names are those of
             `crane.description.parameters`; with `*` a common factor of all that match;
-            `sensor.COLUMN.zero`, `.scale` and `.delay` of what was measured. "auto" adds all
-            that the recordings may tell, with what is usually known of it before, and keeps what
-            they do tell.
-        train: From when to when [s], by the files' own clocks, recordings are fitted; the rest
-            is held out.
-        validation: Recordings that are held out whole.
-        columns: A file that says which columns of raw logs are which, if not as the machine's
-            sensors say, see `crane.recordings.logs`.
-        span: From when to when [s], by the files' own clocks, recordings count at all; those of
-            `validation` count whole.
-        sensors: Columns to compare; all that can be if not given.
+            `sensor.COLUMN.zero`, `.scale` and `.delay` of sensors. "auto" adds all parameters that
+            the recordings may determine, with usual priors, and keeps those that they do.
+        train: Start and end [s], by the clocks of the files, of the training data; the rest is
+            held out.
+        validation: Recordings that are held out completely.
+        columns: Column file of raw logs, see `crane.recordings.logs`; default by the sensors of
+            the machine.
+        span: Start and end [s], by the clocks of the files, of the samples that are read from
+            `recordings`.
+        sensors: Columns to compare; default all that can be simulated.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
-        The numbers with their intervals, channels before and after, the fitted machine, and what
-        else it lacks.
+        Parameters with confidence intervals, channels before and after, the fitted machine, and
+        score tests of other parameters.
 
     Raises:
-        InputError: Names, bounds or windows that cannot be.
-        RecordingError: A recording is malformed, or has no signals.
-        SimulationError: The machine as it is cannot follow a recording.
+        InputError: Names, bounds or spans are not valid.
+        RecordingError: A recording is malformed, or has no valve signals.
+        SimulationError: The simulation of a recording fails with the initial parameters.
     """
     progress = progress_reporter(progress)
     if not isinstance(machine, Machine):
@@ -119,39 +119,19 @@ def calibrate(
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
     if not paths:
         raise InputError("no recording is given, name at least one")
-    if not train[0] < train[1]:
-        raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
-    if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
-        raise InputError(
-            f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
-            f"{span[1]:g} s, which is read"
-        )
-    tables = [
-        select_time_span(read_sensor_readings(path, machine, columns), span, path)
-        for path in paths
-    ]
-    tables += [read_sensor_readings(path, machine, columns) for path in validation]
-    cases = [
-        _read_case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
-        for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
-    ]
-    if not any(case.train_mask.any() for case in cases):
-        raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    cases = _read_cases(machine, paths, validation, columns, train, span, sensors)
     requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
     automatic = AUTO in requested
     if requested.pop(AUTO, None) is not None:
-        raise InputError(f"'{AUTO}' chooses numbers by itself, give it no start")
-    for path, table in zip((*paths, *validation), tables, strict=True):
-        _check_sensor_parameters(path, table, requested)
+        raise InputError(f"'{AUTO}' chooses parameters by itself, give it no start")
+    for path, case in zip((*paths, *validation), cases, strict=True):
+        _check_sensor_parameters(path, case.table, requested)
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = {
-        name: table.units[name]
-        for case, table in zip(cases, tables, strict=True)
-        for name in (
-            *case.sensors,
-            *(VALVE_SIGNAL_PREFIX + joint for joint in case.inputs.signals),
-        )
+        name: case.table.units[name]
+        for case in cases
+        for name in (*case.sensors, *(VALVE_SIGNAL_PREFIX + x for x in case.inputs.signals))
     }
 
     def unknowns_for(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
@@ -182,7 +162,7 @@ def calibrate(
     if not automatic:
         applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
         calibration = replace(
-            calibration, score_tests=tuple(search.score_test(applicable_extras, estimate.z))
+            calibration, score_tests=tuple(score_tests(search, applicable_extras, estimate.z))
         )
     known = dict(machine.sensors) | dict(cases[0].known_sensors)
     return replace(
@@ -191,15 +171,45 @@ def calibrate(
     )
 
 
+def _read_cases(
+    machine: Machine,
+    paths: Sequence[str | Path],
+    validation: Sequence[str | Path],
+    columns: str | Path | None,
+    train: TimeSpan,
+    span: TimeSpan,
+    sensors: Sequence[str] | None,
+) -> list[RecordingCase]:
+    """Read the recordings of a calibration, those of the validation last; see `calibrate`."""
+    if not train[0] < train[1]:
+        raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
+    if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
+        raise InputError(
+            f"the training data, {train[0]:g} to {train[1]:g} s, are not within the span "
+            f"{span[0]:g} to {span[1]:g} s that is read: widen the span"
+        )
+    tables = [
+        select_time_span(read_sensor_readings(path, machine, columns), span, path)
+        for path in paths
+    ]
+    tables += [read_sensor_readings(path, machine, columns) for path in validation]
+    cases = [
+        _read_case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
+        for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
+    ]
+    if not any(case.train_mask.any() for case in cases):
+        raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    return cases
+
+
 def _check_sensor_parameters(path: str | Path, table: Table, fit: Iterable[str]) -> None:
-    """See that numbers of sensors are fitted to what they read."""
+    """Check that sensor parameters are fitted to readings, not to ideal quantities."""
     for name in fit:
         if name.startswith(SENSOR_PREFIX) and table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
             raise InputError(
                 f"{path}: '{name}' cannot be fitted to quantities, which its note "
-                f"'{SENSORS_NOTE}: "
-                f"{IDEAL_SENSORS}' says they are: give the readings, or remove the note if they "
-                f"are"
+                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
+                "the note if they are"
             )
 
 
@@ -209,7 +219,7 @@ def _machine_with_sensors(
     columns: str | Path | None,
     changes: Mapping[str, float],
 ) -> Machine:
-    """The fitted machine with all that is known of its sensors, and of their columns in logs."""
+    """The fitted machine with the known and fitted sensor parameters and log columns."""
     sensors = dict(known)
     for line in read_log_columns(Path(columns))[1] if columns is not None else ():
         name, unit = parse_heading(line.heading)
@@ -251,6 +261,7 @@ def _calibration_result(
     unknowns, z, covariance = problem.unknowns, estimate.z, estimate.covariance
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = problem.values(z)
+    correlation = _correlation_matrix(covariance, len(unknowns))
     fitted = []
     for i, unknown in enumerate(unknowns):
         value, scale = values[unknown.name], unknown.scale
@@ -289,33 +300,51 @@ def _calibration_result(
         tuple(fitted),
         tuple(channels),
         problem.changes(z),
-        tuple(_correlated_pairs(unknowns, covariance)),
+        tuple(_correlated_pairs(unknowns, correlation)),
         problem.simulation_count,
-        correlation=_correlation_matrix(covariance, len(unknowns)),
+        correlation=correlation,
         states=simulated_states(problem, z),
         is_lowest_minimum=estimate.is_lowest_minimum,
     )
 
 
 def _correlation_matrix(covariance: Array, count: int) -> Array:
-    """(n, n) of the first n, 0 of what is known exactly."""
+    """Correlations (n, n) of the first n unknowns; 0 if a variance is zero."""
     deviations = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0))
     divisors = np.where(deviations > 0, deviations, np.inf)
-    correlation: Array = covariance[:count, :count] / np.outer(divisors, divisors)
-    return correlation
+    return covariance[:count, :count] / np.outer(divisors, divisors)
 
 
 def _correlated_pairs(
-    unknowns: Sequence[Unknown], covariance: Array
+    unknowns: Sequence[Unknown], correlation: Array
 ) -> list[tuple[str, str, float]]:
-    """Pairs of numbers that the data tell apart badly, with their correlation."""
-    count = len(unknowns)
-    deviations = np.sqrt(np.diag(covariance))[:count]
-    found = []
-    for i in range(count):
-        for j in range(i):
-            if deviations[i] and deviations[j]:
-                correlation = float(covariance[i, j] / (deviations[i] * deviations[j]))
-                if abs(correlation) > _MAX_CORRELATION:
-                    found.append((unknowns[j].name, unknowns[i].name, correlation))
+    """Strongly correlated pairs of parameters, with their correlation."""
+    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
+    found = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
     return sorted(found, key=lambda pair: -abs(pair[2]))
+
+
+def simulated_states(problem: CalibrationProblem, z: Array) -> dict[str, Mapping[str, Array]]:
+    """Simulated velocities and chamber pressures (N,) of the valve-driven joints by recording.
+
+    They are those of the fitted machine, without noise.
+
+    Args:
+        problem: The calibration problem.
+        z: (p,) unknowns.
+    """
+    hydraulics = problem.machine.hydraulics
+    joints = () if hydraulics is None else hydraulics.joints
+    names = [
+        name
+        for x in joints
+        for name in (x + VELOCITY_SUFFIX, f"{PRESSURE_PREFIX}{x}_a", f"{PRESSURE_PREFIX}{x}_b")
+    ]
+    found: dict[str, Mapping[str, Array]] = {}
+    for case in problem.cases if names else ():
+        try:
+            curve = problem.simulate_readings(replace(case, sensors=names), z, False)
+        except CraneError:  # the channels of the recording report the error
+            continue
+        found[case.name] = dict(zip(names, curve(case.inputs.time).T, strict=True))
+    return found

@@ -1,11 +1,10 @@
-"""What is left between recordings and the simulation of their inputs, and its derivatives."""
+"""Residuals between recordings and simulations of their inputs, and their derivatives."""
 
 import warnings
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from crane.common.errors import CraneError, InputError
@@ -20,13 +19,12 @@ from crane.description.sensors import (
 from crane.dynamics import Dynamics
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
+from crane.identification.calibration.recording_case import RecordingCase
 from crane.identification.calibration.unknowns import SENSOR_PARAMETER_DEFAULTS, Unknown
 from crane.machine import Machine
-from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, correct_readings
-from crane.recordings.timeseries import TIME, Table, table_column
 from crane.simulation.recorded_run import read_simulation
 from crane.simulation.recorded_run import record_run as recording_of
-from crane.simulation.recording_replay import ReplayInputs, replay_inputs
+from crane.simulation.recording_replay import ReplayInputs
 from crane.simulation.sensitivity.rate_formulas import observed_frames
 from crane.simulation.sensitivity.simulated_motion import SimulationProblem
 from crane.simulation.sensitivity.simulation_constants import (
@@ -37,180 +35,29 @@ from crane.simulation.sensitivity.variational_integration import integrate_sensi
 from crane.simulation.simulation_run import simulate
 from crane.simulation.simulation_setup import initial_motion
 
-DERIVATIVE_TOLERANCE = 1e-4  # error of derivatives
-_DIFFERENCE_STEP = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation
-_MIN_SAMPLES = 20  # instants of a recording
-_FRICTION_SMOOTHING = {
-    "rad": 5e-3,
-    "m": 2e-3,
-}  # [rad/s], [m/s] over which friction changes its sign
-_MAX_STEP, _MAX_SENSITIVITY_STEP = (
-    1e-2,
-    2e-3,
-)  # [s] of a step of a simulation, and with derivatives, at most
-_NORMAL_MEDIAN = 0.6745  # median of the size of what has a normal distribution, in deviations
-_MAX_CACHED_MACHINES = 100  # machines with numbers that were asked for last
-# What starts may be off by, one standard deviation, where nothing measures them: rad, m, rates.
-_START_POSITION_STD, _START_VELOCITY_STD = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
-_START_NOISE_FACTOR = (
-    2.0  # noises of a sensor that the start is off by, which is the mean of several samples
-)
-_MIN_START_STD = {"rad": 1e-4, "m": 1e-5, "Pa": 1e3}
-
-
-@dataclass(frozen=True, eq=False)
-class RecordingCase:
-    """One recording.
-
-    Attributes:
-        name: Of its file.
-        inputs: What drove the machine.
-        file_time: (N,) instants as the file has them [s].
-        sensors: Columns that are compared.
-        measured: (N, k) their readings.
-        known_sensors: What was known of the recording's sensors.
-        train_mask: (N,) which instants are fitted, true or false.
-        table: As it was read.
-        start_std: (s,) standard deviations of the start's deviations: q_A, v_A, pressures A and B.
-        first_start_index: Where its start is among all unknowns.
-    """
-
-    name: str
-    inputs: ReplayInputs
-    file_time: Array
-    sensors: list[str]
-    measured: Array
-    known_sensors: Mapping[str, Sensor]
-    train_mask: NDArray[np.bool_]
-    table: Table
-    start_std: Array
-    first_start_index: int = 0
-
-    def split_training(self, machine: Machine, part_duration: float) -> list["RecordingCase"]:
-        """Parts of what is fitted [s], each of which starts where it was measured.
-
-        The way from one to the next is left open: this is multiple shooting whose gaps weigh
-        nothing, for a search that is far from its end (Bock 1981).
-        """
-        time = self.inputs.time
-        train_indices = np.flatnonzero(self.train_mask)
-        span = time[train_indices[-1]] - time[train_indices[0]]
-        count = int(min(span / part_duration, len(train_indices) / _MIN_SAMPLES))
-        if count < 2:
-            return []
-        cases = []
-        for indices in np.array_split(train_indices, count):
-            table = Table(self.table.units, self.table.values[indices], self.table.notes)
-            part = recording_case(
-                machine, self.name, table, self.known_sensors, self.sensors, FULL_TIME_SPAN
-            )
-            # what comes late began before the part
-            inputs = replace(
-                part.inputs, signals=self.inputs.signals, signal_times=time - time[indices[0]]
-            )
-            cases.append(replace(part, inputs=inputs))
-        return cases
-
-
-def recording_case(
-    machine: Machine,
-    name: str,
-    table: Table,
-    known_sensors: Mapping[str, Sensor],
-    sensors: list[str],
-    window: TimeSpan,
-) -> RecordingCase:
-    """A recording of a machine, of which the instants within a window [s] are fitted.
-
-    Args:
-        machine: The machine.
-        name: Of the file.
-        table: Its readings.
-        known_sensors: What is known of its sensors.
-        sensors: Columns to compare.
-        window: By the file's clock.
-
-    Raises:
-        RecordingError: See `replay_inputs`.
-        InputError: Too few instants, or nothing to compare.
-    """
-    # what starts is read off without delays
-    undelayed_sensors = {
-        x: replace(s, delay=0.0)
-        for x, s in known_sensors.items()
-        if not x.startswith(VALVE_SIGNAL_PREFIX)
-    }
-    inputs = replay_inputs(machine, correct_readings(table, undelayed_sensors))
-    if not sensors:
-        raise InputError(f"{name}: nothing of it can be compared with the machine")
-    file_time = table_column(table, TIME)
-    after_start, before_end = file_time >= window[0] - 1e-9, file_time <= window[1] + 1e-9
-    train_mask = np.logical_and(after_start, before_end)
-    if len(train_mask) < _MIN_SAMPLES:
-        raise InputError(f"{name}: {len(train_mask)} instants, give at least {_MIN_SAMPLES}")
-    measured = np.column_stack([table_column(table, x) for x in sensors])
-    joint_units = [machine.unit(joint) for joint in machine.active]
-    start_std: list[float] = []
-
-    def initial_std(name: str, unit: str, otherwise: float) -> float:
-        if name not in table.units:
-            return otherwise
-        return max(
-            _START_NOISE_FACTOR * noise_std(table_column(table, name)), _MIN_START_STD[unit]
-        )
-
-    if inputs.initial:
-        pairs = zip(machine.active, joint_units, strict=True)
-        start_std += [initial_std(joint, kind, _START_POSITION_STD[kind]) for joint, kind in pairs]
-    if inputs.initial:  # what rests at first rests
-        start_std += [
-            _START_VELOCITY_STD[kind] if v else 0.0
-            for kind, v in zip(joint_units, inputs.initial[1], strict=True)
-        ]
-    for joint in inputs.pressures:
-        start_std += [initial_std(f"pressure_{joint}_{side}", "Pa", 0.0) for side in "ab"]
-    return RecordingCase(
-        name,
-        inputs,
-        file_time,
-        sensors,
-        measured,
-        known_sensors,
-        train_mask,
-        table,
-        np.array(start_std),
-    )
-
-
-def noise_std(x: Array) -> float:
-    """Standard deviation of a channel's noise, by the median of its third differences.
-
-    Which shocks do not change. By their mean square where half of them are zero, the readings
-    having few digits.
-    """
-    differences = np.diff(x, 3)
-    size = float(np.median(np.abs(differences))) / _NORMAL_MEDIAN or float(
-        np.sqrt(np.mean(differences**2))
-    )
-    return size / np.sqrt(20.0)
+DERIVATIVE_TOLERANCE = 1e-4  # relative error of derivatives
+_DIFFERENCE_STEP = 1e-5  # of the scale of an unknown, for differences of simulation constants
+# [rad/s], [m/s] over which smoothed friction changes its sign
+_FRICTION_SMOOTHING = {"rad": 5e-3, "m": 2e-3}
+# largest steps [s] of a simulation, and of one with derivatives
+_MAX_STEP, _MAX_SENSITIVITY_STEP = 1e-2, 2e-3
+_MAX_CACHED_MACHINES = 100  # machines with changed parameters in the cache
 
 
 class CalibrationProblem:
-    """Residuals over all unknowns z, each in its scale: fitted numbers, then starts.
+    """Residuals as functions of the scaled unknowns z: parameters, then starts of recordings.
 
     Args:
-        machine: As it was loaded.
-        unknowns: What is fitted.
-        cases: Recordings.
+        machine: The machine before the calibration.
+        unknowns: Unknown parameters.
+        cases: The recordings.
 
     Attributes:
-        friction_smoothing: Over which share of a few millimetres per second friction that sticks
-            is
-            smoothed: where and when something sticks depends on everything before, and what a
-                small
-            change does then tells little of larger ones.
-        min_derivative_smoothing: Share by which derivatives are smoothed at least.
-        derivative_tolerance: Error of derivatives.
+        smooth: Smoothing of friction with stiction, relative to some millimetres per second. The
+            instants of sticking depend on the whole motion before, so derivatives without
+            smoothing are valid for small changes only.
+        slopes: Least smoothing for derivatives, likewise.
+        derivative_tolerance: Relative error of derivatives.
     """
 
     def __init__(
@@ -228,27 +75,27 @@ class CalibrationProblem:
         self._machine_cache: dict[tuple[float, ...], Machine] = {}
 
     def values(self, z: Array) -> dict[str, float]:
-        """Of the unknowns, by name."""
+        """Values of the unknown parameters by name."""
         return {
             unknown.name: unknown.start + unknown.scale * float(x)
             for unknown, x in zip(self.unknowns, z, strict=False)
         }
 
     def changes(self, z: Array) -> dict[str, float]:
-        """Numbers of the machine and its sensors."""
+        """Changed parameters of the machine and its sensors by name."""
         found: dict[str, float] = {}
         for unknown, value in zip(self.unknowns, self.values(z).values(), strict=True):
             found |= unknown.changes(value)
         return found
 
     def fitted_machine(self, z: Array) -> Machine:
-        """The machine and its sensors with these numbers."""
+        """The machine and its sensors with the changed parameters."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return self._variants.machine(self.changes(z))
 
     def simulated_machine(self, z: Array, friction_smoothing: float) -> Machine:
-        """The machine with these numbers, to be simulated, its friction smoothed by a share."""
+        """The machine for simulation, with changed parameters and smoothed friction."""
         changes = {
             x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR_PREFIX)
         }
@@ -274,15 +121,15 @@ class CalibrationProblem:
         return machine.replace(friction=friction)
 
     def simulate_readings(self, case: RecordingCase, z: Array, training_only: bool) -> CubicSpline:
-        """Readings of a case's sensors over time, but for what is amiss with these.
+        """Simulated ideal readings of a recording's sensors over time.
 
         Args:
             case: The recording.
             z: Unknowns.
-            training_only: Whether only up to the last instant that is fitted.
+            training_only: Whether to stop at the last training instant.
 
         Raises:
-            CraneError: The machine cannot be, or its simulation fails.
+            CraneError: The machine is not valid, or its simulation fails.
         """
         self.simulation_count += 1
         inputs = self._inputs_with_start(case, z)
@@ -296,7 +143,7 @@ class CalibrationProblem:
         return CubicSpline(run.time, read_simulation(machine, run, case.sensors))
 
     def _inputs_with_start(self, case: RecordingCase, z: Array) -> ReplayInputs:
-        """Inputs with another start."""
+        """Inputs with the start and the sensors of the unknowns."""
         start_changes = (
             case.start_std
             * z[case.first_start_index : case.first_start_index + len(case.start_std)]
@@ -336,7 +183,7 @@ class CalibrationProblem:
     def _fitted_sensor(
         self, case: RecordingCase, name: str, values: Mapping[str, float]
     ) -> Sensor:
-        """With the numbers that are fitted."""
+        """Sensor with its fitted parameters."""
         known = case.known_sensors.get(name, Sensor())
         names = [f"{SENSOR_PREFIX}{name}.{what}" for what in SENSOR_PARAMETER_DEFAULTS]
         fitted_parameters = {x: values[x] for x in names if x in values}
@@ -349,7 +196,7 @@ class CalibrationProblem:
     def _corrected_quantity(
         self, case: RecordingCase, name: str, x: float, values: Mapping[str, float]
     ) -> float:
-        """What stands for a quantity x by what was known of its sensor, by what is known now."""
+        """Quantity x, corrected from the known sensor to the fitted one."""
         reading = case.known_sensors.get(name, Sensor()).apply(x)
         return self._fitted_sensor(case, name, values).invert(reading)
 
@@ -360,7 +207,7 @@ class CalibrationProblem:
     def _sensor_readings(
         self, case: RecordingCase, curve: CubicSpline, z: Array
     ) -> tuple[Array, dict[int, Array]]:
-        """Readings (N, k) as sensors give them, and their slopes (N, k) by sensors' unknowns."""
+        """Readings (N, k) of the fitted sensors, and derivatives (N, k) by sensor unknowns."""
         time, values = case.inputs.time, self.values(z)
         sensors = [self._fitted_sensor(case, name, values) for name in case.sensors]
         delays, scales, zeros = np.array([(s.delay, s.scale, s.zero) for s in sensors]).T
@@ -386,13 +233,13 @@ class CalibrationProblem:
         return undistorted * scales + zeros, min_derivative_smoothing
 
     def residuals(self, case: RecordingCase, z: Array, training_only: bool = False) -> Array:
-        """(N, k) simulated less measured.
+        """Residuals (N, k): simulated minus measured readings.
 
         Args:
             case: The recording.
             z: Unknowns.
-            training_only: Whether only up to the last instant that is fitted; what is behind it
-                says nothing.
+            training_only: Whether to stop at the last training instant; later residuals are
+                invalid.
 
         Raises:
             CraneError: See `simulate_readings`.
@@ -407,12 +254,12 @@ class CalibrationProblem:
     ) -> tuple[Array, Array]:
         """Residuals (N, k) and their derivatives (N, k, p), see `crane.sensitivities`.
 
-        Up to the last instant that is fitted.
+        They are valid up to the last training instant.
 
         Args:
             case: The recording.
             z: Unknowns.
-            fixed_unknowns: Indices of those whose derivatives are left 0.
+            fixed_unknowns: Indices of unknowns whose derivatives are left 0.
 
         Raises:
             CraneError: See `simulate_readings`.
@@ -475,7 +322,7 @@ class CalibrationProblem:
         return readings - case.measured, jacobian
 
     def _affects_simulation(self, case: RecordingCase, sensor: str) -> bool:
-        """Whether a number of the machine, "", or of a sensor changes the simulation."""
+        """Whether an unknown of a sensor, or of the machine (""), affects the simulation."""
         return not sensor or sensor not in case.sensors or self._start_depends_on(sensor)
 
     def _setup_derivative(
@@ -489,9 +336,9 @@ class CalibrationProblem:
         times: Array,
         machine: Machine,
     ) -> SimulationConstants:
-        """How the numbers of a simulation change with an unknown.
+        """Derivative of the simulation constants by an unknown.
 
-        By a difference of the numbers alone, which are smooth: backwards where it cannot go on.
+        It is a difference quotient of the constants, which are smooth, backwards at a bound.
         """
         is_start = i >= len(self.unknowns)
         sides = (1.0, -1.0)
@@ -519,7 +366,7 @@ class CalibrationProblem:
                 raise InputError(
                     f"'{unknown.name}' cannot be varied about "
                     f"{unknown.start + unknown.scale * z[i]:g}, where the machine has other "
-                    "equations: begin it elsewhere"
+                    "equations: choose another start"
                 )
             return found.difference_quotient(base, side * _DIFFERENCE_STEP)
         raise AssertionError
@@ -528,7 +375,7 @@ class CalibrationProblem:
 def _step_size_and_count(
     case: RecordingCase, max_step: float, training_only: bool
 ) -> tuple[float, int]:
-    """Length [s], at most some, and number of steps up to the last instant, or that is fitted."""
+    """Step size [s] and number of steps up to the last instant, or the last training instant."""
     time = case.inputs.time
     step = float(np.median(np.diff(time)))
     step /= np.ceil(step / max_step)

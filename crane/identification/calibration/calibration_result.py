@@ -1,4 +1,4 @@
-"""What a calibration found, how well it is known, and how well the machine follows now."""
+"""Result of a calibration: parameters with intervals, channels before and after, report."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,33 +10,38 @@ from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.identification.calibration.calibration_problem import noise_std
-from crane.identification.calibration.correlated_parameters import correlated_directions
-from crane.identification.calibration.profile_likelihood import ProfileEnds
-from crane.identification.calibration.score_test import ScoreTestResult
+from crane.description.sensors import PRESSURE_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
+from crane.identification.calibration.calibration_statistics import (
+    ProfileEnds,
+    ScoreTestResult,
+    correlated_directions,
+)
+from crane.identification.calibration.recording_case import noise_std
 from crane.machine import Machine
 
-_DEGRADATION_FACTOR = 1.1  # times what was left before
+_DEGRADATION_FACTOR = 1.1  # times the residual before
 LOWER_MINIMUM_WARNING = (
-    "Near these numbers the machine follows better still, where the search did not end: calibrate "
-    "again from there, or fit fewer numbers."
+    "There is a lower minimum near these parameters: calibrate again from there, or fit fewer "
+    "parameters."
 )
+_MAX_GROUPS = 8  # groups of about equal size
+_REST_SPEED_SHARE = 0.02  # of the largest speed, below which a drive is at rest
 
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """One number.
+    """Fitted parameter.
 
     Attributes:
-        name: Its name.
-        start: Before.
-        value: Fitted.
-        interval_half_width: Half of its interval of 95 %, as if there were no bounds.
-        at_bound: Whether it is on a bound.
-        is_unidentifiable: Whether the recordings do not tell it.
-        unit: Its SI unit, "" of a common factor.
-        members: Numbers of the machine and its sensors that it changed, as they were.
-        profile_ends: What the simulation says of the interval's ends.
+        name: Name of the parameter.
+        start: Value before.
+        value: Fitted value.
+        interval_half_width: Half width of its 95 % interval, without regard to bounds.
+        at_bound: Whether a bound is active.
+        is_unidentifiable: Whether the recordings do not determine it.
+        unit: SI unit, "" for a common factor.
+        members: Parameters that it changed, with their values before.
+        profile_ends: Profile likelihood at the ends of the interval.
     """
 
     name: str
@@ -51,17 +56,17 @@ class FittedParameter:
 
     @property
     def is_common_factor(self) -> bool:
-        """Whether it is a common factor of several numbers."""
+        """Whether it is a common factor of several parameters."""
         return "*" in self.name
 
     @property
     def initial_value(self) -> float:
-        """What the machine had, 1 of a common factor."""
+        """Value of the machine before, 1 for a common factor."""
         return 1.0 if self.is_common_factor or not self.members else self.members[0][1]
 
     @property
     def changed_significantly(self) -> bool:
-        """Whether what the machine had is outside of the interval of what is told."""
+        """Whether the value before is outside of the interval of an identifiable parameter."""
         return (
             not (self.is_unidentifiable or self.at_bound)
             and abs(self.value - self.initial_value) > self.interval_half_width
@@ -69,17 +74,17 @@ class FittedParameter:
 
     @property
     def remark(self) -> str:
-        """What is to be known beside the interval."""
+        """Remark beside the interval, or ""."""
         status = (
             "on its bound"
             if self.at_bound
-            else "not told by the recordings" * self.is_unidentifiable
+            else "not determined by the recordings" * self.is_unidentifiable
         )
         return ", ".join(filter(None, (status, self.profile_ends.remark)))
 
     @property
     def notes(self) -> dict[str, str]:
-        """Words for each number of the machine, as comments of a file have them."""
+        """Comment for each changed parameter in a machine file."""
         interval_text, remark = (
             f"±{self.interval_half_width:.2g}, 95 %",
             self.remark and f", {self.remark}",
@@ -98,17 +103,17 @@ class FittedParameter:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationChannel(OneLineRepr):
-    """A channel of a recording, SI units.
+    """Channel of a recording before and after the calibration, in SI units.
 
     Attributes:
-        recording: Name of its file.
-        name: Of the column.
-        unit: Its unit.
+        recording: Name of the file.
+        name: Name of the column.
+        unit: Unit of the channel.
         time: (N,) [s].
-        train_mask: (N,) which instants were fitted.
-        measured: (N,).
-        simulated_before: (N,) simulated as the machine was.
-        simulated_after: (N,) as it is now.
+        train_mask: (N,) mask of the training data.
+        measured: (N,) measured values.
+        simulated_before: (N,) simulated values of the machine before.
+        simulated_after: (N,) simulated values of the fitted machine.
     """
 
     recording: str
@@ -122,11 +127,11 @@ class CalibrationChannel(OneLineRepr):
 
     @property
     def noise(self) -> float:
-        """Standard deviation of its noise, see `noise_std`."""
+        """Standard deviation of the noise, see `noise_std`."""
         return noise_std(self.measured)
 
     def rms(self, simulated: Array, training: bool) -> float:
-        """Root mean square of simulated less measured, over what was fitted or held out."""
+        """Root mean square of simulated minus measured over training or held-out data."""
         mask = self.train_mask if training else np.logical_not(self.train_mask)
         residual = (simulated - self.measured)[mask]
         return float(np.sqrt(np.mean(residual**2))) if len(residual) else float("nan")
@@ -134,22 +139,21 @@ class CalibrationChannel(OneLineRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Result):
-    """A machine fitted to recordings.
+    """Result of a calibration.
 
     Attributes:
-        machine: With the fitted numbers.
-        parameters: Numbers, in the order in which they were named.
+        machine: The fitted machine.
+        parameters: Fitted parameters, in the given order.
         channels: Channels before and after.
-        changes: Numbers of the machine that differ, as `crane.load(changes=)` takes them.
-        correlated_pairs: Pairs of names that the recordings tell apart badly, with their
-            correlation.
-        simulation_count: Simulations it took.
-        score_tests: Numbers that were not fitted and would help.
-        correlation: (n, n) of the numbers.
-        states: By recording, velocities and chamber pressures of the drives of the fitted machine.
-        is_lowest_minimum: Whether no lower minimum was seen at the ends of the intervals.
-        unobserved_parameters: Numbers that were chosen and of which nothing was seen; they stay as
-            they were.
+        changes: Parameter changes, as in `crane.load(changes=)`.
+        correlated_pairs: Pairs of strongly correlated parameters, with their correlation.
+        simulation_count: Number of simulations.
+        score_tests: Score tests of parameters that were not fitted.
+        correlation: (n, n) correlations of the parameters.
+        states: Velocities and chamber pressures of the drives of the fitted machine, by recording.
+        is_lowest_minimum: Whether no lower minimum was found at the ends of the intervals.
+        unobserved_parameters: Selected parameters without an effect in the recordings; they are
+            unchanged.
     """
 
     machine: Machine
@@ -165,23 +169,24 @@ class Calibration(Result):
     unobserved_parameters: tuple[str, ...] = ()
 
     def _one_line(self) -> str:
-        """What was fitted to, and the numbers that are told."""
+        """Machine, channels, and identifiable parameters."""
         identifiable = [x for x in self.parameters if not (x.at_bound or x.is_unidentifiable)]
         values = ", ".join(f"{x.name} = {x.value:.5g}" for x in identifiable)
-        numbers, channels = format_count(len(self.parameters), "number"), len(self.channels)
+        parameters, channels = format_count(len(self.parameters), "parameter"), len(self.channels)
         return (
-            f"Calibration of '{self.machine.name}': {len(identifiable)} of {numbers} told by "
+            f"Calibration of '{self.machine.name}': {len(identifiable)} of {parameters} "
+            "determined by "
             f"{format_count(channels, 'channel')}{': ' * bool(identifiable)}{values}"
         )
 
     @property
     def notes(self) -> dict[str, str]:
-        """What is to be said of the fitted numbers beside them, by name."""
+        """Comments on the changed parameters by name."""
         return {name: text for one in self.parameters for name, text in one.notes.items()}
 
     @property
     def correlated_directions(self) -> list[dict[str, float]]:
-        """What the recordings cannot tell apart, see `together`."""
+        """Directions that the recordings do not determine, see `correlated_directions`."""
         half_widths = [one.interval_half_width for one in self.parameters]
         return correlated_directions(
             [one.name for one in self.parameters], self.correlation, np.array(half_widths)
@@ -189,12 +194,12 @@ class Calibration(Result):
 
     @property
     def values(self) -> dict[str, float]:
-        """Fitted numbers by name."""
+        """Fitted values by name."""
         return {one.name: one.value for one in self.parameters}
 
     @property
     def degraded_channels(self) -> list[str]:
-        """Channels that were held out and are followed worse than before."""
+        """Channels with larger residuals on held-out data than before."""
         several = len({x.recording for x in self.channels}) > 1
         return [
             f"{x.recording}: {x.name}" if several else x.name
@@ -205,35 +210,34 @@ class Calibration(Result):
 
     @property
     def cautions(self) -> list[str]:
-        """What is to be said of it as a whole."""
+        """Warnings about the calibration as a whole."""
         texts = [] if self.is_lowest_minimum else [LOWER_MINIMUM_WARNING]
         if self.degraded_channels:
             texts.append(
-                f"Held out, the machine follows worse than before in "
-                f"{', '.join(self.degraded_channels)}: fit "
-                "fewer numbers, or record more."
+                "On held-out data the residuals are larger than before in "
+                f"{', '.join(self.degraded_channels)}: fit fewer parameters, or record more."
             )
         if self.unobserved_parameters:
             texts.append(
-                "Nothing of these was seen, they are left as the machine has them: "
+                "These have no effect in the recordings and are unchanged: "
                 f"{', '.join(self.unobserved_parameters)}."
             )
         return texts
 
     @property
     def command_line_options(self) -> str:
-        """What the command line takes for the same machine."""
+        """Options of the command line for the same machine."""
         return " ".join(f"--set {name}={value:.8g}" for name, value in self.changes.items())
 
     def describe_direction(self, direction: Mapping[str, float]) -> str:
-        """A direction in words: numbers that may change together."""
+        """Text of a direction: parameters that may change together."""
         units = {one.name: one.unit for one in self.parameters}
         return ", ".join(f"{x} by {by:+.2g} {units[x]}".rstrip() for x, by in direction.items())
 
     def to_text(self) -> str:
-        """A report, Markdown."""
+        """Report in Markdown."""
         lines = [
-            "| number | before | fitted | 95 % interval | |",
+            "| parameter | before | fitted | 95 % interval | |",
             "| --- | ---: | ---: | ---: | --- |",
         ]
         for one in self.parameters:
@@ -244,16 +248,16 @@ class Calibration(Result):
         for caution in self.cautions:
             lines += ["", caution]
         if self.correlated_pairs:
-            lines += ["", "Told apart badly, of which a combination alone is known:", ""]
+            lines += ["", "Strongly correlated, of which only a combination is identifiable:", ""]
             lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.correlated_pairs]
         if self.correlated_directions:
-            lines += ["", "What changes together without the recordings telling it:", ""]
+            lines += ["", "Directions that the recordings do not determine:", ""]
             lines += [
                 f"- {self.describe_direction(direction)}"
                 for direction in self.correlated_directions
             ]
         if self.score_tests:
-            lines += ["", "What would take away more of what is left, if it were fitted, too:", ""]
+            lines += ["", "Parameters whose fit would reduce the cost further:", ""]
             lines += [
                 f"- {x.name} at about {x.value:.3g}: {100 * x.cost_reduction:.0f} %"
                 for x in self.score_tests
@@ -280,3 +284,98 @@ class Calibration(Result):
         if self.changes:
             lines += ["", f"    {self.command_line_options}"]
         return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ResidualDependence(OneLineRepr):
+    """Residuals of a channel over the training data, and the motion of a drive.
+
+    Attributes:
+        name: Name of the channel.
+        unit: Unit of the channel.
+        residual: (N,) simulated minus measured.
+        drive: Joint whose motion is compared.
+        speed_unit: Unit of its speed.
+        chamber: Chamber "a" or "b" of the pressure.
+        motion: Speed, pressure and direction (-1, 0 at rest, 1), (N,) each.
+        correlation_ratios: Correlation ratio of the residual with each of these.
+    """
+
+    name: str
+    unit: str
+    residual: Array
+    drive: str
+    speed_unit: str
+    chamber: str
+    motion: Mapping[str, Array]
+    correlation_ratios: Mapping[str, float]
+
+
+def residual_dependences(calibration: Calibration) -> list[ResidualDependence]:
+    """Residual dependence of every fitted channel, over all recordings.
+
+    A channel is compared with the drive in its name, else with the drive of the largest
+    correlation ratio with the speed. The list is empty for a machine without valves.
+    """
+    channels: dict[str, list[CalibrationChannel]] = {}
+    for channel in calibration.channels:
+        if channel.train_mask.any() and channel.recording in calibration.states:
+            channels.setdefault(channel.name, []).append(channel)
+    dependences = []
+    for name, same_name in channels.items():
+        drives = [
+            x.removesuffix(VELOCITY_SUFFIX)
+            for x in calibration.states[same_name[0].recording]
+            if x.endswith(VELOCITY_SUFFIX)
+        ]
+        named_drives = [drive for drive in drives if f"_{drive}_" in f"_{name}_"]
+        options = [
+            _residual_dependence(calibration, same_name, x)
+            for x in ([max(named_drives, key=len)] if named_drives else drives)
+        ]
+        dependences += (
+            [max(options, key=lambda one: one.correlation_ratios["speed"])] if options else []
+        )
+    return dependences
+
+
+def group_samples(x: Array) -> list[NDArray[np.intp]]:
+    """Groups of samples (N,) by x, of about equal size, or one per value if x has few values."""
+    values = np.unique(x)
+    if len(values) <= _MAX_GROUPS:
+        return [np.flatnonzero(x == value) for value in values]
+    return list(np.array_split(np.argsort(x, kind="stable"), _MAX_GROUPS))
+
+
+def correlation_ratio(residual: Array, x: Array) -> float:
+    """Correlation ratio of a residual (N,) with x (N,), 0 to 1."""
+    deviation = residual - residual.mean()
+    total = float(deviation @ deviation)
+    explained = sum(len(some) * float(deviation[some].mean()) ** 2 for some in group_samples(x))
+    return explained / total if total else 0.0
+
+
+def _residual_dependence(
+    calibration: Calibration, channels: list[CalibrationChannel], drive: str
+) -> ResidualDependence:
+    """Dependence of channels of one name on the motion of a drive."""
+    name, unit = channels[0].name, channels[0].unit
+    chamber = "b" if name == f"{PRESSURE_PREFIX}{drive}_b" else "a"
+
+    def joined(column: str) -> Array:
+        return np.concatenate(
+            [calibration.states[x.recording][column][x.train_mask] for x in channels]
+        )
+
+    residual = np.concatenate([(x.simulated_after - x.measured)[x.train_mask] for x in channels])
+    speed, pressure = (
+        joined(drive + VELOCITY_SUFFIX),
+        joined(f"{PRESSURE_PREFIX}{drive}_{chamber}"),
+    )
+    is_moving = np.abs(speed) > _REST_SPEED_SHARE * np.abs(speed).max()
+    motion = {"speed": speed, "pressure": pressure, "direction": np.sign(speed) * is_moving}
+    correlation_ratios = {what: correlation_ratio(residual, x) for what, x in motion.items()}
+    speed_unit = VELOCITY_UNITS[calibration.machine.unit(drive)]
+    return ResidualDependence(
+        name, unit, residual, drive, speed_unit, chamber, motion, correlation_ratios
+    )

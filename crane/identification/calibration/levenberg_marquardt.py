@@ -1,7 +1,7 @@
-"""The search for a calibration: Levenberg and Marquardt's method within bounds."""
+"""Levenberg-Marquardt method of a calibration, within bounds and with channel scales."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,56 +11,48 @@ from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.identification.calibration.calibration_problem import (
     DERIVATIVE_TOLERANCE,
     CalibrationProblem,
-    RecordingCase,
-    noise_std,
 )
-from crane.identification.calibration.score_test import ScoreTestResult, score_test
-from crane.identification.calibration.unknowns import Unknown
+from crane.identification.calibration.recording_case import RecordingCase, noise_std
 
 Progress = Callable[[float], None]
 
-_MAX_WEIGHT_ROUNDS = 3  # of weights
-_SCALE_TOLERANCE = 0.05  # change of a channel's size, as a share, that ends them
-# shares of the smoothing of friction, and of that of derivatives: first, and in the end
+_MAX_WEIGHT_ROUNDS = 3  # rounds of channel scales
+_SCALE_TOLERANCE = 0.05  # relative change of channel scales that ends them
+# smoothing of friction and least smoothing for derivatives: initial rounds, and final
 _SMOOTHING_SCHEDULE, _FINAL_SMOOTHING = (
     ((1.0, 1.0), (0.3, 0.3), (0.1, 0.1), (0.0, 0.3)),
     (0.0, 0.03),
 )
-_COVARIANCE_SMOOTHING = 0.1  # of derivatives that tell how well all is known
-_MAX_ITERATIONS = 40  # of Gauss-Newton between them
-_COST_TOLERANCE, _INITIAL_COST_TOLERANCE = (
-    1e-4,
-    1e-2,
-)  # change of the cost, as a share, that ends them
-_MIN_RELATIVE_SCALE, _MIN_SCALE = (
-    1e-6,
-    1e-9,
-)  # of a channel's largest value, and of one that is zero [SI]
-_MAX_SCALE_SHARE = 0.2  # of a channel's variation, that no channel may be off by for nothing
-_INITIAL_DAMPING, _CAUTIOUS_DAMPING = (
-    1e-3,
-    1.0,
-)  # Levenberg's damping at first, and far from the end
-_DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of it
-_PART_DURATION = 2.0  # [s] of recordings that are begun with
-_COARSE_DERIVATIVE_TOLERANCE = 1e-2  # error of derivatives far from the end
-_BLOCK_COUNT_RANGE = 8, 40  # least and most blocks of a covariance
+_COVARIANCE_SMOOTHING = 0.1  # smoothing for derivatives of the covariance
+_MAX_ITERATIONS = 40  # iterations per round
+# relative change of the cost that ends the iterations
+_COST_TOLERANCE, _INITIAL_COST_TOLERANCE = 1e-4, 1e-2
+# least scale per largest value of a channel, and absolute [SI]
+_MIN_RELATIVE_SCALE, _MIN_SCALE = 1e-6, 1e-9
+_MAX_SCALE_SHARE = 0.2  # largest scale per variation of a channel
+# initial damping, and that far from the minimum
+_INITIAL_DAMPING, _CAUTIOUS_DAMPING = 1e-3, 1.0
+_DAMPING_INCREASE, _DAMPING_DECREASE, _MAX_DAMPING = 10.0, 0.2, 1e8  # of the damping
+_PART_DURATION = 2.0  # [s] of the parts of the initial search
+_COARSE_DERIVATIVE_TOLERANCE = 1e-2  # relative error of derivatives far from the minimum
+_BLOCK_COUNT_RANGE = 8, 40  # range of the number of blocks of a covariance
 
 
 class LevenbergMarquardt:
-    """Levenberg and Marquardt's method within bounds, and the channels' weights.
+    """Levenberg-Marquardt method within bounds, with channel scales by their residuals.
 
     Attributes:
-        channel_scales: (k,) by sensor, what is left of its channel.
-        jacobian: (M, p) weighted derivatives at the end, of what is fitted.
-        residual: (M,) weighted, likewise.
-        blocks: (M,) block of each row.
+        problem: The calibration problem.
+        channel_scales: Channel scales by sensor.
+        jacobian: (M, p) weighted derivatives of the training data at the minimum.
+        residual: (M,) weighted residuals, likewise.
+        blocks: (M,) time of each row, unique over recordings.
     """
 
     def __init__(
         self, problem: CalibrationProblem, progress: Progress | None, iteration_count: int = 0
     ):
-        self._problem, self._progress = problem, progress
+        self.problem, self._progress = problem, progress
         unknowns = problem.unknowns
         start_count = problem.unknown_count - len(unknowns)
         self.low = np.array(
@@ -77,25 +69,25 @@ class LevenbergMarquardt:
         self._has_stiction = bool(find_stick_slip_columns(problem.machine))
 
     def restricted_search(self, problem: CalibrationProblem, z: Array) -> "LevenbergMarquardt":
-        """A search of fewer numbers that begins near where this one ended."""
+        """Method for fewer unknowns, with these channel scales and an initial guess."""
         search = LevenbergMarquardt(problem, self._progress, self._iteration_count)
         search.channel_scales, search._initial_guess = self.channel_scales, z
         return search
 
     def run(self) -> Array:
-        """The unknowns."""
-        problem = self._problem
+        """Run all rounds; returns the unknowns at the minimum."""
+        problem = self.problem
         z = self.smoothed_minimum() if self._initial_guess is None else self._initial_guess
         problem.derivative_tolerance = DERIVATIVE_TOLERANCE
-        # what smoothed friction leaves is no measure of what is left in the end: it is taken anew
+        # residuals with smoothed friction do not give the final scales: they are updated
         for problem.smooth, problem.slopes in _SMOOTHING_SCHEDULE if self._has_stiction else ():
             z = self._minimize(z, _INITIAL_COST_TOLERANCE)
             self.channel_scales = self._updated_channel_scales(z)
         return self.nearest_minimum(z)
 
     def smoothed_minimum(self) -> Array:
-        """About the unknowns, with friction that is smoothed, and linearized there."""
-        problem = self._problem
+        """Approximate minimum with smoothed friction, and the linearization there."""
+        problem = self.problem
         self.channel_scales = self._max_channel_scales()
         problem.smooth, problem.derivative_tolerance = (
             float(self._has_stiction),
@@ -108,8 +100,8 @@ class LevenbergMarquardt:
         return z
 
     def nearest_minimum(self, z: Array) -> Array:
-        """The unknowns of the minimum that is nearest to others, with its own weights."""
-        problem = self._problem
+        """Nearest minimum to some unknowns, with updated channel scales."""
+        problem = self.problem
         problem.smooth, problem.slopes = _FINAL_SMOOTHING
         for _ in range(_MAX_WEIGHT_ROUNDS):
             z = self._minimize(z)
@@ -126,15 +118,15 @@ class LevenbergMarquardt:
         return z
 
     def _max_channel_scales(self) -> dict[str, float]:
-        """The largest size of each channel, by its variation and its noise."""
+        """Largest scale of each channel, by its variation and its noise."""
         noise, spread = self._channel_noise(), self._channel_variation()
         return {name: max(noise[name], _MAX_SCALE_SHARE * spread[name]) for name in noise}
 
     def _updated_channel_scales(self, z: Array) -> dict[str, float]:
-        """Sizes of the channels by what is left of them."""
+        """Channel scales by the residuals."""
         noise, max_scales = self._channel_noise(), self._max_channel_scales()
         residual_rms = self._channel_rms(
-            [self._problem.residuals(case, z) for case in self._training_cases]
+            [self.problem.residuals(case, z) for case in self.training_cases]
         )
         return {
             name: min(max(noise[name], residual_rms[name]), max_scales[name])
@@ -142,17 +134,17 @@ class LevenbergMarquardt:
         }
 
     def _best_initial_minimum(self, z: Array) -> Array:
-        """The better one of two minima: from the file's numbers, and from those of short parts.
+        """The better of two minima: from the initial parameters, and from a fit to short parts.
 
-        Over long motions, one swing more or less is a minimum, too, and so is what never moves.
+        Long motions have local minima with another number of oscillations, or without motion.
         """
-        problem, count = self._problem, len(self._problem.unknowns)
+        problem, count = self.problem, len(self.problem.unknowns)
         minima = [self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             parts = [
                 x
-                for case in self._training_cases
+                for case in self.training_cases
                 for x in case.split_training(problem.machine, _PART_DURATION)
             ]
         if parts:
@@ -175,14 +167,15 @@ class LevenbergMarquardt:
         return min(minima, key=self._cost)
 
     @property
-    def _training_cases(self) -> list[RecordingCase]:
-        return [case for case in self._problem.cases if case.train_mask.any()]
+    def training_cases(self) -> list[RecordingCase]:
+        """Recordings with training data."""
+        return [case for case in self.problem.cases if case.train_mask.any()]
 
     def _channel_noise(self) -> dict[str, float]:
-        """Of each channel, by its third differences, and no less than its digits."""
+        """Noise of each channel, by third differences, with a lower bound by its digits."""
         variances: dict[str, list[float]] = {}
         largest: dict[str, float] = {}
-        for case in self._training_cases:
+        for case in self.training_cases:
             for name, x in zip(case.sensors, case.measured.T, strict=True):
                 known_noise = case.known_sensors[name].noise if name in case.known_sensors else 0.0
                 variances.setdefault(name, []).append((known_noise or noise_std(x)) ** 2)
@@ -193,13 +186,13 @@ class LevenbergMarquardt:
         }
 
     def _channel_variation(self) -> dict[str, float]:
-        """Of each channel, the largest variation of those in its unit.
+        """Variation of each channel: the largest of all channels in the same unit.
 
-        How far a model is off depends on what moves, not on which channel does.
+        Model errors depend on the motion, not on the channel.
         """
         variation_by_unit: dict[str, float] = {}
         units: dict[str, str] = {}
-        for case in self._training_cases:
+        for case in self.training_cases:
             for name, x in zip(case.sensors, case.measured[case.train_mask].T, strict=True):
                 units[name] = case.table.units[name]
                 variation_by_unit[units[name]] = max(
@@ -208,9 +201,9 @@ class LevenbergMarquardt:
         return {name: variation_by_unit[unit] for name, unit in units.items()}
 
     def _channel_rms(self, residuals: list[Array]) -> dict[str, float]:
-        """Root mean square of each channel over what is fitted."""
+        """Root mean square residual of each channel over the training data."""
         residuals_by_channel: dict[str, list[Array]] = {}
-        for case, residual in zip(self._training_cases, residuals, strict=True):
+        for case, residual in zip(self.training_cases, residuals, strict=True):
             for name, x in zip(case.sensors, residual[case.train_mask].T, strict=True):
                 residuals_by_channel.setdefault(name, []).append(x)
         return {
@@ -218,37 +211,37 @@ class LevenbergMarquardt:
             for name, x in residuals_by_channel.items()
         }
 
-    def _weights(self, case: RecordingCase) -> Array:
-        """(N, k) one over the channels' sizes, 0 of what is held out."""
+    def channel_weights(self, case: RecordingCase) -> Array:
+        """Weights (N, k): one over the channel scales, 0 for held-out data."""
         return case.train_mask[:, None] / np.array(
             [self.channel_scales[name] for name in case.sensors]
         )
 
     def weighted_residuals(self, z: Array) -> Array:
-        """(M,) weighted residuals.
+        """Weighted residuals (M,) of the training data.
 
         Raises:
-            CraneError: The machine cannot be, or its simulation fails.
+            CraneError: The machine is not valid, or its simulation fails.
         """
         residuals = [
-            self._problem.residuals(case, z, training_only=True) * self._weights(case)
-            for case in self._training_cases
+            self.problem.residuals(case, z, training_only=True) * self.channel_weights(case)
+            for case in self.training_cases
         ]
         return np.concatenate(
             [
                 left[case.train_mask].ravel()
-                for left, case in zip(residuals, self._training_cases, strict=True)
+                for left, case in zip(residuals, self.training_cases, strict=True)
             ]
         )
 
     def _cost(self, z: Array) -> float:
-        """Half the sum of squares, infinite where the machine cannot be."""
+        """Half the sum of squares, infinite if the simulation fails."""
         total = float(np.sum((self.prior * z) ** 2))
-        for case in self._training_cases:
+        for case in self.training_cases:
             try:
-                residual = self._problem.residuals(case, z, training_only=True) * self._weights(
-                    case
-                )
+                residual = self.problem.residuals(
+                    case, z, training_only=True
+                ) * self.channel_weights(case)
             except CraneError:
                 return np.inf
             total += float(np.sum(residual**2))
@@ -256,12 +249,12 @@ class LevenbergMarquardt:
 
     def _linearize(self, z: Array) -> None:
         rows, weighted, blocks = [], [], []
-        for number, case in enumerate(self._training_cases):
-            residual, derivatives = self._problem.linearize(case, z)
-            weights = self._weights(case)
+        for number, case in enumerate(self.training_cases):
+            residual, derivatives = self.problem.linearize(case, z)
+            weights = self.channel_weights(case)
             mask = case.train_mask
             rows.append(
-                (derivatives * weights[:, :, None])[mask].reshape(-1, self._problem.unknown_count)
+                (derivatives * weights[:, :, None])[mask].reshape(-1, self.problem.unknown_count)
             )
             weighted.append((residual * weights)[mask].ravel())
             time = np.repeat(case.inputs.time[mask], len(case.sensors))
@@ -269,45 +262,14 @@ class LevenbergMarquardt:
         self.jacobian, self.residual = np.vstack(rows), np.concatenate(weighted)
         self.blocks = np.concatenate(blocks)
 
-    def score_test(self, candidates: Sequence[Unknown], z: Array) -> list[ScoreTestResult]:
-        """Numbers that are not fitted and would help, see `ScoreTestResult`."""
-        problem = self._problem
-        if not candidates:
-            return []
-        extended_problem = CalibrationProblem(
-            problem.machine, [*problem.unknowns, *candidates], problem.cases
-        )
-        extended_problem.smooth, extended_problem.slopes = problem.smooth, problem.slopes
-        count, candidate_count = len(problem.unknowns), len(candidates)
-        extended_unknowns = np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
-        rows = []
-        for case, extended_case in zip(problem.cases, extended_problem.cases, strict=True):
-            if not case.train_mask.any():
-                continue
-            try:
-                _, derivatives = extended_problem.linearize(
-                    extended_case, extended_unknowns, set(range(count))
-                )
-            except CraneError:  # a hint is not worth what was found
-                return []
-            candidate_derivatives = (derivatives * self._weights(case)[:, :, None])[
-                case.train_mask
-            ]
-            rows.append(
-                candidate_derivatives.reshape(-1, extended_problem.unknown_count)[
-                    :, count : count + candidate_count
-                ]
-            )
-        return score_test(candidates, self.jacobian, np.vstack(rows), self.residual, self.prior)
-
     def _minimize(
         self, z: Array, cost_tolerance: float = _COST_TOLERANCE, damping: float = _INITIAL_DAMPING
     ) -> Array:
-        """The nearest minimum for the present weights."""
+        """Nearest minimum for the present channel scales."""
         cost = self._cost(z)
-        if not np.isfinite(cost):  # say why
-            for case in self._training_cases:
-                self._problem.residuals(case, z)
+        if not np.isfinite(cost):  # raises the error
+            for case in self.training_cases:
+                self.problem.residuals(case, z)
         for _ in range(_MAX_ITERATIONS):
             self._linearize(z)
             hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
@@ -328,7 +290,7 @@ class LevenbergMarquardt:
         return z
 
     def _step(self, z: Array, hessian: Array, gradient: Array, damping: float) -> Array:
-        """A damped step, of which what would leave its bounds stays on them."""
+        """Damped step within the bounds, by an active set."""
         size = np.diag(hessian)
         scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max()))
         free = np.ones(len(z), dtype=bool)
@@ -355,10 +317,10 @@ class LevenbergMarquardt:
             self._progress(1.0 - 0.97**self._iteration_count)
 
     def covariance(self, z: Array) -> tuple[Array, int]:
-        """(p, p) of the unknowns in their scales, and the number of blocks.
+        """Covariance (p, p) of the scaled unknowns, and the number of blocks.
 
-        H^-1 (sum_b g_b g_b^T) H^-1 with g_b the gradient of a block, and at least that of white
-        noise; as if there were no bounds.
+        It is H^-1 (sum_b g_b g_b^T) H^-1 with the gradients g_b of blocks, at least that of white
+        noise, without regard to bounds.
         """
         hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
         inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
@@ -376,13 +338,13 @@ class LevenbergMarquardt:
         return robust * np.outer(inflation, inflation), count
 
     def _block_duration(self) -> tuple[float, int]:
-        """Of a block [s]: four times over which what is left remembers itself."""
+        """Duration of a block [s], four correlation times of the residuals, and their number."""
         correlation_time, duration = 0.0, 0.0
-        for case in self._training_cases:
+        for case in self.training_cases:
             time = case.inputs.time[case.train_mask]
             duration += float(time[-1] - time[0])
         start = 0
-        for case in self._training_cases:
+        for case in self.training_cases:
             k, count = len(case.sensors), int(case.train_mask.sum())
             rows = self.residual[start : start + k * count].reshape(count, k)
             start += k * count
@@ -397,7 +359,7 @@ class LevenbergMarquardt:
 
 
 def _correlation_time(x: Array) -> float:
-    """Samples over which a sequence remembers itself: its integral correlation time."""
+    """Integral correlation time of a sequence in samples."""
     x = x - x.mean()
     power = float(x @ x)
     if not power:

@@ -1,4 +1,4 @@
-"""What a calibration fits: numbers of the machine, shares of several, sensors, starts."""
+"""Unknowns of a calibration: machine parameters, common factors, sensor parameters."""
 
 import fnmatch
 from collections.abc import Mapping, Sequence
@@ -10,19 +10,11 @@ from crane.description.sensors import SENSOR_PREFIX
 from crane.description.specification import MachineSpec
 
 SENSOR_PARAMETER_DEFAULTS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
-_ZERO_SCALES = {
-    "rad": 0.02,
-    "m": 5e-3,
-    "rad/s": 0.02,
-    "m/s": 0.01,
-    "Pa": 1e5,
-    "V": 0.05,
-}  # of zeros that sensors have
+# scales of sensor zeros
+_ZERO_SCALES = {"rad": 0.02, "m": 5e-3, "rad/s": 0.02, "m/s": 0.01, "Pa": 1e5, "V": 0.05}
 _DELAY_SCALE = 0.02  # [s]
-_MIN_SHARE = (
-    1e-3  # share of a number's start below which it does not go, where it must be positive
-)
-# Words that numbers end with which may have either sign.
+_MIN_SHARE = 1e-3  # lower bound of a positive parameter, per start
+# last words of parameter names with either sign
 _SIGNED_PARAMETERS = (
     "x", "y", "z", "roll", "pitch", "yaw", "xx", "xy", "xz", "yy", "yz", "zz", "neutral", "full",
     "lower", "upper", "coulomb_offset", "viscous_offset",
@@ -31,19 +23,18 @@ _SIGNED_PARAMETERS = (
 
 @dataclass(frozen=True)
 class Unknown:
-    """One number that is fitted, value = start + scale z.
+    """Unknown of a calibration, value = start + scale z.
 
     Attributes:
-        name: Of a number of the machine; with `*` a common factor of all numbers that match;
+        name: Name of a machine parameter; with `*` a common factor of all that match;
             `sensor.COLUMN.zero`, `.scale` or `.delay`.
-        start: Where the search begins.
-        low: Least value.
-        high: Largest.
-        scale: How much counts as 1.
-        members: Numbers of the machine that it changes, with what they are at first.
-        sensor: Column of the sensor, "" of a number of the machine.
-        prior: One over the standard deviation of what is known of it before, in its scale; 0 if
-            nothing is.
+        start: Initial guess.
+        low: Lower bound.
+        high: Upper bound.
+        scale: Change for z = 1.
+        members: Parameters that it changes, with their initial values.
+        sensor: Column of the sensor, "" for a machine parameter.
+        prior: One over the standard deviation of the prior, in its scale; 0 without a prior.
     """
 
     name: str
@@ -56,14 +47,14 @@ class Unknown:
     prior: float = 0.0
 
     def changes(self, value: float) -> dict[str, float]:
-        """Numbers of the machine at a value."""
+        """Changed parameters by name for a value of the unknown."""
         if "*" in self.name:
             return {name: value * start for name, start in self.members}
         return {name: value for name, _ in self.members}
 
     @property
     def sensor_parameter(self) -> str:
-        """Of a sensor: zero, scale or delay."""
+        """The sensor parameter zero, scale or delay, "" for a machine parameter."""
         return self.name.rpartition(".")[2] if self.sensor else ""
 
 
@@ -73,21 +64,21 @@ def build_unknowns(
     parameters: Mapping[str, float],
     sensor_units: Mapping[str, str],
 ) -> list[Unknown]:
-    """What is to be fitted.
+    """Build the unknowns of a calibration.
 
     Args:
-        fit: By name None, a start, or (start, low, high); None of these where not known. Or names.
-        spec: The machine's description.
-        parameters: Of the machine and its sensors by name, see `parameters`.
-        sensor_units: Units by column.
+        fit: Parameters by name: None, a start, or (start, low, high), each of which may be None;
+            or names only.
+        spec: Specification of the machine.
+        parameters: Parameters of the machine and its sensors by name.
+        sensor_units: Units of the sensors by column.
 
     Raises:
-        InputError: An unknown name, bounds that hold no value, or a number of which nothing tells
-            how large it may be.
+        InputError: A name is unknown, bounds are empty, or the scale of a parameter is unknown.
     """
     requested = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
     if not requested:
-        raise InputError("nothing is to be fitted, name numbers such as 'payload.mass'")
+        raise InputError("nothing is to be fitted, name parameters such as 'payload.mass'")
     return [
         _build_unknown(name, value, spec, parameters, sensor_units)
         for name, value in requested.items()
@@ -120,7 +111,7 @@ def _build_unknown(
     if "*" in name:
         found = {x: parameters[x] for x in fnmatch.filter(parameters, name) if parameters[x]}
         if not found:
-            raise InputError(f"'{name}' matches no number of the machine that is not 0")
+            raise InputError(f"'{name}' matches no nonzero parameter of the machine")
         initial = 1.0 if start is None else start
         lower = _MIN_SHARE if low is None else low
         return _bounded_unknown(name, initial, lower, high, 1.0, tuple(found.items()))
@@ -142,7 +133,7 @@ def _build_unknown(
     elif low is not None and high is not None:
         size = high - low
     else:
-        raise InputError(f"'{name}' is 0 at first, say how large it may be: '{name}=0,LOW~HIGH'")
+        raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
     if name.endswith((".x", ".y", ".z")):
         size = min(size, 0.1)
     return _bounded_unknown(name, initial, low, high, size, ((name, parameters[name]),))

@@ -1,1 +1,1 @@
-"""Linear least squares: rows, estimators, noise, and how sure they are."""
+"""Linear estimation: regressors, estimators, noise models and covariances."""

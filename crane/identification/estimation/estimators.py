@@ -1,81 +1,19 @@
-"""Parameters theta of y = W theta + noise, and how well they are known.
+"""Estimators of theta in y = W theta + noise: least squares, Huber, instrumental variables.
 
-Rows come from joints (`groups`) at instants (`samples`); rows may be missing. The noise of a
-joint may be correlated in time, and with that of the other joints at the same instant. The
-regressor is read in blocks of rows, see `regressor.Regressor`, and may be larger than the memory.
+Rows belong to joints (`groups`) at instants (`samples`); rows may be missing. The noise of a joint
+may be correlated in time, and with that of other joints at the same instant. The regressor is read
+in blocks of rows, see `regressor.Regressor`, and may exceed the memory.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError
-from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.identification.estimation.jackknife import Jackknife
-from crane.identification.estimation.noise_model import NoiseModel, innovation_covariance
+from crane.identification.estimation.regression_problem import Estimate, Prior, RegressionProblem
 from crane.identification.estimation.regressor import (
     Regressor,
-    StoredRegressor,
-    triangular_factor,
-    triangular_factors,
 )
-
-Prior = tuple[Array, Array]
-"""Means (p,) and standard deviations (p,) of the parameters; infinite where nothing is known."""
-
-_HUBER_THRESHOLD = (
-    1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
-)
-_MAD_TO_STD = (
-    1.482602218505602  # standard deviation over median absolute deviation of normal noise
-)
-_CONVERGENCE_TOLERANCE = 1e-6  # standard deviations
-_ROUNDING_SHARE = 1e-8  # of the forces, what base parameters leave out as nothing new
-_MAX_ITERATIONS = 100
-_GAP_BLOCK = 4096  # instants without rows that are passed at once
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Estimate(OneLineRepr):
-    """Estimated parameters.
-
-    Attributes:
-        values: (p,).
-        covariance: (p, p), with the correlations of the noise.
-        residuals: y - W values (m,).
-        noise: Standard deviation of the noise of each group (g,).
-        effective_samples: Number of independent rows that tell the mean of a group's noise as well
-            as its N correlated rows, N variance / spectral density at zero (g,).
-        degrees_of_freedom: Degrees of freedom behind the standard deviations, see `Jackknife`.
-        condition: Condition number of W.
-        scaled_condition: The same with columns of length one.
-    """
-
-    values: Array
-    covariance: Array
-    residuals: Array
-    noise: Array
-    effective_samples: Array
-    degrees_of_freedom: float
-    condition: float
-    scaled_condition: float
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations (p,)."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Lower and upper ends (p, 2) of what covers the truth with this probability.
-
-        values -+ t std with Student's t for `degrees_of_freedom`.
-        """
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
 
 
 def least_squares(
@@ -87,19 +25,20 @@ def least_squares(
 ) -> Estimate:
     """Ordinary least squares: min |y - W theta|^2 (/ noise^2 + |(theta - mean) / std|^2).
 
-    The noise against which a prior counts is one number for all rows, taken from the residuals.
+    The noise that a prior is weighted against is common to all rows and estimated from the
+    residuals.
 
     Args:
         W: Regressor (m, p), as an array or in blocks.
         y: Forces (m,).
-        groups: Joint of each row (m,), 0, 1, ...; they differ in what their noise is like.
+        groups: Joint of each row (m,), 0, 1, ..., with its own noise.
         samples: Number of the instant of each row (m,), increasing within a group.
         prior: See `Prior`.
 
     Raises:
-        InputError: Shapes, too few rows, or columns that depend on each other.
+        InputError: Shapes differ, there are too few rows, or columns are linearly dependent.
     """
-    rows = _RegressionProblem(W, None, y, groups, samples, prior)
+    rows = RegressionProblem(W, None, y, groups, samples, prior)
     return rows.estimate(rows.common_noise)
 
 
@@ -110,11 +49,11 @@ def weighted_least_squares(
     samples: np.ndarray | None = None,
     prior: Prior | None = None,
 ) -> Estimate:
-    """Least squares with the rows of each joint divided by its noise, until both agree.
+    """Weighted least squares with the rows of each joint divided by its estimated noise.
 
     Arguments and errors as for `least_squares`.
     """
-    rows = _RegressionProblem(W, None, y, groups, samples, prior)
+    rows = RegressionProblem(W, None, y, groups, samples, prior)
     return rows.estimate(rows.group_noise)
 
 
@@ -127,14 +66,14 @@ def huber(
 ) -> Estimate:
     """Huber's M-estimate by iteratively reweighted least squares.
 
-    Beyond k = 1.345 robust standard deviations sigma (1.4826 median |e|, of each joint) a row
-    counts by its sign alone: weight min(1, k sigma / |e|) / sigma^2. The covariance is that of
-    sum_i w_i psi(e_i), psi clipping at k sigma, over the information sum_i w_i psi'(e_i) w_i^T of
-    the unclipped rows: where noise depends on the motion, their share does so too.
+    Rows are weighted by min(1, k sigma / |e|) / sigma^2 with k = 1.345 and the robust standard
+    deviation sigma of each joint, 1.4826 median |e|. The covariance is that of sum_i w_i psi(e_i),
+    with psi clipping at k sigma, over the information sum_i w_i psi'(e_i) w_i^T of the unclipped
+    rows, whose share may depend on the motion.
 
     Arguments and errors as for `least_squares`.
     """
-    return _RegressionProblem(W, None, y, groups, samples, prior).huber_estimate()
+    return RegressionProblem(W, None, y, groups, samples, prior).huber_estimate()
 
 
 def instrumental_variables(
@@ -147,14 +86,14 @@ def instrumental_variables(
 ) -> Estimate:
     """Instrumental variables: theta from Z^T D (y - W theta) = 0, D = 1 / noise^2 of each joint.
 
-    Noise of the measured motion in W biases least squares, and does not bias this as long as
-    the instruments have none of it: Z (m, p) is the regressor of a simulated or commanded
-    motion. With a prior, its rows belong to both. Other arguments and errors as for
+    Noise of the measured motion in W biases least squares. It does not bias this estimate if the
+    instruments Z (m, p) are independent of it, such as the regressor of a simulated or commanded
+    motion. Rows of a prior belong to both. Other arguments and errors are those of
     `least_squares`.
 
     Source: Janot, Vandanjon, Gautier 2014, IEEE Trans. Control Systems Technology 22(1).
     """
-    rows = _RegressionProblem(W, Z, y, groups, samples, prior)
+    rows = RegressionProblem(W, Z, y, groups, samples, prior)
     return rows.estimate(rows.group_noise)
 
 
@@ -167,7 +106,7 @@ def estimate_from_minimum(
     noise: Array,
     prior_root: Array,
 ) -> Estimate:
-    """How well parameters are known that are the minimum of something else than least squares.
+    """Covariance of parameters that minimize another cost than least squares.
 
     Args:
         W: Regressor (m, p), as an array or in blocks.
@@ -175,27 +114,27 @@ def estimate_from_minimum(
         groups: Joint of each row (m,).
         samples: Number of the instant of each row (m,).
         values: Minimum (p,) of |(y - W theta) / noise|^2 + c(theta).
-        noise: Of each group (g,).
+        noise: Standard deviation of the noise of each group (g,).
         prior_root: L (k, p), L^T L half of the second derivative of c there.
 
     Returns:
-        Theirs, with the covariance of `weighted_least_squares` for a prior whose rows are L.
+        Estimate with the covariance of `weighted_least_squares` for a prior with the rows L.
     """
-    rows = _RegressionProblem(W, None, y, groups, samples, None, prior_root)
+    rows = RegressionProblem(W, None, y, groups, samples, None, prior_root)
     return rows.evaluate_estimate(values, rows.residuals(values), noise, math.inf)
 
 
 def essential_parameters(estimate: Estimate, level: float = 0.05) -> np.ndarray:
-    """Parameters without which the model would be significantly worse.
+    """Essential parameters, without which the model would be significantly worse.
 
-    The one with the largest relative standard deviation is set to zero, the others follow by
-    their covariances, and so on, as long as an F-test of all that are set to zero against the
-    full estimate does not reject at `level`:
+    The parameter with the largest relative standard deviation is set to zero and the others are
+    updated by their covariances, repeatedly, until an F-test of all zero parameters against the
+    full estimate rejects at `level`:
 
         F = theta_d^T C_dd^-1 theta_d / d.
 
-    For least squares with independent noise that is (RSS_reduced - RSS) / (d sigma^2), and the
-    others come out as if estimated anew; for correlated noise it stays valid.
+    For least squares with independent noise this is (RSS_reduced - RSS) / (d sigma^2), and the
+    updates equal new estimates; it remains valid for correlated noise.
 
     Returns:
         Indices of the kept parameters, increasing.
@@ -221,289 +160,3 @@ def essential_parameters(estimate: Estimate, level: float = 0.05) -> np.ndarray:
         covariance = (covariance - np.outer(gain, covariance[worst]))[np.ix_(rest, rest)]
         dropped.append(kept.pop(worst))
     return np.array(kept)
-
-
-class _RegressionProblem:
-    """Equations and how to solve them: one engine for all estimators.
-
-    With weights D = diag(1 / s^2) and prior rows L, such as diag(1 / std), appended to W, Z and
-    y, the estimate solves Q^T W' theta = Q^T y', where Q R = Z' are the appended and weighted Z.
-    Of the regressor, only the triangular factors of each group's rows are held: as long as all
-    rows of a group weigh the same, they tell everything but the single residuals.
-    """
-
-    def __init__(
-        self,
-        W: Array | Regressor,
-        Z: Array | None,
-        y: Array,
-        groups: np.ndarray | None,
-        samples: np.ndarray | None,
-        prior: Prior | None,
-        prior_root: Array | None = None,
-    ):
-        count, size = np.shape(W) if isinstance(W, np.ndarray) else W.shape
-        groups = np.zeros(count, int) if groups is None else np.asarray(groups)
-        samples = np.arange(count) if samples is None else np.asarray(samples)
-        shapes = {"y": np.shape(y), "groups": groups.shape, "samples": samples.shape}
-        for name, shape in shapes.items():
-            if shape != (count,):
-                raise InputError(f"{name} has the shape {shape}, give ({count},)")
-        if Z is not None and np.shape(Z) != (count, size):
-            raise InputError(f"instruments have the shape {np.shape(Z)}, give {(count, size)}")
-        self._order: np.ndarray | None = None  # in which the rows come, by time
-        if isinstance(W, np.ndarray):
-            if (np.diff(samples) < 0).any():
-                self._order = np.argsort(samples, kind="stable")
-                W, y = W[self._order], y[self._order]
-                groups, samples = groups[self._order], samples[self._order]
-                Z = None if Z is None else Z[self._order]
-            W = StoredRegressor(W, samples)
-        self.W, self.y, self.samples = W, y, samples
-        self.Z = W if Z is None else StoredRegressor(Z, samples)
-        self.group_rows = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
-        self.groups = groups
-        for g, rows in enumerate(self.group_rows):
-            if len(rows) < 2:
-                raise InputError(f"group {g} has {len(rows)} row, give two at least")
-            if (np.diff(samples[rows]) <= 0).any():
-                raise InputError(f"samples of group {g} do not increase, sort its rows by time")
-        self.mean = np.zeros(size)
-        self.prior_root = np.zeros((0, size)) if prior_root is None else prior_root
-        if prior is not None:
-            prior_mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
-            if prior_mean.shape != (size,) or std.shape != (size,):
-                raise InputError(
-                    f"the prior has means of the shape {prior_mean.shape} and deviations of the "
-                    f"shape "
-                    f"{std.shape}, give ({size},) each, one per column of the regressor"
-                )
-            if not (std > 0).all():
-                raise InputError(f"the prior has the deviation {std.min():g}, give one above 0")
-            self.mean, self.prior_root = prior_mean, np.diag(1 / std)
-        if count + np.count_nonzero(self.prior_root) <= size:
-            raise InputError(f"{count} rows for {size} parameters are too few, record longer")
-        self.plain = (
-            W.triangular_factors(y, groups)
-            if Z is None
-            else triangular_factors(W, y, groups, Z=self.Z)
-        )  # of unweighted rows (g, k, k)
-        if not np.isfinite(self.plain).all():
-            self._raise_not_finite()
-        # of what counts as noise, so that equations that hold to rounding settle
-        self.min_noise = _ROUNDING_SHARE * max(_rms(y), np.finfo(float).tiny)
-
-    def _raise_not_finite(self) -> None:
-        order = np.arange(len(self.y)) if self._order is None else self._order
-        for name, matrix in (("regressor", self.W), ("instruments", self.Z)):
-            bad = [order[rows][~np.isfinite(W).all(axis=1)] for rows, W in matrix.blocks()]
-            if (at := np.concatenate(bad)).size:
-                raise InputError(f"{name} not finite in row {at.min()}, leave such rows out")
-        at = order[~np.isfinite(self.y)]
-        raise InputError(f"forces not finite in row {at.min()}, leave such rows out")
-
-    def common_noise(self, theta: Array) -> Array:
-        """One standard deviation for all rows, at each group (g,)."""
-        residual_rms = np.linalg.norm(self._residual_norms(theta)) / math.sqrt(len(self.y))
-        return np.full(len(self.group_rows), max(float(residual_rms), self.min_noise))
-
-    def group_noise(self, theta: Array) -> Array:
-        """Standard deviation of each group (g,)."""
-        counts = np.array([len(rows) for rows in self.group_rows])
-        return np.maximum(self._residual_norms(theta) / np.sqrt(counts), self.min_noise)
-
-    def _residual_norms(self, theta: Array) -> Array:
-        """|y - W theta| of each group (g,), from the triangular factors."""
-        size = len(self.mean)
-        return np.linalg.norm(
-            self.plain[:, :, -1] - self.plain[:, :, -1 - size : -1] @ theta, axis=1
-        )
-
-    def _robust_group_noise(self, e: Array) -> Array:
-        """The same from medians of residuals (m,)."""
-        found = [_MAD_TO_STD * float(np.median(np.abs(e[rows]))) for rows in self.group_rows]
-        return np.maximum(found, self.min_noise)
-
-    def residuals(self, theta: Array) -> Array:
-        """Residuals y - W theta (m,)."""
-        e = np.array(self.y, dtype=np.float64)
-        for rows, W in self.W.blocks():
-            e[rows] -= W @ theta
-        return e
-
-    def estimate(self, noise_function) -> Estimate:  # type: ignore[no-untyped-def]
-        """Solve with the scales of the groups that the residuals ask for, until both agree."""
-        theta, s = np.zeros(len(self.mean)), noise_function(np.zeros(len(self.mean)))
-        for round_ in range(_MAX_ITERATIONS):
-            before = theta
-            theta, _, A = self._solve(self.plain, s)
-            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
-                break
-            s = noise_function(theta)
-        return self.evaluate_estimate(theta, self.residuals(theta), s, math.inf)
-
-    def huber_estimate(self) -> Estimate:
-        """The same with rows of large residuals counting less, see `huber`."""
-        e, R = self.y, self.plain
-        s, theta = self._robust_group_noise(e), np.zeros(len(self.mean))
-        for round_ in range(_MAX_ITERATIONS):
-            before = theta
-            theta, _, A = self._solve(R, s)
-            e = self.residuals(theta)
-            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
-                break
-            s = self._robust_group_noise(e)
-            clip = _HUBER_THRESHOLD * s[self.groups]
-            shares = np.minimum(1, clip / np.maximum(np.abs(e), self.min_noise))
-            R = triangular_factors(self.W, self.y, self.groups, np.sqrt(shares))
-        return self.evaluate_estimate(theta, e, s, _HUBER_THRESHOLD)
-
-    def _solve(self, group_factors: Array, s: Array) -> tuple[Array, Array, Array]:
-        """theta, R (p, p) of the weighted instruments with the prior's rows, and Q^T W.
-
-        Args:
-            group_factors: Triangular factors of [W y], or of [Z W y], of the groups (g, k, k).
-            s: Standard deviations of the groups (g,).
-        """
-        size = len(self.mean)
-        copies = [self.prior_root] * ((group_factors.shape[2] - 1) // size)
-        prior = np.column_stack([*copies, self.prior_root @ self.mean])
-        stacked_factor = triangular_factor(np.vstack([*(group_factors / s[:, None, None]), prior]))
-        R, A, right_side = (
-            stacked_factor[:size, :size],
-            stacked_factor[:size, -1 - size : -1],
-            stacked_factor[:size, -1],
-        )
-        length = np.linalg.norm(R, axis=0)
-        length[length == 0] = 1.0
-        values = np.linalg.svd(A / length, compute_uv=False)
-        if values[-1] < np.finfo(float).eps * len(A) * values[0]:
-            raise InputError(
-                f"the {A.shape[1]} columns of the regressor depend on each other (condition "
-                f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
-                "with finite deviations of those that do"
-            )
-        return np.asarray(np.linalg.solve(A, right_side), dtype=np.float64), R, A
-
-    def evaluate_estimate(self, theta: Array, e: Array, s: Array, threshold: float) -> Estimate:
-        """Covariance of theta: A^-1 (sum of Q^T noise) A^-T with the noise's correlations.
-
-        The noise of joint i is modelled as autoregressive, a_i(z) e_i = u_i, with covariances
-        S_ij of the innovations u between joints at one instant; its covariance matrix over time
-        is then a_i^-1 S_ij a_j^-T, and Q^T (...) Q comes from filtering Q by a_i^-1 backwards
-        in time. Rows that are missing are zero in Q.
-
-        Where parameters take many of the degrees of freedom at low frequencies, where motions
-        are, the residuals there are smaller than the noise, and noise may be more than a steady
-        spectrum. So the standard deviations are those of the `Jackknife` where these are larger;
-        the correlations between parameters stay. R and A are of the rows that are not clipped,
-        with which alone the estimate moves, Q of all. Residuals smaller than what rounding and
-        the choice of base parameters make of the rows count as that.
-        """
-        row_noise = s[self.groups]
-        clipped = np.clip(e, -threshold * row_noise, threshold * row_noise)
-        unclipped = np.abs(e) <= threshold * row_noise
-        count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
-        noise = inflated * np.array([_rms(clipped[rows]) for rows in self.group_rows])
-        for group_indices in self.group_rows:
-            if 0 < (group_rms := _rms(clipped[group_indices])) < self.min_noise:
-                clipped[group_indices] *= self.min_noise / group_rms
-        clipped /= row_noise
-        del row_noise
-        noises = [NoiseModel.fit(clipped[rows], self.samples[rows]) for rows in self.group_rows]
-        rows = (
-            self.plain
-            if unclipped.all()
-            else triangular_factors(self.W, self.y, self.groups, unclipped)
-        )
-        _, R, A = self._solve(rows, s)
-        jackknife = Jackknife(self.samples, noises, len(theta))
-        middle = self._noise_covariance_product(R, s, noises, jackknife, clipped, unclipped)
-        del clipped, unclipped
-        prior = np.linalg.solve(R.T, self.prior_root.T)
-        inverse = np.linalg.inv(A)
-        covariance, jackknife_covariance = (
-            inverse @ (x + prior @ prior.T) @ inverse.T
-            for x in (0.5 * (middle + middle.T), jackknife.covariance())
-        )
-        inflation = np.sqrt(np.maximum(np.diag(jackknife_covariance) / np.diag(covariance), 1.0))
-        unweighted_factors, scaled = condition_numbers(
-            np.vstack(list(self.plain[:, :, -1 - len(theta) : -1]))
-        )
-        if self._order is not None:
-            e, ordered = np.empty(count), e
-            e[self._order] = ordered
-        return Estimate(
-            values=theta,
-            covariance=covariance * np.outer(inflation, inflation),
-            residuals=e,
-            noise=noise,
-            effective_samples=np.array([noise.effective_samples for noise in noises]),
-            degrees_of_freedom=jackknife.degrees_of_freedom,
-            condition=unweighted_factors,
-            scaled_condition=scaled,
-        )
-
-    def _noise_covariance_product(
-        self,
-        R: Array,
-        s: Array,
-        noises: list[NoiseModel],
-        jackknife: Jackknife,
-        e: Array,
-        unclipped: np.ndarray,
-    ) -> Array:
-        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on.
-
-        The rows are handed to a jackknife on the way, with their weighted residuals e (m,) and
-        whether the estimate moves with them.
-        """
-        from scipy.linalg import solve_triangular
-
-        S, size = innovation_covariance(noises), len(R)
-        filter_states = [noise.zero_state(size) for noise in noises]
-        middle = np.zeros((size, size))
-
-        def filter_instants(count: int, at: np.ndarray, groups: np.ndarray, Q: Array) -> None:
-            """So many instants, the last of which is 0, the one before it 1; Q (p, rows)."""
-            filtered = []
-            for i, noise in enumerate(noises):
-                dense = np.zeros((size, count))
-                dense[:, at[groups == i]] = Q[:, groups == i]
-                out, filter_states[i] = noise.apply_filter(dense, filter_states[i])
-                filtered.append(out)
-            for i, one in enumerate(filtered):
-                middle[:] += one @ sum(S[i, j] * other.T for j, other in enumerate(filtered))
-
-        def skip_instants(count: int) -> None:
-            nothing = np.zeros(0, dtype=np.intp)
-            for start in range(0, count, _GAP_BLOCK):
-                filter_instants(
-                    min(_GAP_BLOCK, count - start), nothing, nothing, np.zeros((size, 0))
-                )
-
-        last = int(self.samples[-1]) + 1
-        for rows, block in self.Z.blocks(backwards=True):
-            at, groups = self.samples[rows], self.groups[rows]
-            Q = solve_triangular(R, (block / s[groups, None]).T, trans="T")
-            jackknife.add(self.samples[rows], Q, e[rows], unclipped[rows])
-            skip_instants(last - 1 - int(at[-1]))
-            filter_instants(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
-            last = int(at[0])
-        skip_instants(max(noise.memory_length for noise in noises))
-        return middle
-
-
-def _rms(e: Array) -> float:
-    return math.sqrt(np.mean(np.square(e)))
-
-
-def condition_numbers(W: Array) -> tuple[float, float]:
-    """Condition numbers of W, or of its triangular factor, and with columns of length one."""
-    return _condition_number(W), _condition_number(
-        W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
-    )
-
-
-def _condition_number(W: Array) -> float:
-    return float(np.linalg.cond(np.linalg.qr(W, mode="r")))

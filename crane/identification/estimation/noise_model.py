@@ -1,4 +1,4 @@
-"""Noise that remembers: autoregressive models of residuals."""
+"""Autoregressive noise models of residuals, and the jackknife covariance of an estimate."""
 
 import math
 from dataclasses import dataclass
@@ -7,23 +7,26 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_FREQUENCY_COUNT = 1 << 14  # at which a spectrum is known
-_MAX_ORDER = 60  # samples in the autoregressive model of the noise
+_FREQUENCY_COUNT = 1 << 14  # frequencies of a spectrum
+_MAX_ORDER = 60  # largest order of the autoregressive model
+_MIN_CORRELATION_TIMES = 4.0  # least length of a segment, in mean correlation times of the noise
+_MIN_SEGMENTS, _MAX_SEGMENTS = 20, 200  # segments
+_MIN_REMAINING_SHARE = 1e-8  # least share of the information of a direction outside of one segment
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Autoregressive noise a_0 e_k + a_1 e_k-1 + ... = u_k of one joint, a_0 = 1.
+    """Autoregressive noise model a_0 e_k + a_1 e_k-1 + ... = u_k of one joint, a_0 = 1.
 
     Attributes:
         a: Coefficients.
-        innovations: u (T,) over all instants from the first to the last, nan where unknown.
+        innovations: u (T,) at all instants from the first to the last, nan where unknown.
         first_instant: Number of the first instant.
         effective_samples: See `Estimate`.
-        correlation_time: Samples over which it is correlated, the sum of its squared
-            autocorrelations at all lags (Bartlett 1946), mean S^2 / (mean S)^2 of its spectrum S:
-            1 for white noise, (1 + c^2) / (1 - c^2) where a = (1, -c).
-        memory_length: Samples until the noise has forgotten its past.
+        correlation_time: Correlation time in samples, the sum of the squared autocorrelations at
+            all lags (Bartlett 1946), mean S^2 / (mean S)^2 of the spectrum S: 1 for white noise,
+            (1 + c^2) / (1 - c^2) for a = (1, -c).
+        memory_length: Length of the impulse response in samples.
     """
 
     a: Array
@@ -35,11 +38,11 @@ class NoiseModel:
 
     @classmethod
     def fit(cls, e: Array, samples: np.ndarray) -> "NoiseModel":
-        """Burg's estimate from all runs without missing rows, order by Schwarz's criterion.
+        """Fit by Burg's method to all runs without missing rows, order by Schwarz's criterion.
 
-        Burg's needs no window, which would smear the steep spectrum of filtered noise, and is
-        stable always. Where filtered noise was not thinned (a pass band of a tenth of the band
-        that the samples can tell), some thousand rows are needed for intervals that hold.
+        Burg's method needs no window, which would smear the steep spectrum of filtered noise, and
+        is always stable. For filtered noise that is not decimated (a passband of a tenth of the
+        Nyquist frequency), valid intervals need some thousand rows.
         """
         from scipy.signal import lfilter
 
@@ -51,16 +54,17 @@ class NoiseModel:
                 u = np.convolve(run, a, mode="valid")
                 series[start + len(a) - 1 : start + len(run)] = u
         largest = np.abs(np.roots(a)).max() if len(a) > 1 else 0.0
-        # of what can be predicted to rounding a root may lie on the unit circle, or beyond
+        # for predictable signals, rounding may put a root on the unit circle or beyond
         rate = -math.log(min(max(largest, 1e-3), 1.0))
         memory = len(series) if rate * len(series) <= 20 else math.ceil(20 / rate)
-        impulse_response = lfilter([1.0], a, np.eye(1, 4 * memory)[0])  # of e to an impulse in u
-        # mean of its spectrum, by Parseval, over the spectrum at zero
+        # response of e to an impulse in u
+        impulse_response = lfilter([1.0], a, np.eye(1, 4 * memory)[0])
+        # mean of the spectrum, by Parseval, over the spectrum at zero
         effective = float(
             len(e) * (impulse_response @ impulse_response) / impulse_response.sum() ** 2
         )
         gain = np.abs(np.fft.fft(a, _FREQUENCY_COUNT)) ** 2
-        spectrum = gain.min() / gain if gain.min() else np.zeros(0)  # of a line all is correlated
+        spectrum = gain.min() / gain if gain.min() else np.zeros(0)  # empty for a spectral line
         correlated = (
             float(np.mean(spectrum**2) / spectrum.mean() ** 2)
             if len(spectrum)
@@ -69,11 +73,11 @@ class NoiseModel:
         return cls(a, series, int(samples[0]), effective, correlated, memory)
 
     def zero_state(self, count: int) -> Array:
-        """What `apply_filter` starts from, for so many signals."""
+        """Initial state of `apply_filter` for a number of signals."""
         return np.zeros((count, len(self.a) - 1))
 
     def apply_filter(self, x: Array, state: Array) -> tuple[Array, Array]:
-        """a^-1 of signals (count, N), and the state to go on from."""
+        """Filter signals (count, N) by a^-1; returns the result and the final state."""
         from scipy.signal import lfilter
 
         if len(self.a) == 1:
@@ -117,7 +121,7 @@ def _burg_coefficients(runs: list[Array]) -> Array:
 
 
 def innovation_covariance(noises: list[NoiseModel]) -> Array:
-    """Covariances (g, g) of innovations at the same instants."""
+    """Covariance matrix (g, g) of the innovations of all groups at the same instants."""
     start = min(noise.first_instant for noise in noises)
     end = max(noise.first_instant + len(noise.innovations) for noise in noises)
     u = np.full((len(noises), end - start), np.nan)
@@ -131,6 +135,72 @@ def innovation_covariance(noises: list[NoiseModel]) -> Array:
 
 
 def _run_starts(samples: np.ndarray) -> np.ndarray:
-    """Where runs without missing rows start, counted from the first instant."""
+    """Starts of runs without missing rows, counted from the first instant."""
     breaks = np.flatnonzero(np.diff(samples) != 1) + 1
     return samples[np.append(0, breaks)] - samples[0]
+
+
+class Jackknife:
+    """Delete-one jackknife covariance over K segments of time.
+
+    With rows W' = W / s of unit noise, W' = Q R, the weighted residuals e' and the share H_k =
+    Q_k^T Q_k of segment k in the information, removing the segment changes R theta exactly by
+
+        d_k = (1 - H_k)^-1 Q_k^T e'_k,   cov(R theta) = (K - 1) / K sum_k (d_k - mean d)^2
+
+    This needs no noise model: the noise may be correlated within segments and between joints,
+    depend on configuration and speed, and contain model errors. The factor (1 - H_k)^-1 restores
+    residuals that the fit has reduced where few rows determine a parameter, so the variance tends
+    to be too large, not too small.
+
+    Args:
+        samples: Number of the instant of each row (m,), not decreasing.
+        noises: Noise models of the joints, for their correlation times.
+        size: Number of parameters p.
+
+    Source: MacKinnon, Nielsen, Webb 2023, J. Applied Econometrics 38(5): CV3; Kuensch 1989, Annals
+    of Statistics 17(3), for blocks of time.
+    """
+
+    def __init__(self, samples: np.ndarray, noises: list[NoiseModel], size: int):
+        longest = _MIN_CORRELATION_TIMES * np.mean([noise.correlation_time for noise in noises])
+        span = int(samples[-1] - samples[0]) + 1
+        wanted = int(np.clip(span / longest, _MIN_SEGMENTS, _MAX_SEGMENTS))
+        starts = samples[np.arange(wanted) * len(samples) // wanted]
+        self._segment_starts = np.unique(starts)  # an instant belongs to one segment
+        self._H = np.zeros((len(self._segment_starts), size, size))
+        self._c = np.zeros((len(self._segment_starts), size))
+
+    def add(self, samples: np.ndarray, Q: Array, e: Array, unclipped: np.ndarray) -> None:
+        """Add the rows (N,) of complete instants.
+
+        Args:
+            samples: Numbers of their instants.
+            Q: (p, N).
+            e: Weighted residuals (N,).
+            unclipped: Mask of the rows that are not clipped.
+        """
+        cuts = [0, *np.searchsorted(samples, self._segment_starts[1:]).tolist(), len(samples)]
+        for k, rows in enumerate(map(slice, cuts[:-1], cuts[1:])):
+            here = Q[:, rows][:, unclipped[rows]]
+            self._H[k] += here @ here.T
+            self._c[k] += Q[:, rows] @ e[rows]
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Degrees of freedom, K - 1."""
+        return len(self._c) - 1
+
+    def covariance(self) -> Array:
+        """Covariance (p, p) of R theta, of rank K - 1 at most."""
+        shares, U = np.linalg.eigh(self._H)
+        rest = np.maximum(1 - shares, _MIN_REMAINING_SHARE)
+        rotated_changes = np.einsum("kji,kj->ki", U, self._c) / rest
+        parameter_changes = np.einsum("kij,kj->ki", U, rotated_changes)
+        parameter_changes -= parameter_changes.mean(axis=0)
+        return (
+            self.degrees_of_freedom
+            / len(parameter_changes)
+            * parameter_changes.T
+            @ parameter_changes
+        )

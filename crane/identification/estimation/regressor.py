@@ -1,4 +1,4 @@
-"""Tall matrices that are read in blocks of rows, and their triangular factors."""
+"""Regressors that are read in blocks of rows, and their triangular factors."""
 
 from collections.abc import Iterator
 from typing import Protocol
@@ -7,11 +7,11 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_BLOCK_ROWS = 8192  # of a block
+_BLOCK_ROWS = 8192  # rows of a block
 
 
 class Regressor(Protocol):
-    """A matrix W (m, p), whose rows come in blocks of increasing instants.
+    """Regressor W (m, p) in blocks of rows with increasing instants.
 
     Attributes:
         shape: (m, p).
@@ -20,19 +20,19 @@ class Regressor(Protocol):
     shape: tuple[int, int]
 
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
-        """Which rows, and W there; no instant is in two blocks. The last first if asked for."""
+        """Row slices and blocks of W; no instant is in two blocks. Optionally in reverse order."""
 
     def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
         """See `triangular_factors`."""
 
 
 class StoredRegressor:
-    """A matrix that is held as a whole.
+    """Regressor that is stored as one array.
 
     Args:
         W: (m, p).
         samples: Number of the instant of each row (m,), not decreasing.
-        rows: Of a block, about.
+        rows: Approximate number of rows of a block.
     """
 
     def __init__(self, W: Array, samples: np.ndarray, rows: int = _BLOCK_ROWS):
@@ -60,17 +60,17 @@ def triangular_factors(
     weights: Array | None = None,
     Z: Regressor | None = None,
 ) -> Array:
-    """Triangular R_g (k, k) of [W y], or of [Z W y], of the rows of each group: |R x| = |[W y] x|.
+    """Triangular factors R_g (k, k) of [W y], or of [Z W y], of the rows of each group.
 
-    By QR updates: R of [R; block] is that of all rows so far, as exact as of all at once
-    (Golub, Van Loan, Matrix Computations, 6.5).
+    They satisfy |R x| = |[W y] x| and are computed by QR updates: R of [R; block] is the factor of
+    all rows so far (Golub, Van Loan, Matrix Computations, 6.5).
 
     Args:
         W: (m, p).
         y: (m,).
-        groups: Of each row (m,), 0, 1, ...
-        weights: (m,) by which rows are multiplied.
-        Z: Another matrix of the same shape, and in the same blocks.
+        groups: Group of each row (m,), 0, 1, ...
+        weights: (m,) factors of the rows.
+        Z: Instruments of the same shape, in the same blocks.
 
     Returns:
         (g, k, k).
@@ -91,13 +91,13 @@ def triangular_factors(
 
 
 def update_triangular_factor(R: Array, rows: Array) -> None:
-    """Make a triangular factor (k, k) that of its rows and of others (m, k)."""
+    """Update a triangular factor (k, k) in place by further rows (m, k)."""
     if len(rows):
         R[:] = np.linalg.qr(np.vstack([R, rows]), mode="r")
 
 
 def triangular_factor(rows: Array) -> Array:
-    """Triangular factor (k, k) of a matrix (m, k), with rows of zeros where m < k."""
+    """Triangular factor (k, k) of a matrix (m, k), with zero rows if m < k."""
     out = np.zeros((rows.shape[-1],) * 2)
     update_triangular_factor(out, rows)
     return out

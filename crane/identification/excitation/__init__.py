@@ -1,1 +1,1 @@
-"""Motions that tell most of the parameters."""
+"""Design of excitations: trajectories and valve signals with most information."""

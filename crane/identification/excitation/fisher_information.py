@@ -1,4 +1,4 @@
-"""What a motion tells about base parameters: the information matrix and its figures."""
+"""Fisher information of a motion about base parameters, and its measures."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from crane.identification.mechanics.model_term import MotionSamples
 
 @dataclass(frozen=True, eq=False)
 class InformationMeasures:
-    """What a recording of a motion tells, see `FisherInformation`.
+    """Information measures of a recording, see `FisherInformation`.
 
     Attributes:
-        condition: Condition number of N^-1 W S, infinite where it has no inverse.
+        condition: Condition number of N^-1 W S, infinite if it is singular.
         logdet: ln det (1 + M).
-        smallest_singular_value: Smallest singular value of N^-1 W S; below one, some combination
-            of parameters is known no better after than before.
-        std: (r,) standard deviations of the base parameters estimated by weighted least squares,
-            with the prior where one is given; SI units, infinite for what is not told.
+        smallest_singular_value: Smallest singular value of N^-1 W S; below one, the recording adds
+            little to the prior of a combination of parameters.
+        std: (r,) expected standard deviations of the base parameters by weighted least squares,
+            with the prior if one is given, in SI units; infinite if not identifiable.
     """
 
     condition: float
@@ -33,32 +33,31 @@ class InformationMeasures:
 
 
 class FisherInformation:
-    """The information matrix of base parameters.
+    """Fisher information matrix of base parameters.
 
         M = S^T (sum_t W_t^T N^-2 W_t) S,    N = diag(noise),
 
-    W_t the regressor's columns of the base parameters at instant t, and S S^T their covariance
-    beforehand: ln det (1 + M) is twice the information gained [nat], and a parameter that no
-    motion of the machine can tell from noise counts nothing (Chaloner, Verdinelli 1995). Where
-    no prior is given, a base parameter's deviation is what would take the whole force of the
-    drives, as a root mean square over motions all over the limits. Columns scaled over the
-    motion in question instead would hide that it moves a parameter too little; that the
-    condition number means something only with columns of comparable parameters is why it has
-    the same S (Gautier, Khalil 1992).
+    with the columns W_t of the base parameters in the regressor at instant t, and their prior
+    covariance S S^T: ln det (1 + M) is twice the gained information [nat], and parameters below
+    the noise in all motions do not contribute (Chaloner, Verdinelli 1995). Without a prior, the
+    standard deviation of a base parameter is the value that needs the whole force of the drives,
+    as a root mean square over motions within the limits. Scaling by the motion itself would hide
+    that it excites a parameter too little. The condition number has the same scales S, since it is
+    meaningful only for comparable parameters (Gautier, Khalil 1992).
 
     Args:
         model: The model.
-        base: Its base parameters.
-        noise: (n,) standard deviation of the noise of each drive's force [N], [N m], white.
-        force: (n,) of each drive [N], [N m].
-        random_motions: Motions all over the limits.
-        prior: (p,) standard deviations of the model's parameters before.
+        base: Base parameters of the model.
+        noise: (n,) standard deviations of the white noise of the drive forces [N], [N m].
+        force: (n,) largest drive forces [N], [N m].
+        random_motions: Motions over the whole limits.
+        prior: (p,) prior standard deviations of the parameters of the model.
 
     Attributes:
-        scale: S (r, r).
+        scale: (r, r) scales S.
 
     Raises:
-        InputError: The prior is not what it should be.
+        InputError: The prior has a wrong shape or is not positive.
 
     Source: Gautier, Khalil 1992, Int. J. Robotics Research 11(4), exciting trajectories;
     Swevers et al. 1997, IEEE Trans. Robotics and Automation 13(5), for det M; Chaloner,
@@ -89,12 +88,13 @@ class FisherInformation:
     def singular_values(
         self, samples: MotionSamples, sample_count: float, motion_count: int = 1
     ) -> Array:
-        """Singular values of N^-1 W S (sets, r) of motions one after the other.
+        """Singular values (motions, r) of N^-1 W S of several motions.
 
         Args:
-            samples: Their samples, the same number of each, evenly over a period.
-            sample_count: Number of samples that a recording of each will have.
-            motion_count: How many motions.
+            samples: Samples of the motions one after the other, the same number each, evenly over
+                a period.
+            sample_count: Number of samples in a recording of each motion.
+            motion_count: Number of motions.
         """
         return np.asarray(
             np.linalg.svd(
@@ -103,7 +103,7 @@ class FisherInformation:
         )
 
     def measures(self, samples: MotionSamples, sample_count: float) -> InformationMeasures:
-        """Figures of one motion, see `singular_values`."""
+        """Measures of one motion, see `singular_values`."""
         return information_measures(
             self._weighted_regressor(samples, sample_count, 1)[0],
             self.scale,
@@ -116,7 +116,7 @@ class FisherInformation:
     def _weighted_regressor(
         self, samples: MotionSamples, sample_count: float, motion_count: int
     ) -> Array:
-        """N^-1 W S (sets, samples n, r), each of a recording's weight."""
+        """N^-1 W S (motions, samples n, r), weighted as a recording."""
         W = self._base_regressor(samples) * (
             np.sqrt(sample_count * motion_count / len(samples.q_a)) / self.noise[:, None]
         )
@@ -126,12 +126,12 @@ class FisherInformation:
 def information_measures(
     rows: Array, scale: Array, prior_information: float
 ) -> InformationMeasures:
-    """Figures of information M = R^T R.
+    """Measures of the information matrix M = R^T R.
 
     Args:
-        rows: R (N, r), of parameters in their scales.
-        scale: S (r, r), these scales.
-        prior_information: 1 where S S^T is what is known beforehand and counts in the deviations,
+        rows: (N, r) root R, for parameters in their scales.
+        scale: (r, r) scales S.
+        prior_information: 1 if S S^T is a prior covariance that reduces the standard deviations,
             else 0.
     """
     _, singular_values, directions = np.linalg.svd(rows, full_matrices=False)
@@ -157,4 +157,4 @@ CRITERIA: Mapping[str, Callable[[Array], Array]] = {
     "logdet": _negative_logdet,
     "condition": _log_condition,
 }
-"""What is to be small, of singular values (..., r) of N^-1 W S: -ln det (1 + M), ln condition."""
+"""Criteria to be minimized, by singular values (..., r): -ln det (1 + M), ln condition."""

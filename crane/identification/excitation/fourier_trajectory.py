@@ -1,4 +1,4 @@
-"""Periodic references as finite Fourier series, from rest to rest."""
+"""Periodic trajectories as finite Fourier series, from rest to rest."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,28 +11,28 @@ _INSTANTS_PER_PERIOD = 200  # instants in the shortest period
 
 
 class FourierTrajectory(Trajectory):
-    """A finite Fourier series in the active coordinates (Swevers et al., 1997).
+    """Finite Fourier series in the active coordinates (Swevers et al., 1997).
 
         q_i = c_i + sum_k a_ik / (w k) sin(w k s) - b_ik / (w k) cos(w k s),   k = 1 ... K,
 
-    w = 2 pi / period, so that a_ik and b_ik are amplitudes of the velocity. Steadily s runs like
-    time. In half a period before, its rate grows from zero to one, 3 u^2 - 2 u^3 of that time's
-    share u, and falls likewise after: from rest to rest on the periodic part's own curve, so its
-    strokes, and with them the loops, stay in their range, and it is never faster.
+    with w = 2 pi / period, so that a_ik and b_ik are velocity amplitudes. In the periodic part s
+    is time. In half a period before it the rate of s grows from zero to one as 3 u^2 - 2 u^3 of
+    the share u of that time, and decreases likewise after it: the motion starts and ends at rest
+    on the periodic curve itself, within its strokes and speeds.
 
     Args:
         coefficients: (1 + 2 K, n): c [m], [rad], then a and b [m/s], [rad/s].
         period: [s].
-        periods: How many steady ones.
+        periods: Number of complete periods.
 
     Attributes:
-        coefficients: See above.
-        period: See above.
-        periods: See above.
-        lead: When the steady part begins, and how long after it the motion ends [s].
+        coefficients: As given.
+        period: Period [s].
+        periods: Number of complete periods.
+        lead: Duration of the parts before and after the periodic part [s].
 
     Raises:
-        InputError: Wrong shape, not finite, no period.
+        InputError: The shape is wrong, values are not finite, or the period is not positive.
 
     Source: Swevers, Ganseman, Tukel, De Schutter, Van Brussel 1997, IEEE Trans. Robotics and
     Automation 13(5).
@@ -55,7 +55,7 @@ class FourierTrajectory(Trajectory):
         return np.array([0.0, self.lead, self.duration - self.lead, self.duration])
 
     def extremum_times(self) -> Array:
-        """See `Trajectory`: so dense that the largest is missed by 1e-4 of its harmonic's."""
+        """See `Trajectory`: dense instants that resolve a maximum to 1e-4 of its harmonic."""
         shortest = self.period / self.harmonics
         return np.linspace(
             0.0, self.duration, 1 + round(_INSTANTS_PER_PERIOD * self.duration / shortest)
@@ -63,11 +63,11 @@ class FourierTrajectory(Trajectory):
 
     @property
     def harmonics(self) -> int:
-        """K."""
+        """Number of harmonics K."""
         return len(self.coefficients) // 2
 
     def bounds(self) -> tuple[Array, Array]:
-        """See `Trajectory`: every harmonic is as large as its amplitude at once."""
+        """See `Trajectory`: the sum of the amplitudes of all harmonics."""
         middle, (a, b) = self.coefficients[0], np.split(self.coefficients[1:], 2)
         wk = 2 * np.pi / self.period * np.arange(1, self.harmonics + 1)
         reach = (np.hypot(a, b) / wk[:, None]).sum(axis=0)
@@ -100,7 +100,7 @@ class FourierTrajectory(Trajectory):
 
 
 def fourier_basis(time: Array, harmonics: int, period: float) -> tuple[Array, Array, Array]:
-    """What coefficients multiply in q, v and a of a series, (..., 1 + 2 K) each."""
+    """Basis functions (..., 1 + 2 K) of the coefficients in q, v and a of a series."""
     wk = 2 * np.pi / period * np.arange(1, harmonics + 1)
     angle = np.asarray(time)[..., None] * wk
     sin, cos = np.sin(angle), np.cos(angle)

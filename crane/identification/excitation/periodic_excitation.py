@@ -1,4 +1,4 @@
-"""Periodic references that tell as much as possible about a machine's parameters."""
+"""Design of periodic excitation trajectories for the identification of a machine."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -45,33 +45,34 @@ from crane.recordings import timeseries
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
 from crane.recordings.timeseries import TIME, Table
 
-_NOISE_SHARE = 0.01  # of a drive's force limit, its noise if none is given
+_NOISE_SHARE = 0.01  # default noise per force limit of a drive
 _REPORTED_PARAMETERS = 5  # parameters in the table
 _MAX_SAMPLES = 4_000_000  # samples of the recording
-_FRICTION_SMOOTHING = 5e-4  # of velocities of the machine, over which friction turns in the search
-_MAX_MEMORY = 1e9  # that motions are optimised in [bytes]
+# of characteristic velocities, smoothing of friction in the optimization
+_FRICTION_SMOOTHING = 5e-4
+_MAX_MEMORY = 1e9  # [bytes] for the motions of an optimization
 
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Excitation(Result):
-    """A reference to identify a machine with.
+    """Excitation trajectory for the identification of a machine.
 
     Attributes:
-        trajectory: The reference, see `FourierTrajectory`.
+        trajectory: The trajectory, see `FourierTrajectory`.
         machine: The machine.
-        base: What is to be identified.
-        nominal: (p,) all parameters by the machine's description.
-        prior_std: (r,) deviations of the base parameters beforehand, see `FisherInformation`.
-        initial_information: What the first random reference within the limits would tell.
-        optimized_information: What this one will tell.
-        limits: That it keeps.
-        limit_usage: (5, n) share of them that it uses, by `QUANTITIES`.
-        noise: (n,) of the forces [N], [N m].
-        criterion: It is best in.
-        seed: Of the random references.
-        step: Of the recording that is counted on [s].
+        base: Base parameters to be identified.
+        nominal: (p,) parameters by the description of the machine.
+        prior_std: (r,) prior standard deviations of the base parameters, see `FisherInformation`.
+        initial_information: Information measures of the first random trajectory within the limits.
+        optimized_information: Information measures of this trajectory.
+        limits: Limits of the trajectory.
+        limit_usage: (5, n) used share of the limits, by `QUANTITIES`.
+        noise: (n,) standard deviations of the force noise [N], [N m].
+        criterion: Optimization criterion.
+        seed: Seed of the random trajectories.
+        step: Step of the planned recording [s].
     """
 
     trajectory: FourierTrajectory
@@ -89,7 +90,7 @@ class Excitation(Result):
     step: float
 
     def _one_line(self) -> str:
-        """For what, how long, and what it gains."""
+        """Machine, duration and condition numbers."""
         return (
             f"Excitation of '{self.machine.name}', {self.trajectory.duration:.6g} s: condition "
             f"{self.initial_information.condition:.3g} random, "
@@ -97,23 +98,23 @@ class Excitation(Result):
         )
 
     def motion(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Times (N,), and q_A, v_A, a_A, tau_A (N, n) of the machine as described."""
+        """Times (N,), and q_A, v_A, a_A, tau_A (N, n) of the described machine."""
         count = int(self.trajectory.duration / self.step + 1e-9) + 1
         time = self.step * np.arange(count, dtype=np.float64)
         q, v, a = self.trajectory(time)
         return time, q, v, a, Dynamics(self.machine).inverse(q, v, a, friction=True)
 
     def least_identifiable(self, count: int = _REPORTED_PARAMETERS) -> list[int]:
-        """Base parameters that are told least, by std over what would take all force."""
+        """Indices of the base parameters with the largest std per prior std."""
         return np.argsort(-self.optimized_information.std / self.prior_std, kind="stable")[
             :count
         ].tolist()
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the motion, with forces of the machine as described: a recording of no noise.
+        """Write the motion with the forces of the described machine, as a recording without noise.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         units = {TIME: "s"}
         for suffix in ("", "_velocity", "_acceleration", "_force"):
@@ -134,10 +135,10 @@ class Excitation(Result):
         timeseries.write_table(path, Table(units, np.column_stack(self.motion()), notes))
 
     def to_yaml(self, path: str | Path) -> None:
-        """Write the coefficients, see `FourierTrajectory`.
+        """Write the coefficients as YAML, see `FourierTrajectory`.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         K = self.trajectory.harmonics
         numbers = self.trajectory.coefficients.T.tolist()
@@ -157,7 +158,7 @@ class Excitation(Result):
             part.write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
 
     def to_text(self) -> str:
-        """Tables for reading: before and after, shares of the limits, the worst parameters."""
+        """Tables of information measures, used limits, and the least identifiable parameters."""
         initial, optimized = self.initial_information, self.optimized_information
         figures: list[tuple[str, ...]] = [
             ("", "random", "optimised"),
@@ -208,32 +209,32 @@ def excite(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Excitation:
-    """Find a periodic reference that determines a machine's base parameters best.
+    """Design a periodic trajectory with the most information about the base parameters.
 
-    The best of random references, scaled to what the limits allow, are optimised by sequential
-    quadratic programming over the coefficients of `FourierTrajectory`, then scaled to keep all
-    limits at 64 instants per period of the highest harmonic, the ways from and to rest included,
-    with 1 / cos(pi / 64) for what a series may do in between (Ehlich and Zeller, 1964).
+    The best of random trajectories, scaled to the limits, are optimized by sequential quadratic
+    programming over the coefficients of `FourierTrajectory`, then scaled to satisfy all limits at
+    64 instants per period of the highest harmonic, including the parts from and to rest, with the
+    factor 1 / cos(pi / 64) for maxima between the instants (Ehlich and Zeller, 1964).
 
     Args:
         machine: The machine.
-        model: What is to be identified; `IdentificationModel(machine)` if not given.
+        model: Model to be identified; default `IdentificationModel(machine)`.
         period: [s].
-        harmonics: K.
-        periods: How many.
+        harmonics: Number of harmonics K.
+        periods: Number of periods.
         criterion: "logdet", the volume of the confidence ellipsoid, or "condition".
-        noise: Standard deviations of the measured forces by active joint [N], [N m]; 1 % of the
-            force limit if not given, 1 where there is none.
-        prior: (p,) standard deviations of the model's parameters before, see `FisherInformation`.
-        acceleration: See `limits`.
-        margin: See `limits`.
-        step: Of the recording [s].
-        starts: How many random references are optimised.
-        seed: Of the random references: the same seed gives the same bits.
+        noise: Standard deviations of the measured forces by active joint [N], [N m]; default 1 %
+            of the force limit, 1 without a limit.
+        prior: (p,) prior standard deviations of the parameters, see `FisherInformation`.
+        acceleration: See `trajectory_limits`.
+        margin: See `trajectory_limits`.
+        step: Step of the recording [s].
+        starts: Number of random trajectories that are optimized.
+        seed: Seed of the random trajectories; the result is reproducible to the last bit.
         progress: Called with the finished share, 0 to 1.
 
     Raises:
-        InputError: Arguments out of range, or no reference within the limits.
+        InputError: Arguments are out of range, or no trajectory is within the limits.
     """
     progress = progress_reporter(progress)
     if criterion not in CRITERIA:
@@ -251,28 +252,19 @@ def excite(
             f"nothing drives {', '.join(map(repr, machine.free))}, and a planned motion needs all "
             f"joints where it wants them: hold what is free ({held})"
         )
-    # friction that jumps has no gradient to search along
+    # discontinuous friction has no gradient
     smooth_model = model or IdentificationModel(_with_smooth_friction(machine))
     model = model or IdentificationModel(machine)
     _check_size(model, period, harmonics, periods, step)
     bounds = trajectory_limits(machine, acceleration, margin)
-    force = machine.model.effortLimit[machine.closure.active]
-    default = np.where(np.isfinite(force), _NOISE_SHARE * force, 1.0)
-    deviation = joint_values(machine, noise, "noise", default)
-    for joint, force_limit, value in zip(machine.active, force, deviation, strict=True):
-        if value > force_limit:
-            raise InputError(
-                f"noise of '{joint}' is {value:g}, above the {force_limit:g} of its drive: give "
-                f"less"
-            )
-    force = np.where(np.isfinite(force), force, deviation / _NOISE_SHARE)
+    deviation, force = _force_noise(machine, noise)
     base = base_parameters(model)
     if not base.rank:
         raise InputError(f"nothing of '{machine.name}' has an effect on its drives")
     time = np.arange(0.0, period, step)
     if len(time) * len(machine.active) < base.rank:
         raise InputError(
-            f"{len(time)} samples in a period of {period:g} s tell no {base.rank} base "
+            f"{len(time)} samples in a period of {period:g} s do not determine {base.rank} base "
             "parameters, give a smaller step or a longer period"
         )
     random_motions = _random_motions(model, bounds, 2 * np.pi / period * harmonics)
@@ -285,18 +277,7 @@ def excite(
         smooth_information, bounds, period, harmonics, count, CRITERIA[criterion]
     )
     draws = search.random_references(np.random.default_rng(seed))
-    costs = search.evaluate(draws)[0]
-    order = np.argsort(costs, kind="stable")[:starts]
-    best, lowest_cost = draws[order[0]], float(costs[order[0]])
-    for start_index, start in enumerate(draws[order]):
-
-        def report(share: float, tried: int = start_index) -> None:
-            if progress is not None:
-                progress((tried + share) / len(order))
-
-        found = search.optimize(start, report)
-        if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:
-            best, lowest_cost = found, cost
+    best = _optimize_best(search, draws, starts, progress)
     initial_trajectory, trajectory = (
         FourierTrajectory(search.coefficients(x), period, periods) for x in (draws[0], best)
     )
@@ -321,8 +302,41 @@ def excite(
     )
 
 
+def _force_noise(machine: Machine, noise: Mapping[str, float] | None) -> tuple[Array, Array]:
+    """Standard deviations (n,) of the force noise, and force limits (n,) or their equivalents."""
+    force = machine.model.effortLimit[machine.closure.active]
+    default = np.where(np.isfinite(force), _NOISE_SHARE * force, 1.0)
+    deviation = joint_values(machine, noise, "noise", default)
+    for joint, force_limit, value in zip(machine.active, force, deviation, strict=True):
+        if value > force_limit:
+            raise InputError(
+                f"noise of '{joint}' is {value:g}, above the {force_limit:g} of its drive: give "
+                "less"
+            )
+    return deviation, np.where(np.isfinite(force), force, deviation / _NOISE_SHARE)
+
+
+def _optimize_best(
+    search: TrajectoryOptimizer, draws: Array, starts: int, progress: Progress | None
+) -> Array:
+    """The best vector after optimization of the best random ones (V, size)."""
+    costs = search.evaluate(draws)[0]
+    order = np.argsort(costs, kind="stable")[:starts]
+    best, lowest_cost = draws[order[0]], float(costs[order[0]])
+    for start_index, start in enumerate(draws[order]):
+
+        def report(share: float, tried: int = start_index) -> None:
+            if progress is not None:
+                progress((tried + share) / len(order))
+
+        found = search.optimize(start, report)
+        if (cost := float(search.evaluate(found[None])[0][0])) < lowest_cost:
+            best, lowest_cost = found, cost
+    return best
+
+
 def _with_smooth_friction(machine: Machine) -> Machine:
-    """The machine with friction that is smooth where it sticks."""
+    """The machine with smoothed friction in place of stiction."""
     rates = machine.closure.units / machine.closure.characteristic_time
     laws = {
         joint: replace(law, smoothing=_FRICTION_SMOOTHING * float(rates[machine.column(joint)]))
@@ -335,26 +349,25 @@ def _with_smooth_friction(machine: Machine) -> Machine:
 def _check_size(
     model: IdentificationModel, period: float, harmonics: int, periods: int, step: float
 ) -> None:
-    """See that the search and the recording have room.
+    """Check that the optimization and the recording fit into memory.
 
     Raises:
-        InputError: They have none; the message has what would be possible.
+        InputError: They do not; the message gives possible values.
     """
     n = len(model.machine.active)
-    max_samples = _MAX_MEMORY / (24 * n * len(model.names))  # samples of three regressors at once
+    max_samples = _MAX_MEMORY / (24 * n * len(model.names))  # samples for three regressors
     min_step = max(period / max_samples, (periods + 1) * period / _MAX_SAMPLES)
     if step < min_step:
         raise InputError(
-            f"{periods} periods of {period:g} s and the ways from and to rest are "
-            f"{(periods + 1) * period / step:.3g} samples of {step:g} s, for which there is no "
-            f"room: give a step of at least {min_step:.2g} s, or fewer or shorter periods"
+            f"{periods} periods of {period:g} s and the parts from and to rest are "
+            f"{(periods + 1) * period / step:.3g} samples of {step:g} s, too many for the "
+            f"memory: give a step of at least {min_step:.2g} s, or fewer or shorter periods"
         )
-    max_harmonics = max(
-        1, int((max_samples / (2 * n * COARSE_SAMPLES)) ** 0.5)
-    )  # a stack of motions per derivative
+    # one motion per derivative
+    max_harmonics = max(1, int((max_samples / (2 * n * COARSE_SAMPLES)) ** 0.5))
     if harmonics > max_harmonics:
         raise InputError(
-            f"the number of harmonics is {harmonics}, more than there is room for with {n} active "
+            f"the number of harmonics is {harmonics}, too many for the memory with {n} active "
             f"joints: give at most {max_harmonics}"
         )
 
@@ -362,7 +375,7 @@ def _check_size(
 def _random_motions(
     model: IdentificationModel, bounds: TrajectoryLimits, max_frequency: float
 ) -> MotionSamples:
-    """Random motions within the limits, of harmonics up to a circular frequency [rad/s]."""
+    """Random motions within the limits, with harmonics up to an angular frequency [rad/s]."""
     machine, rng = model.machine, np.random.default_rng(0)
     at = random_samples(model, 300)
     is_regular = singularity_proximity(machine, at) <= 1

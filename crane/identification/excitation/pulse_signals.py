@@ -1,4 +1,4 @@
-"""Signals of valves that move cylinders as planned and turn them before their strokes end."""
+"""Valve signals of planned pulses that keep cylinders within their strokes."""
 
 from collections.abc import Sequence
 
@@ -14,29 +14,29 @@ from crane.machine import Machine
 
 
 class PulseSignals(ValveCommand):
-    """Pulses of the valves' signals, one per valve and slot of time, that keep within strokes.
+    """Pulses of valve signals, one per valve and time slot, that keep cylinders within strokes.
 
-    A plan has the largest opening y of each pulse, -1 to 1, and for how much of its slot the
-    pulse lasts. The spool's position u = (U - neutral) / (full - neutral) goes from 0 to
-    sign(y) (d + (1 - d) |y|), d the dead band, and back to 0 at the rate r, so that over a pulse
-    of duration T
+    A plan contains the largest opening y of each pulse, -1 to 1, and the share of its slot that
+    the pulse takes. The spool position u = (U - neutral) / (full - neutral) goes from 0 to sign(y)
+    (d + (1 - d) |y|) with the dead band d, and back to 0, at the rate r, so that over a pulse of
+    duration T
 
         integral of |y| dt = |y| (T - (|u| + d) / r),
 
-    and the stroke moves by that times its steady velocity at full opening (`full_opening_speed`).
-    At the begin of a slot the plan meets the machine as it is there: where a pulse would pass the
-    end of its range it goes the other way, or less far, and where all together would ask for more
-    than the pump's flow, all open less.
+    and the stroke changes by this times its steady velocity at full opening
+    (`full_opening_speed`). At the start of a slot the plan is adapted to the state of the machine:
+    a pulse that would exceed its range is reversed or reduced, and all openings are reduced if
+    together they would exceed the pump's flow.
 
     Args:
         machine: The machine.
-        plan: (slots, m, 2) openings, and shares of the slot from 0 to 1; the slot before and what
-            follows after them is rest.
+        plan: (slots, m, 2) openings, and shares of the slot from 0 to 1; valves are closed in the
+            slot before and after them.
         slot: Duration of a slot [s].
-        rate: The fastest change of u [1/s].
-        low: (m,) least coordinates [m], [rad].
-        high: (m,) largest.
-        flow: The most that the valves ask the pump for [m3/s]; infinite where it has no limit.
+        rate: Rate of u [1/s].
+        low: (m,) lower limits of the coordinates [m], [rad].
+        high: (m,) upper limits [m], [rad].
+        flow: Largest demand of pump flow [m3/s]; infinite without limit.
     """
 
     is_open_loop = True
@@ -62,7 +62,7 @@ class PulseSignals(ValveCommand):
         self._valve_indices = [
             circuit.joints.index(spool.joint) for spool in circuit.spools.values()
         ]
-        # slots from when on, how far they open, and for how long
+        # start times of slots, peak spool positions, and durations of pulses
         self._slot_starts = [0.0]
         self._peak_positions, self._duration_history = (
             [np.zeros(len(valves))],
@@ -83,7 +83,7 @@ class PulseSignals(ValveCommand):
         ) = [time], [peak_positions], [self._pulse_durations]
 
     def _pulse_positions(self, slot: int, q: Array, pressures: Array) -> Array:
-        """(m,) how far valves open in a slot."""
+        """Peak spool positions (m,) in a slot."""
         opening, share = self._plan[slot].T
         x = q[self._joint_columns]
         speeds = self._full_opening_speeds(pressures)
@@ -105,7 +105,7 @@ class PulseSignals(ValveCommand):
         since = np.asarray(times)[:, None] - np.array(self._slot_starts)[at, None]
         ramps = self._rate * np.clip(np.minimum(since, last - since), 0.0, None)
         u = np.copysign(np.minimum(np.abs(top), ramps), top)
-        # a second spool gets the signal of the first one, as `ValveSignals` have it
+        # a second spool gets the signal of the first one, as in `ValveSignals`
         return np.asarray(self._neutral + self._signal_ranges * u)[:, self._valve_indices]
 
     def signals(self, inputs: ControllerInputs) -> Sequence[Scalar]:
@@ -113,7 +113,7 @@ class PulseSignals(ValveCommand):
         return inputs.reference
 
     def _full_opening_speeds(self, pressures: Array) -> Array:
-        """(m, 2) steady velocities at full opening, forwards and backwards [m/s], [rad/s]."""
+        """Steady velocities (m, 2) at full opening, forwards and backwards [m/s], [rad/s]."""
         found = []
         for joint, (a, b) in zip(self._circuit.joints, pressures, strict=True):
             cylinder, valve = self._circuit.cylinders[joint], self._circuit.valves[joint]
@@ -125,7 +125,7 @@ class PulseSignals(ValveCommand):
         return np.array(found)
 
     def _opening_within_stroke(self, i: int, opening: float, x: float, speeds: Array) -> float:
-        """The opening of a pulse that keeps cylinder i within its range."""
+        """Opening of a pulse that keeps cylinder i within its range."""
         clearances = max(self._high[i] - x, 0.0), max(x - self._low[i], 0.0)
         side, size = int(opening < 0), self._reachable_opening(i, abs(opening))
         if size and self._opening_integral(i, size) * speeds[side] > clearances[side]:
@@ -135,7 +135,7 @@ class PulseSignals(ValveCommand):
         return -size if side else size
 
     def _reachable_opening(self, i: int, opening: float) -> float:
-        """As much of an opening as the rate allows within the pulse."""
+        """Opening that the rate allows within the pulse."""
         dead = self._dead_bands[i]
         most = (self._rate * self._pulse_durations[i] / 2 - dead) / (1.0 - dead)
         return min(opening, max(most, 0.0))
@@ -147,7 +147,7 @@ class PulseSignals(ValveCommand):
         return float(opening * (self._pulse_durations[i] - (u + dead) / self._rate))
 
     def _opening_for_integral(self, i: int, integral: float) -> float:
-        """The opening of which the integral over the pulse is `integral` [s], the smaller root."""
+        """Opening with a given integral over the pulse [s], the smaller root."""
         dead, rate = self._dead_bands[i], self._rate
         linear_coefficient = self._pulse_durations[i] - 2 * dead / rate
         root = linear_coefficient**2 - 4 * (1.0 - dead) / rate * integral
@@ -158,7 +158,7 @@ class PulseSignals(ValveCommand):
         )
 
     def _pump_flow(self, openings: Array, speeds: Array) -> float:
-        """What the pump is asked for [m3/s]."""
+        """Demand of pump flow [m3/s]."""
         total = 0.0
         for y, speed, cylinder in zip(
             openings, speeds, self._circuit.cylinders.values(), strict=True
@@ -171,21 +171,21 @@ class PulseSignals(ValveCommand):
 def full_opening_speed(
     cylinder: Cylinder, valve: Valve, supply: Supply, force: float, backwards: bool
 ) -> float:
-    """Steady velocity of a cylinder at full opening [m/s], [rad/s], its size.
+    """Steady speed of a cylinder at full opening [m/s], [rad/s].
 
-    The pressure drops of both edges, (A_in w / c_in)^2 and (A_out w / c_out)^2, and the force F
-    against the motion balance the supply,
+    With the pressure drops of both orifices, (A_in w / c_in)^2 and (A_out w / c_out)^2, and the
+    force F against the motion, the speed w is given by
 
         w^2 (A_in^3 / c_in^2 + A_out^3 / c_out^2) = A_in p_S - A_out p_R - F,
 
-    and a compensator lets no more in than c_in sqrt(margin), unless a load that pulls presses out
-    more, c_out sqrt(-F / A_out - p_R); 0 where the load is too heavy.
+    A compensator limits the inflow to c_in sqrt(margin), unless a pulling load causes a larger
+    outflow, c_out sqrt(-F / A_out - p_R). The speed is 0 if the load is too large.
 
     Args:
         cylinder: The cylinder.
-        valve: Its valve.
-        supply: Of the circuit.
-        force: Of the cylinder, A_A p_A - A_B p_B [N], [N m].
+        valve: Valve of the cylinder.
+        supply: Supply of the circuit.
+        force: Cylinder force A_A p_A - A_B p_B [N], [N m].
         backwards: Whether oil flows into chamber B.
     """
     inward, outward = cylinder.area_a, cylinder.area_b

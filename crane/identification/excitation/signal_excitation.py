@@ -1,4 +1,4 @@
-"""Signals of valves that tell as much as possible about numbers that a calibration fits."""
+"""Design of valve signals for the calibration of a machine."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -17,43 +17,42 @@ from crane.common.units import format_quantity, format_table
 from crane.control.valve_commands import require_circuit
 from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm
+from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm, SignalLimits
 from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
 from crane.identification.excitation.signal_information import SignalInformation
-from crane.identification.excitation.signal_limits import SignalLimits
 from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE, Recording
 from crane.recordings.timeseries import Table
 
-_MAX_STD_SHARE = 0.5  # standard deviation, of a number's size, that says nothing
-_MIN_DURATION, _MIN_STEP = 2.0, 1e-3  # duration and step [s]
-_MAX_STEP = 0.05  # step [s], of which a pulse still has enough
+_MAX_STD_SHARE = 0.5  # standard deviation per scale, above which a parameter is unidentifiable
+_MIN_DURATION, _MIN_STEP = 2.0, 1e-3  # least duration and step [s]
+_MAX_STEP = 0.05  # largest step [s] that resolves a pulse
 
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SignalExcitation(Result):
-    """Signals of valves to calibrate a machine with.
+    """Valve signals for the calibration of a machine.
 
     Attributes:
         machine: The machine.
-        unknowns: The numbers that are wanted.
-        run: The machine as described, driven by the signals.
-        expected_readings: Signals, and what sensors without noise say of it.
+        unknowns: Parameters to be calibrated.
+        run: Simulation of the described machine with the signals.
+        expected_readings: Signals and readings of sensors without noise.
         noise: Standard deviations of the sensors by column.
-        initial_information: What one lever after the other, out and back, would tell in the same
-            time.
-        optimized_information: What these signals will tell; `std` in the numbers' own units.
-        stroke_margins: (m,) what the strokes keep to their ends, as a share of the stroke.
-        worst_case_stroke_margins: (m,) the same of the worst machine whose wanted numbers are off,
-            one at a time.
-        pump_flow_share: The largest share of the pump's flow; 0 where it has no limit.
-        peak_pressures: (m,) largest pressure in a cylinder [Pa].
-        signal_rates: (m,) fastest change of the signals [V/s].
-        criterion: They are best in.
-        seed: Of the random signals.
+        initial_information: Information measures of reference signals of the same duration, one
+            valve after the other.
+        optimized_information: Information measures of these signals; `std` in units of the
+            parameters.
+        stroke_margins: (m,) smallest distances to the ends of the strokes, per stroke.
+        worst_case_stroke_margins: (m,) the same for the worst deviation of a single parameter.
+        pump_flow_share: Largest share of the pump's flow; 0 without a limit.
+        peak_pressures: (m,) largest pressures in the cylinders [Pa].
+        signal_rates: (m,) largest rates of the signals [V/s].
+        criterion: Optimization criterion.
+        seed: Seed of the random plans.
     """
 
     machine: Machine
@@ -72,22 +71,22 @@ class SignalExcitation(Result):
     seed: int
 
     def _one_line(self) -> str:
-        """For what, how long, and what it tells."""
+        """Machine, duration and number of identifiable parameters."""
         return (
             f"SignalExcitation of '{self.machine.name}', {self.run.time[-1]:.6g} s: "
             f"{len(self.unknowns) - len(self.unidentifiable)} of "
-            f"{format_count(len(self.unknowns), 'number')} told"
+            f"{format_count(len(self.unknowns), 'parameter')} identifiable"
         )
 
     @property
     def signals(self) -> dict[str, Array]:
-        """(N,) by joint at `run.time` [V], as `crane.ValveSignals` takes them."""
+        """Signals (N,) by joint at `run.time` [V], as for `crane.ValveSignals`."""
         joints = require_circuit(self.machine).joints
         return {joint: self.run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
 
     @property
     def std(self) -> dict[str, float]:
-        """Expected standard deviations by name, infinite for what is not told."""
+        """Expected standard deviations by name, infinite if not identifiable."""
         return {
             one.name: float(x)
             for one, x in zip(self.unknowns, self.optimized_information.std, strict=True)
@@ -95,7 +94,7 @@ class SignalExcitation(Result):
 
     @property
     def unidentifiable(self) -> list[str]:
-        """Names of numbers that these sensors do not tell, whatever the signals here."""
+        """Names of parameters that these sensors do not determine."""
         return [
             one.name
             for one in self.unknowns
@@ -103,10 +102,10 @@ class SignalExcitation(Result):
         ]
 
     def to_csv(self, path: str | Path) -> None:
-        """Write signals and expected readings: a recording of no noise.
+        """Write signals and expected readings as a recording without noise.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         notes = {"machine": self.machine.load_expression, "task": "excitation through the valves"}
         notes[SENSORS_NOTE] = IDEAL_SENSORS
@@ -115,8 +114,8 @@ class SignalExcitation(Result):
         )
 
     def to_text(self) -> str:
-        """Tables for reading: numbers before and after, strokes, and what is not told."""
-        numbers: list[tuple[str, ...]] = [("number", "value", "std, plain", "std, designed")]
+        """Tables of standard deviations, strokes and unidentifiable parameters."""
+        numbers: list[tuple[str, ...]] = [("parameter", "value", "std, plain", "std, designed")]
         for one, initial_std, optimized_std in zip(
             self.unknowns,
             self.initial_information.std,
@@ -131,7 +130,7 @@ class SignalExcitation(Result):
         )
         numbers.append(("ln det (1 + M)", "", *gain))
         strokes: list[tuple[str, ...]] = [
-            ("stroke", "least left", "numbers off", "largest pressure", "fastest signal")
+            ("stroke", "least margin", "worst case", "largest pressure", "fastest signal")
         ]
         for i, joint in enumerate(require_circuit(self.machine).joints):
             strokes.append((
@@ -144,7 +143,7 @@ class SignalExcitation(Result):
         if self.unidentifiable:
             names = ", ".join(self.unidentifiable)
             parts.append(
-                f"not told by these sensors in this time: {names}\n"
+                f"not determined by these sensors in this time: {names}\n"
                 "leave them out, name further --sensors, or give a longer --duration"
             )
         return "\n\n".join(parts)
@@ -166,34 +165,33 @@ def excite_valves(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SignalExcitation:
-    """Find signals of a machine's valves that determine numbers best, fitted by `calibrate`.
+    """Design valve signals with the most information about parameters for `calibrate`.
 
-    Pulses of all valves (see `PulseSignals`) from rest at home to rest, the best of some at random
-    and of what the exchange of single slots makes of them (Meyer and Nachtsheim, 1995), judged by
-    the information of the simulated readings (see `SignalInformation`). Signals that leave the
-    limits of `crane.identification.excitation.signal_limits.SignalLimits` are not taken.
+    The signals are pulses of all valves (see `PulseSignals`) from rest at home to rest: the best
+    of random plans, improved by the exchange of single slots (Meyer and Nachtsheim, 1995), by the
+    Fisher information of the simulated readings (see `SignalInformation`). Signals that exceed the
+    limits of `SignalLimits` are rejected.
 
     Args:
         machine: A machine with valves.
-        fit: Numbers by name, as `crane.calibrate` takes them; with (start, low, high) the
-            strokes hold from low to high, else for numbers that are off by 30 %.
+        fit: Parameters by name, as for `crane.calibrate`; strokes are within their limits from low
+            to high of (start, low, high), else for deviations of 30 %.
         duration: [s].
-        sensors: Columns that will be measured; strokes and pressures of all cylinders if not
-            given.
-        noise: Their standard deviations by column, SI; where not given 0.5 mm, 1 mrad, 2 mm/s,
-            5 mrad/s, 0.3 bar.
-        criterion: "logdet", the volume of the confidence ellipsoid of the numbers, each against
-            its size; or "condition".
-        rate: The fastest change of a signal, in strokes of the spool per second; 2 is an
-            operator's hand that moves a lever to its end in half a second.
-        margin: Share of every stroke that is left unused at both ends, and of the pump's flow.
-        step: Between samples of the signals [s].
-        trials: How many signals are judged.
-        seed: Of the random signals: the same seed gives the same bits.
+        sensors: Columns that will be measured; default strokes and pressures of all cylinders.
+        noise: Standard deviations by column in SI units; default 0.5 mm, 1 mrad, 2 mm/s, 5 mrad/s,
+            0.3 bar.
+        criterion: "logdet", the volume of the confidence ellipsoid of the scaled parameters, or
+            "condition".
+        rate: Largest rate of a signal in spool strokes per second; an operator reaches about 2.
+        margin: Unused share of every stroke at both ends, and of the pump's flow.
+        step: Step of the signals [s].
+        trials: Number of plans that are evaluated.
+        seed: Seed of the random plans; the result is reproducible to the last bit.
         progress: Called with the finished share, 0 to 1.
 
     Raises:
-        InputError: Arguments out of range, no valves, or no signals within the limits.
+        InputError: Arguments are out of range, there are no valves, or no signals are within the
+            limits.
 
     Source: Goodwin, Payne 1977, Dynamic System Identification, chapter 6; Meyer, Nachtsheim
     1995, Technometrics 37(1).
@@ -209,8 +207,7 @@ def excite_valves(
     if step < _MIN_STEP or duration < _MIN_DURATION:
         raise InputError(
             f"{duration:g} s in steps of {step:g} s: give a duration of at least "
-            f"{_MIN_DURATION:g} s "
-            f"and a step from {_MIN_STEP:g} to {_MAX_STEP:g} s"
+            f"{_MIN_DURATION:g} s and a step from {_MIN_STEP:g} to {_MAX_STEP:g} s"
         )
     rate = as_number(rate, "the rate", "1/s", greater_than=0)
     if not 0 <= as_number(margin, "the margin", "") < 0.5:

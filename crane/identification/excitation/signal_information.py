@@ -1,4 +1,4 @@
-"""What a recording of valve signals tells of numbers that are fitted through the simulation."""
+"""Fisher information of a recording with valve signals about calibrated parameters."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,8 @@ from crane.control.valve_commands import require_circuit
 from crane.description.sensors import INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
-from crane.identification.calibration.calibration_problem import (
-    CalibrationProblem,
-    RecordingCase,
-    recording_case,
-)
+from crane.identification.calibration.calibration_problem import CalibrationProblem
+from crane.identification.calibration.recording_case import RecordingCase, recording_case
 from crane.identification.calibration.unknowns import build_unknowns
 from crane.identification.excitation.fisher_information import (
     InformationMeasures,
@@ -27,41 +24,38 @@ from crane.recordings.recording import Recording
 from crane.recordings.timeseries import TIME, Table
 from crane.simulation.recorded_run import read_simulation, simulated_columns, simulated_units
 
-# Standard deviations of usual sensors, by unit.
+# standard deviations of usual sensors, by unit
 _DEFAULT_NOISE = {"rad": 1e-3, "m": 5e-4, "rad/s": 5e-3, "m/s": 2e-3, "Pa": 3e4}
-_MIN_SENSITIVITY = (
-    1e-6  # noises that a number of its own size changes all readings by, taken together
-)
+_MIN_SENSITIVITY = 1e-6  # change of all readings per scale of a parameter, in standard deviations
 
 
 class SignalInformation:
-    """The information of recordings about numbers p that are fitted, `crane.calibrate`'s.
+    """Fisher information of recordings about the parameters p of `crane.calibrate`.
 
-    Readings y of white noise sigma depend on p, each in its scale, and on the recording's start s,
-    known beforehand to its deviations, each 1 in these:
+    Readings y with white noise sigma depend on the scaled parameters p and on the start s of the
+    recording, in units of its prior standard deviations:
 
         M = J_p^T (1 - J_s (J_s^T J_s + 1)^-1 J_s^T) J_p,    J = sigma^-1 dy/d(p, s),
 
-    whose inverse is the covariance that the best fit has. With [J_s J_p; 1 0] = Q R the rows of
-    R that belong to p alone are a root of it.
+    The inverse of M is the covariance of the best fit. With [J_s J_p; 1 0] = Q R, the rows of R
+    that belong to p alone are a root of M.
 
     Args:
         machine: The machine.
-        fit: Numbers by name, see `crane.calibrate`.
-        sensors: Columns of what is measured; active joints on valves and their pressures if not
-            given.
-        noise: Standard deviations by column; those of usual sensors if not given.
-        seed: Of the noise on the virtual recordings, which only says how well starts are known.
+        fit: Parameters by name, see `crane.calibrate`.
+        sensors: Measured columns; default the valve-driven joints and their pressures.
+        noise: Standard deviations by column; default those of usual sensors.
+        seed: Seed of the noise of virtual recordings, which only affects the prior of starts.
 
     Attributes:
-        machine: With the numbers from which a fit starts.
-        sensor_units: Of the sensors by column.
-        noise: (k,) standard deviations.
+        machine: The machine with the initial parameters.
+        units: Units of the sensors by column.
+        noise: (k,) standard deviations of the sensors.
         unknowns: See `crane.identification.calibration.unknowns.Unknown`.
 
     Raises:
-        InputError: Names that cannot be, or noise that nothing tells.
-        RecordingError: An inclination of no link.
+        InputError: Names are not valid, or the noise of a sensor is unknown.
+        RecordingError: An inclination has no link.
 
     Source: Ljung 1999, System Identification, section 7.4.
     """
@@ -102,17 +96,17 @@ class SignalInformation:
         initial_values = {x: y for one in self.unknowns for x, y in one.changes(one.start).items()}
         if any(variants.values[name] != value for name, value in initial_values.items()):
             self.machine = variants.machine(initial_values)
-        # where and when something sticks depends on everything before
+        # instants of sticking depend on the whole motion before
         self._has_stiction = bool(find_stick_slip_columns(machine))
         self._problem = self._smoothed_problem([])
 
     def perturbed_machine(self, values: Mapping[str, float]) -> Machine:
-        """The machine with some of the wanted numbers changed, of friction that is smooth."""
+        """The machine with changed parameters and smoothed friction."""
         z = [(values.get(one.name, one.start) - one.start) / one.scale for one in self.unknowns]
         return self._problem.simulated_machine(np.array(z), self._problem.smooth)
 
     def expected_readings(self, run: Recording, noisy: bool = False) -> Table:
-        """What a run's recording would hold: signals and readings, with noise or without."""
+        """Recording of a run: signals and readings, with noise or without."""
         names = list(self.units)
         values = read_simulation(self.machine, run, names)
         if noisy:
@@ -128,14 +122,14 @@ class SignalInformation:
         return Table(sensor_units, np.column_stack([run.time, *columns, values]), {})
 
     def information_root(self, run: Recording, estimate_start: bool = True) -> Array:
-        """A root of M, (p, p) upper triangle.
+        """Root of M as an upper triangular matrix (p, p).
 
         Args:
             run: A simulation of the machine with the signals.
-            estimate_start: Whether the start has to be found, too; quicker without.
+            estimate_start: Whether the start is estimated as well; faster without.
 
         Raises:
-            CraneError: A machine of slightly other numbers cannot be simulated.
+            CraneError: The simulation of a perturbed machine fails.
         """
         names, table = list(self.units), self.expected_readings(run, noisy=True)
         with warnings.catch_warnings():
@@ -155,14 +149,14 @@ class SignalInformation:
         return _triangular_factor(stacked)[start_count:, start_count:]
 
     def measures(self, run: Recording) -> InformationMeasures:
-        """What a recording of a run will tell; deviations in the units of the numbers."""
+        """Information measures of a recording of a run; standard deviations in SI units."""
         rows = self.information_root(run)
         result = information_measures(rows, np.eye(len(self.unknowns)), 0.0)
         scale = np.array([unknown.scale for unknown in self.unknowns])
         return replace(result, std=self.standard_deviations(rows) * scale)
 
     def standard_deviations(self, information_root: Array) -> Array:
-        """(p,) standard deviations of the numbers in their scales, infinite if not told."""
+        """Standard deviations (p,) of the scaled parameters, infinite if not identifiable."""
         is_identifiable = np.linalg.norm(information_root, axis=0) > _MIN_SENSITIVITY
         out = np.full(len(information_root), np.inf)
         if is_identifiable.any():
@@ -179,7 +173,7 @@ class SignalInformation:
 
 
 def _triangular_factor(matrix: Array) -> Array:
-    """R of Q R."""
+    """Triangular factor R of a QR factorization."""
     return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
 
 

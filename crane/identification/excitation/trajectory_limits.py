@@ -1,4 +1,4 @@
-"""What a reference may use of a machine."""
+"""Limits of a machine for excitation trajectories."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,24 +12,22 @@ from crane.identification.mechanics.model_term import MotionSamples
 from crane.machine import Machine
 
 QUANTITIES = ("stroke", "velocity", "acceleration", "force", "flow")
-_SINGULARITY_GAIN = (
-    5.0  # times as fast as at home, passive joints near the edge of the assembly branch
-)
+_SINGULARITY_GAIN = 5.0  # ratio of gamma to that at home, near the end of the branch
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryLimits:
-    """What a reference may use of a machine, infinite where there is no limit.
+    """Limits of a trajectory, infinite if there is no limit.
 
     Attributes:
-        stroke_middle: (n,) of the strokes [m], [rad].
-        half_stroke: (n,) of the strokes' lengths.
-        velocity: (n,).
-        acceleration: (n,).
-        force: (n,) [N], [N m].
-        flow: (n,) of the pump that feeds a joint, for all that it feeds [m3/s].
-        areas: (2, n, n) areas of A and B of joint j where one pump feeds i and j, else 0 [m2],
-            [m3/rad]: the pump of i gives the sum over j of max(A_ij v_j, -B_ij v_j).
+        stroke_middle: (n,) middle of the strokes [m], [rad].
+        half_stroke: (n,) half lengths of the strokes.
+        velocity: (n,) velocity limits.
+        acceleration: (n,) acceleration limits.
+        force: (n,) force limits [N], [N m].
+        flow: (n,) flow of the pump that feeds a joint [m3/s].
+        areas: (2, n, n) areas A and B of joint j if one pump feeds i and j, else 0 [m2], [m3/rad]:
+            the flow of the pump of i is the sum over j of max(A_ij v_j, -B_ij v_j).
     """
 
     stroke_middle: Array
@@ -42,13 +40,13 @@ class TrajectoryLimits:
 
     @property
     def as_array(self) -> Array:
-        """(5, n) by `QUANTITIES`, of strokes their half lengths."""
+        """Limits (5, n) by `QUANTITIES`, with half lengths of strokes."""
         return np.stack(
             [self.half_stroke, self.velocity, self.acceleration, self.force, self.flow]
         )
 
     def usage(self, q_a: Array, v_a: Array, a_a: Array, tau: Array) -> Array:
-        """What of the limits a motion uses, 1 at a limit, (..., 5, n) as in `QUANTITIES`."""
+        """Used share (..., 5, n) of the limits by a motion, 1 at a limit, by `QUANTITIES`."""
         out, back = self.areas
         drawn = np.maximum(v_a, 0.0) @ out.T + np.maximum(-v_a, 0.0) @ back.T
         return (
@@ -60,18 +58,18 @@ class TrajectoryLimits:
 def trajectory_limits(
     machine: Machine, acceleration: Mapping[str, float] | None = None, margin: float = 0.05
 ) -> TrajectoryLimits:
-    """Limits of the active joints: strokes, velocities and forces as in the URDF, flow of pumps.
+    """Limits of the active joints: strokes, velocities, forces, and flows of pumps.
 
-    A joint without end keeps within 1 rad (1 m) of home. Accelerations need no limit of their
-    own: one below velocity V with harmonics up to K w is below K w V (Bernstein).
+    An unlimited joint stays within 1 rad (1 m) of home. Accelerations need no separate limit: for
+    a velocity below V with harmonics up to K w they are below K w V (Bernstein).
 
     Args:
         machine: The machine.
-        acceleration: Further limits by active joint [m/s2], [rad/s2].
-        margin: Share of every limit that is left unused, at both ends of a stroke.
+        acceleration: Acceleration limits by active joint [m/s2], [rad/s2].
+        margin: Unused share of every limit, at both ends of a stroke.
 
     Raises:
-        InputError: Unknown joints, limits that let nothing move.
+        InputError: Joints are unknown, or limits are zero.
     """
     if not 0 <= as_number(margin, "the margin", "") < 1:
         raise InputError(f"the margin is {margin:g}, give a share from 0 to below 1")
@@ -96,9 +94,9 @@ def trajectory_limits(
 
 
 def _fed(machine: Machine) -> tuple[Array, Array, Array]:
-    """Velocity limits of each joint alone by valve and pump, with the flow and the areas.
+    """Velocity limits of each joint alone by valve and pump, flows, and areas.
 
-    A valve that keeps a flow gives c sqrt(margin) at most, any valve what its pump has.
+    A compensated valve has the largest flow c sqrt(margin), any valve that of its pump.
     """
     n = len(machine.active)
     velocity, flow, areas = np.full(n, np.inf), np.full(n, np.inf), np.zeros((2, n, n))
@@ -123,10 +121,10 @@ def _fed(machine: Machine) -> tuple[Array, Array, Array]:
 def joint_values(
     machine: Machine, given: Mapping[str, float] | None, what: str, default: Array
 ) -> Array:
-    """Positive numbers (n,) by active joint.
+    """Positive values (n,) by active joint, with defaults.
 
     Raises:
-        InputError: An unknown joint, or a number that is not positive.
+        InputError: A joint is unknown, or a value is not positive.
     """
     out = default.copy()
     for joint, value in (given or {}).items():
@@ -141,10 +139,10 @@ def joint_values(
 
 
 def singularity_proximity(machine: Machine, samples: MotionSamples) -> Array:
-    """How near the edge of the branch postures are, (N,), 1 where it is near.
+    """Proximity (N,) of configurations to the end of the branch, 1 at the limit.
 
-    Passive joints move there without end for a small way of the active ones, which would tell
-    everything and cannot be driven: |gamma_P diag(span)| / (5 |...| at home).
+    It is |gamma_P diag(span)| / (5 |...| at home). Near the end of the branch small active motions
+    cause large passive ones, which drives cannot follow.
     """
     lower, upper = stroke_limits(machine)
     rows, span = machine.closure.passive, upper - lower

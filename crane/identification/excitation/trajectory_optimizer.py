@@ -1,4 +1,4 @@
-"""The search for a reference: random ones within the limits, and the way down from them."""
+"""Optimization of excitation trajectories, from random trajectories within the limits."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,38 +17,35 @@ from crane.identification.excitation.trajectory_limits import (
 )
 from crane.identification.mechanics.model_term import MotionSamples
 
-DENSE_SAMPLES = 64  # samples per period of the highest harmonic, to see that limits hold
-COARSE_SAMPLES = 12  # the same to optimise with
-_SAMPLED_LIMIT = float(
-    np.cos(np.pi / DENSE_SAMPLES)
-)  # at samples, so that nothing exceeds 1 in between
-_PEAK_INSTANTS = 33  # instants between the neighbours of the one with the largest share
-_RANDOM_COUNT, _MAX_TRIALS = (
-    20,
-    200,
-)  # random references: how many within the limits, of how many at most
-_MAX_BISECTIONS = 10  # of the interval in which the largest amplitude lies
-_NORM_ORDER = 80  # takes the place of the maximum over time, which has no derivative
+DENSE_SAMPLES = 64  # samples per period of the highest harmonic, for checks of limits
+COARSE_SAMPLES = 12  # the same for the optimization
+# limit at samples, so that shares do not exceed 1 in between
+_SAMPLED_LIMIT = float(np.cos(np.pi / DENSE_SAMPLES))
+_PEAK_INSTANTS = 33  # instants around the one with the largest share
+# random trajectories within the limits, and largest number of trials
+_RANDOM_COUNT, _MAX_TRIALS = 20, 200
+_MAX_BISECTIONS = 10  # of the interval of the largest amplitude
+_NORM_ORDER = 80  # order of the norm in place of the maximum over time, for derivatives
 _MAX_ITERATIONS = 150  # of sequential quadratic programming
-_COST_TOLERANCE = 1e-3  # change of the cost that ends it
-_DIFFERENCE_STEP = 1e-6  # step of differences, of coefficients of order one
-_INFEASIBLE_COST = 1e3  # cost and excess where loops do not close
-_CONSTRAINT_TOLERANCE = 1e-3  # excess that a last scaling takes away
+_COST_TOLERANCE = 1e-3  # change of the cost at convergence
+_DIFFERENCE_STEP = 1e-6  # step of differences of scaled coefficients
+_INFEASIBLE_COST = 1e3  # cost and constraint violation if loops do not close
+_CONSTRAINT_TOLERANCE = 1e-3  # violation that the final scaling removes
 
 Progress = Callable[[float], None]
 
 
 class TrajectoryOptimizer:
-    """References of a machine as vectors x of order one, their costs and constraints.
+    """Costs and constraints of trajectories with scaled coefficients x.
 
-    The units of x are half a stroke for the middle, and for every harmonic the largest amplitude
-    that it could have alone.
+    The units of x are half a stroke for the middle, and for every harmonic its largest possible
+    amplitude alone.
 
     Args:
-        information: To be gained.
-        limits: Not to be left.
+        information: Fisher information to be maximized.
+        limits: Limits of the trajectories.
         period: [s].
-        harmonics: K.
+        harmonics: Number of harmonics K.
         sample_count: Number of samples of the recording.
         criterion: See `crane.identification.excitation.fisher_information.CRITERIA`.
     """
@@ -96,7 +93,7 @@ class TrajectoryOptimizer:
         return self._offset + x.reshape(*x.shape[:-1], *self._units.shape) * self._units
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
-        """Costs (V,) of vectors (V, size), and 1 - share of each limit (V, c), >= 0 inside.
+        """Costs (V,) of vectors (V, size), and constraints (V, c), 1 - used share of a limit >= 0.
 
         Raises:
             ClosureError: Loops do not close.
@@ -116,10 +113,10 @@ class TrajectoryOptimizer:
         return costs, 1 - norms
 
     def random_references(self, rng: np.random.Generator) -> Array:
-        """Random vectors (V, size) of references as large as the limits allow.
+        """Random vectors (V, size) of trajectories, scaled to the limits.
 
         Raises:
-            InputError: There are none.
+            InputError: No trajectory is within the limits.
         """
         vectors: list[Array] = []
         for _ in range(_MAX_TRIALS):
@@ -132,17 +129,16 @@ class TrajectoryOptimizer:
                     break
         if not vectors:
             raise InputError(
-                f"'{self._machine.name}' cannot even stand still within its limits in "
-                f"{_MAX_TRIALS} random postures, lastly for {reason}: check it, or lower the "
-                f"margin"
+                f"'{self._machine.name}' has no reference within its limits in {_MAX_TRIALS} "
+                f"random configurations, lastly for {reason}: check it, or lower the margin"
             )
         return np.array(vectors)
 
     def scale_to_limits(self, x: Array) -> tuple[Array, str]:
-        """A vector's amplitudes scaled to what the limits allow, and why it cannot be.
+        """Scale the amplitudes of a vector to the limits; returns also "" or an exceeded limit.
 
-        Joint by joint for strokes, velocities and accelerations, then together for forces and
-        loops.
+        Amplitudes are scaled by joint for strokes, velocities and accelerations, then together for
+        forces and loops.
         """
         limits, table = self._limits, x.reshape(self._units.shape).copy()
         table[0] = np.clip(table[0], -0.95, 0.95)
@@ -174,9 +170,9 @@ class TrajectoryOptimizer:
         return scaled(feasible_share), ""
 
     def optimize(self, start: Array, progress: Progress) -> Array:
-        """The best vector on the way of sequential quadratic programming, fitted.
+        """Optimize a vector by sequential quadratic programming, and scale it to the limits.
 
-        Derivatives are differences, all of them computed as one stack of motions.
+        Derivatives are difference quotients, computed as one stack of motions.
         """
         from scipy.optimize import Bounds, minimize
 
@@ -221,7 +217,7 @@ class TrajectoryOptimizer:
             "fun": lambda x: values(x, np.zeros((1, size)), "value")[1][0],
             "jac": lambda x: gradients(x)[1],
         }
-        # no harmonic of what keeps within 1 is larger than that of a square wave
+        # a harmonic of a function within 1 is at most that of a square wave
         amplitude_bounds = np.vstack(
             [np.ones((1, n)), np.full((len(self._units) - 1, n), 4 / np.pi)]
         ).ravel()
@@ -245,7 +241,7 @@ class TrajectoryOptimizer:
         )
 
     def limit_usage(self, trajectory: FourierTrajectory) -> Array:
-        """Largest share of every limit over a whole trajectory, (5, n) as in `QUANTITIES`."""
+        """Largest used share (5, n) of every limit over a trajectory, by `QUANTITIES`."""
 
         def shares(times: Array) -> Array:
             q, v, a = trajectory(times)
@@ -257,9 +253,9 @@ class TrajectoryOptimizer:
         return np.maximum(dense.max(axis=0), peaks.max(axis=0))
 
     def _times_near_peaks(self, shares: Array) -> Array:
-        """Times [s] close around where each of (N, c) shares is largest at the dense instants.
+        """Times [s] around the maxima of the shares (N, c) at the dense instants.
 
-        Where a joint turns, friction steps within milliseconds, and a force's peak is beside it.
+        At a reversal friction jumps within milliseconds, and the peak of the force is next to it.
         """
         largest = np.unique(shares.argmax(axis=0))
         before = self._dense_times[np.maximum(largest - 1, 0)]
@@ -267,7 +263,7 @@ class TrajectoryOptimizer:
         return np.unique(np.linspace(before, after, _PEAK_INSTANTS))
 
     def _exceeded_limit(self, x: Array) -> str:
-        """Which limit a vector's reference exceeds, ways from and to rest included."""
+        """Name of a limit that a trajectory with its parts from and to rest exceeds, or ""."""
         trajectory = FourierTrajectory(self.coefficients(x), self._period)
         try:
             shares = self._limit_usage_at(
@@ -285,7 +281,7 @@ class TrajectoryOptimizer:
         )
 
     def _limit_usage_at(self, samples: MotionSamples) -> Array:
-        """Of all limits that there are, (N, c)."""
+        """Used shares (N, c) of all finite limits."""
         tau = self._dynamics.inverse(samples.q_a, samples.v_a, samples.a_a, friction=True)
         shares = self._limits.usage(samples.q_a, samples.v_a, samples.a_a, tau).reshape(
             len(tau), -1

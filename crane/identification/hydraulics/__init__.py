@@ -1,1 +1,1 @@
-"""Orifices, valves, and the friction of cylinders."""
+"""Identification of orifice coefficients, valve curves and cylinder friction."""

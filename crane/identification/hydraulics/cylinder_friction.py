@@ -1,11 +1,11 @@
-"""Friction of a cylinder from its pressures at constant speed.
+"""Identification of the friction of a cylinder from its pressures at constant speeds.
 
-The hydraulic force of equation (20) of the electro-hydraulic forwarder paper, less the load's, is
-friction:
+The friction is the hydraulic force by equation (20) of the electro-hydraulic forwarder paper minus
+the load:
 
     F - load = (coulomb + stiction e^-(v / stribeck)^2) sign(v) + coulomb_offset + viscous v,
 
-with sign(v) as tanh(v / smoothing), as `crane.description.Friction`.
+with tanh(v / smoothing) for sign(v), as in `crane.description.Friction`.
 """
 
 import dataclasses
@@ -20,8 +20,7 @@ from crane.common.threads import with_single_threaded_blas
 from crane.description import Friction
 from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators
-from crane.identification.estimation.estimators import Estimate
-from crane.identification.hydraulics.cylinder_signals import joint_index
+from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.steady_samples import steady_samples
 from crane.machine import Machine
@@ -29,9 +28,9 @@ from crane.recordings.recording import Recording
 
 PARAMETER_NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")
 
-_REST_SPEED_SHARE = 1e-3  # of the largest speed, below which nothing slides
-_SLIDING_FACTOR = 3.0  # smoothing velocities, above which the sign of the speed is told
-_STEADY_SHARE = 0.05  # of the speed, by which it may change
+_REST_SPEED_SHARE = 1e-3  # of the largest speed, below which a joint does not slide
+_SLIDING_FACTOR = 3.0  # smoothing velocities, above which the sign of the speed is fully developed
+_STEADY_SHARE = 0.05  # largest change of a steady speed
 _MAX_SAMPLES = 4000  # samples
 _STANDSTILL_SHARE = 0.01  # of the fastest speed
 _STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
@@ -39,18 +38,18 @@ _STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CylinderFriction(Result):
-    """Friction of one joint.
+    """Identified friction of one joint.
 
     Attributes:
-        joint: Its name.
+        joint: Name of the joint.
         values: (3,) coulomb, coulomb_offset, viscous; or (5,) with stiction and stribeck.
-        covariance: (3, 3) or (5, 5).
-        degrees_of_freedom: Degrees of freedom behind it.
-        smoothing: Of the sign [m/s] or [rad/s], which is given, not estimated.
-        speed: Steady samples (M,) [m/s] or [rad/s].
-        force: Measured friction there (M,) [N] or [N m].
+        covariance: (3, 3) or (5, 5) covariance of the values.
+        degrees_of_freedom: Degrees of freedom of the covariance.
+        smoothing: Smoothing velocity of the sign [m/s] or [rad/s], which is not estimated.
+        speed: (M,) speeds of the steady samples [m/s] or [rad/s].
+        force: (M,) measured friction there [N] or [N m].
         noise: Standard deviation of the force about the fit.
-        note: Why stiction was left out, "" where it was not.
+        note: Reason for the omission of stiction, "" if it is estimated.
     """
 
     joint: str
@@ -65,7 +64,7 @@ class CylinderFriction(Result):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the values."""
+        """Names of the values."""
         return PARAMETER_NAMES[: len(self.values)]
 
     @property
@@ -74,26 +73,23 @@ class CylinderFriction(Result):
         return np.sqrt(np.diag(self.covariance))
 
     def interval(self, level: float = 0.95) -> Array:
-        """Ends (p, 2) of what covers the truth with this probability."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        """Confidence intervals (p, 2) of a level."""
+        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     @property
     def friction(self) -> Friction:
-        """For `Machine.replace`; what came out negative and cannot be is 0."""
+        """Friction law for `Machine.replace`; negative coefficients are set to 0."""
         found = dict(zip(self.names, map(float, self.values), strict=True))
         for name in ("coulomb", "viscous", "stiction"):
             found[name] = max(found.get(name, 0.0), 0.0)
         return Friction(smoothing=self.smoothing, **found)
 
     def predict(self, speed: Array) -> Array:
-        """Friction at speeds (N,)."""
+        """Friction (N,) at speeds (N,)."""
         return _friction_law(self.values, speed, self.smoothing)
 
     def to_text(self, unit: str = "m") -> str:
-        """A table of the parameters."""
+        """Table of the parameters."""
         force = "N" if unit == "m" else "N m"
         units = (force, force, f"{force} s/{unit}", force, f"{unit}/s")
         lines = [
@@ -115,24 +111,24 @@ def identify_cylinder_friction(
     settle: float = 0.3,
     stribeck: bool | None = None,
 ) -> CylinderFriction:
-    """Friction of one joint, its load from the machine's masses.
+    """Identify the friction of one joint, with the load by the masses of the machine.
 
-    The load is tau_A of `Dynamics.inverse` without friction at the smoothed motion. Samples count
-    where the speed was steady for `settle` seconds and the joint slides. Stiction and its velocity
-    are estimated if the speeds reach below that velocity and the stiction is told apart from
-    zero; otherwise they are 0 and the result's note says so.
+    The load is tau_A of `Dynamics.inverse` without friction for the smoothed motion. Samples are
+    used where the speed was steady for `settle` seconds and the joint slides. Stiction and its
+    velocity are estimated if there are speeds below that velocity and the stiction is significant;
+    otherwise they are 0 and the note of the result gives the reason.
 
     Args:
-        machine: Its masses count as known; friction of this joint is not used but for its
-            smoothing if it has any, that of the other joints belongs to their own forces.
-        recording: Of all its active joints, tau of this one by (20).
+        machine: The machine, whose masses are taken as known; of the friction of this joint only
+            the smoothing is used.
+        recording: Recording of all active joints, with tau of this one by (20).
         joint: An active joint.
-        settle: [s].
-        stribeck: False never estimates stiction, True insists; None decides.
+        settle: Duration of steady speed before a sample [s].
+        stribeck: False never estimates stiction, True requires it; None decides by the data.
 
     Raises:
         InputError: The joint is not active.
-        RecordingError: What is recorded cannot serve, or does not tell the parameters.
+        RecordingError: The recording is not suitable, or does not determine the parameters.
     """
     if joint not in machine.active:
         raise InputError(
@@ -164,7 +160,7 @@ def identify_cylinder_friction(
     if stribeck is not False:
         stiction_fit, note = _fit_with_stiction(at, speed, force, described_friction.smoothing)
         if note and stribeck:
-            raise RecordingError(f"stiction of '{joint}' cannot be told: {note}")
+            raise RecordingError(f"stiction of '{joint}' cannot be determined: {note}")
         if not note:
             result = stiction_fit
     values, estimate = result
@@ -193,7 +189,7 @@ def _friction_law(values: Array, v: Array, smoothing: float) -> Array:
 
 
 def _friction_columns(v: Array, smoothing: float, stribeck: float | None = None) -> Array:
-    """Of what the law is linear in (M, 3) or (M, 4)."""
+    """Columns (M, 3) or (M, 4) of the linear coefficients of the friction law."""
     sign = np.tanh(v / smoothing) if smoothing else np.sign(v)
     columns = [sign, np.ones_like(v), v]
     if stribeck is not None:
@@ -209,7 +205,7 @@ def _fit_without_stiction(at: np.ndarray, v: Array, force: Array, smoothing: flo
 def _fit_with_stiction(
     at: np.ndarray, v: Array, force: Array, smoothing: float
 ) -> tuple[FitResult, str]:
-    """With stiction, and why it is not told ("" if it is)."""
+    """Fit with stiction, and the reason why it is not identifiable, else ""."""
     from scipy.optimize import minimize_scalar
 
     sizes = np.abs(v)
@@ -220,7 +216,7 @@ def _fit_with_stiction(
         rest = force - W @ np.linalg.lstsq(W, force, rcond=None)[0]
         return float(rest @ rest)
 
-    # for every stribeck velocity the rest is linear
+    # the other parameters are linear for every Stribeck velocity
     grid = np.linspace(np.log(0.3 * slowest), np.log(fastest), _STRIBECK_GRID_SIZE)
     best = int(np.argmin([cost(x) for x in grid]))
     ends = grid[max(best - 1, 0)], grid[min(best + 1, _STRIBECK_GRID_SIZE - 1)]
@@ -248,84 +244,3 @@ def _fit_with_stiction(
     if not linear[3] > 3 * estimate.std[3]:
         return fit_without, f"{low} show no stiction"
     return (values, dataclasses.replace(estimate, values=values)), ""
-
-
-@dataclass(frozen=True, eq=False)
-class DirectionDifference:
-    """Friction and load without a model, for strokes and speeds that occur both ways.
-
-    Attributes:
-        stroke: Middle of each bin (K,) [m] or [rad].
-        speed: Mean size of the speed (K,).
-        friction: (F_extending - F_retracting) / 2, (K,) [N] or [N m].
-        load: (F_extending + F_retracting) / 2, without the part of friction that does not change
-            its sign in it (K,).
-    """
-
-    stroke: Array
-    speed: Array
-    friction: Array
-    load: Array
-
-
-def direction_difference(
-    recording: Recording,
-    joint: str,
-    bins: int = 10,
-    settle: float = 0.3,
-    speed_tolerance: float = 0.1,
-) -> DirectionDifference:
-    """Half the difference of the force between both directions at the same stroke and speed.
-
-    No masses are needed. The other joints have to be at the same coordinates both ways. In
-    each bin of the stroke, force over stroke is a straight line for each direction and speed, read
-    at the middle of what both share, so that a load that changes along the stroke does not count.
-
-    Args:
-        recording: tau of the joint by (20).
-        joint: Its name.
-        bins: Number of equal bins of the stroke.
-        settle: [s] of constant speed.
-        speed_tolerance: Relative difference of speeds that count as the same.
-
-    Raises:
-        RecordingError: Nothing occurs both ways.
-    """
-    i = joint_index(recording, joint)
-    x, v, force = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
-    is_steady = steady_samples(recording.time, settle, v, share=_STEADY_SHARE, relative=True) & (
-        np.abs(v) > _STANDSTILL_SHARE * np.abs(v).max()
-    )
-    edges = np.linspace(x.min(), x.max(), bins + 1)
-    rows = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        inside = is_steady & (x >= low) & (x <= high)
-        for level in _speed_levels(np.abs(v[inside]), speed_tolerance):
-            same = inside & (np.abs(np.abs(v) - level) <= speed_tolerance * level)
-            directions = [np.flatnonzero(same & (sense * v > 0)) for sense in (1, -1)]
-            if min(map(len, directions)) < 3:
-                continue
-            start, end = (max(x[w].min() for w in directions), min(x[w].max() for w in directions))
-            if end <= start:
-                continue
-            middle = 0.5 * (start + end)
-            up, down = (float(np.polyfit(x[w] - middle, force[w], 1)[-1]) for w in directions)
-            speed = float(np.mean([np.abs(v[w]).mean() for w in directions]))
-            rows.append((middle, speed, 0.5 * (up - down), 0.5 * (up + down)))
-    if not rows:
-        raise RecordingError(
-            f"'{joint}' has no stroke that it passes both ways at one steady speed, record it "
-            "extending and retracting at the same speeds"
-        )
-    return DirectionDifference(*np.array(rows).T)
-
-
-def _speed_levels(sizes: Array, speed_tolerance: float) -> list[float]:
-    """Speeds that stand for groups of equal ones."""
-    out: list[float] = []
-    rest = np.sort(sizes)
-    while len(rest):
-        group = rest[rest <= rest[0] * (1 + speed_tolerance)]
-        out.append(float(np.median(group)))
-        rest = rest[len(group) :]
-    return out

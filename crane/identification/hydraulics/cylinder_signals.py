@@ -1,4 +1,4 @@
-"""What a recording tells of one hydraulic cylinder: stroke, opening of its valve, pressures."""
+"""Signals of one hydraulic cylinder in a recording: stroke, valve opening, pressures."""
 
 from dataclasses import dataclass, fields
 
@@ -17,23 +17,23 @@ from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.missing_measurements import check_columns_present
 from crane.recordings.recording import Recording
 
-_STROKE_TOLERANCE = 1e-3  # of the stroke by which a noisy sensor may leave it
-_NOISE_SHARE = 0.03  # of the fastest speed, noise that is worth smoothing
+_STROKE_TOLERANCE = 1e-3  # of the stroke, for noise beyond its ends
+_NOISE_SHARE = 0.03  # of the fastest speed; noise above it is smoothed
 
 
 @dataclass(frozen=True, eq=False)
 class CylinderSignals:
-    """Samples of one cylinder at N equidistant instants, pressures from a vacuum.
+    """Signals of one cylinder at N equidistant instants, with absolute pressures.
 
     Attributes:
         time: (N,) [s].
-        x: Coordinate above the joint's lower limit (N,) [m] or [rad], as in equation (24).
-        opening: Of the valve's edges (N,), -1 to 1.
-        p_a: Pressure of chamber A (N,) [Pa].
-        p_b: Of chamber B (N,).
-        p_s: Of the supply (N,).
-        p_r: Of the return line (N,).
-        stroke: Distance s between the joint's limits [m] or [rad].
+        x: (N,) coordinate above the lower limit of the joint [m] or [rad], as in equation (24).
+        opening: (N,) opening of the valve, -1 to 1.
+        p_a: (N,) pressure of chamber A [Pa].
+        p_b: (N,) pressure of chamber B [Pa].
+        p_s: (N,) pressure of the supply [Pa].
+        p_r: (N,) pressure of the return line [Pa].
+        stroke: Distance between the limits of the joint [m] or [rad].
     """
 
     time: Array
@@ -47,7 +47,7 @@ class CylinderSignals:
 
     @property
     def step(self) -> float:
-        """[s]."""
+        """Sampling step [s]."""
         return float((self.time[-1] - self.time[0]) / (len(self.time) - 1))
 
 
@@ -58,7 +58,7 @@ def cylinder_and_valve(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     """Cylinder and valve of a joint.
 
     Raises:
-        InputError: The machine has none there.
+        InputError: The machine has none at this joint, or the valve has two spools.
     """
     circuit = machine.hydraulics
     if circuit is None:
@@ -67,14 +67,14 @@ def cylinder_and_valve(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
         raise InputError(f"'{joint}' has no cylinder, {suggest_names(circuit.cylinders, joint)}")
     if circuit.valves[joint].spool_b:
         raise InputError(
-            f"the valve of '{joint}' has two spools, which this does not tell apart: fit its "
-            "numbers with crane calibrate"
+            f"the valve of '{joint}' has two spools, which this method does not separate: fit "
+            "its parameters with crane calibrate"
         )
     return circuit.cylinders[joint], circuit.valves[joint]
 
 
 def required_channels(joint: str) -> list[tuple[str, ...]]:
-    """Channels of a cylinder: four pressures, and the signal of its valve or the spool."""
+    """Required channels of a cylinder: four pressures, and the valve signal or spool position."""
     names = [f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply", "pressure_tank"]
     return [*((name,) for name in names), (f"voltage_{joint}", f"spool_{joint}")]
 
@@ -93,9 +93,9 @@ def joint_index(recording: Recording, joint: str) -> int:
 
 
 def joint_velocity(recording: Recording, joint: str) -> Array:
-    """A joint's velocity (N,) as recorded, or from a Kalman smoother of its coordinate.
+    """Recorded velocity (N,) of a joint, or that of a Kalman smoother of its coordinate.
 
-    The latter where the recorded one is noisy, as differences of a measured coordinate are.
+    The smoother is used if the recorded velocity is noisy.
     """
     i = joint_index(recording, joint)
     v = recording.v[:, i]
@@ -105,10 +105,10 @@ def joint_velocity(recording: Recording, joint: str) -> Array:
 
 
 def channel_values(recording: Recording, name: str, unit: str) -> Array:
-    """A further column (N,) in SI units.
+    """Channel (N,) in SI units.
 
     Raises:
-        RecordingError: It is missing, or in another unit.
+        RecordingError: The channel is missing, or has another unit.
     """
     if name not in recording.channels:
         raise RecordingError(
@@ -123,21 +123,21 @@ def channel_values(recording: Recording, name: str, unit: str) -> Array:
 def cylinder_signals(
     machine: Machine, recording: Recording, joint: str, period: float | None = None
 ) -> CylinderSignals:
-    """Signals of one cylinder from the columns of a recording.
+    """Extract the signals of one cylinder from a recording.
 
-    The opening comes from `spool_<joint>` where that is recorded, else from `voltage_<joint>`
-    by `valve_opening`. A stroke that leaves its limits by noise is kept.
+    The opening is computed from `spool_<joint>` if it is recorded, else from `voltage_<joint>` by
+    `spool_position` and `valve_opening`. Strokes may exceed their limits by noise.
 
     Args:
         machine: With hydraulics.
-        recording: With the joint, `pressure_<joint>_a`, `pressure_<joint>_b`,
+        recording: Recording with the joint, `pressure_<joint>_a`, `pressure_<joint>_b`,
             `pressure_supply` and `pressure_tank`.
-        joint: The cylinder's.
-        period: Of a periodic motion [s], to be averaged over its whole periods; None for none.
+        joint: Joint of the cylinder.
+        period: Period of a periodic motion [s], which is averaged over its periods; None for none.
 
     Raises:
         InputError: The joint has no cylinder.
-        RecordingError: A column is missing, in another unit, or out of the stroke; samples are
+        RecordingError: A column is missing, has another unit, or exceeds the stroke; samples are
             not equidistant.
     """
     _, valve = cylinder_and_valve(machine, joint)
@@ -171,20 +171,20 @@ def cylinder_signals(
 
 
 def valve_opening(valve: Valve, u: Array) -> Array:
-    """Opening y (N,) of spool positions u (N,), see `Valve`."""
+    """Opening (N,) for spool positions u (N,), see `Valve`."""
     size = np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0)
     return np.copysign(size, u)
 
 
 def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
-    """Spool position u (N,) that follows a signal (N,) [V].
+    """Spool position u (N,) for a valve signal (N,) [V].
 
-    u'' + 2 damping w u' + w^2 u = w^2 (U - neutral) / (full - neutral), w the bandwidth, U the
-    signal of t - delay, from rest at the first sample, straight between samples, which is exact to
-    second order in the step. Without bandwidth the spool follows at once.
+    It solves u'' + 2 damping w u' + w^2 u = w^2 (U - neutral) / (full - neutral) with the
+    bandwidth w and the signal U at t - delay, from rest at the first sample, with linear
+    interpolation of the signal. Without bandwidth the spool follows the signal without lag.
 
     Raises:
-        RecordingError: It would move faster than the valve's rate, which this leaves out.
+        RecordingError: The spool would exceed the rate of the valve, which is not modelled here.
     """
     from scipy.signal import cont2discrete, dlsim
 
@@ -213,8 +213,8 @@ def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
 def noise_std(x: Array) -> float:
     """Standard deviation of white noise on a smooth signal (N,).
 
-    Differences of order d have the variance binomial(2 d, d) sigma^2 of the noise and hardly
-    anything of the signal; their median does not see jumps. The least over d from 2 to 8.
+    Differences of order d have the variance binomial(2 d, d) sigma^2 of the noise and little of
+    the signal; their median is robust against jumps. The minimum over d from 2 to 8 is returned.
     """
     from scipy.special import comb
 
@@ -228,7 +228,7 @@ def noise_std(x: Array) -> float:
 def signal_noise(
     signals: CylinderSignals, given: dict[str, float] | None = None
 ) -> dict[str, float]:
-    """Standard deviation of each sensor's noise, estimated where it is not given.
+    """Standard deviation of the noise of each sensor, estimated if not given.
 
     Raises:
         InputError: A sensor is unknown.
@@ -240,12 +240,12 @@ def signal_noise(
 
 
 def shift_signal(signals: CylinderSignals, name: str, offset: float) -> CylinderSignals:
-    """The same signals with one of them moved; an opening of zero stays zero."""
+    """Signals with an offset added to one of them; an opening of zero stays zero."""
     values = {entry.name: getattr(signals, entry.name) for entry in fields(signals)}
     where = values["opening"] != 0 if name == "opening" else 1.0
     return CylinderSignals(**values | {name: values[name] + offset * where})
 
 
 def opening_regions(y: Array) -> np.ndarray:
-    """Which smooth piece of the opening each sample (N,) is on: closed, open, or fully open."""
+    """Label (N,) of the smooth piece of the opening: closed, open, or fully open, with sign."""
     return np.sign(y) * (1.0 + (np.abs(y) >= 1))

@@ -1,4 +1,4 @@
-"""Bulk modulus and orifice coefficients of a cylinder and its valve by equations (29) to (32).
+"""Identification of bulk modulus and orifice coefficients by equations (29) to (32).
 
 Equations are those of the electro-hydraulic forwarder paper (IROS 2012); see
 `crane.identification.hydraulics.orifice_equations` for them.
@@ -14,6 +14,7 @@ from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
+from crane.identification.estimation.regression_problem import confidence_intervals
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,
     cylinder_and_valve,
@@ -35,7 +36,8 @@ PARAMETER_UNITS = ("1/Pa",) + 4 * ("m3/(s Pa^0.5)",)
 METHODS = ("weak", "chambers", "ls")
 
 _WINDOW_LENGTH = 0.1  # [s]
-_MIN_CORRELATION, _MIN_SIGNIFICANCE = 0.5, 10.0  # of a column's halves: see `_check_told`
+# of the halves of a column, see `_check_identifiable`
+_MIN_CORRELATION, _MIN_SIGNIFICANCE = 0.5, 10.0
 _MAX_SAMPLES = 20000  # samples of method "ls"
 _UNIDENTIFIABLE_REASONS = {
     0: (
@@ -55,21 +57,20 @@ _UNIDENTIFIABLE_REASONS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OrificeCoefficients(Result):
-    """X of one cylinder.
+    """Identified bulk modulus and orifice coefficients of one cylinder.
 
     Attributes:
-        machine: Whose areas and volumes counted as known.
+        machine: The machine, whose areas and volumes are taken as known.
         joint: The cylinder's.
-        method: Of `identify_orifices`.
+        method: Method of `identify_orifices`.
         values: (5,) 1/beta [1/Pa], c1 to c4 [m3/(s Pa^0.5)].
-        covariance: (5, 5).
-        degrees_of_freedom: Degrees of freedom of each standard error (5,).
+        covariance: (5, 5) covariance of the values.
+        degrees_of_freedom: (5,) degrees of freedom of the standard errors.
         condition: Condition number of A with columns of length one.
-        misfit: Mean square of the residuals over what the sensors' noise explains, nan for "ls",
-            which does not follow the noise through its derivatives; far above 1
-            the model is wrong or the noise stronger or not white.
+        misfit: Mean square of the residuals over that expected from the sensor noise; far above 1
+            if the model is wrong, or the noise is stronger or not white; nan for "ls".
         window: Length of the test functions [s].
-        training_sides: Sides of (29), one entry per recording.
+        training_sides: Both sides of (29), one entry per recording.
     """
 
     machine: Machine
@@ -85,27 +86,24 @@ class OrificeCoefficients(Result):
 
     @property
     def std(self) -> Array:
-        """(5,) standard errors."""
+        """Standard errors (5,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def bulk_modulus(self) -> float:
-        """Beta [Pa]; infinite if 1/beta came out negative, which its interval allows."""
+        """Bulk modulus beta [Pa]; infinite if the estimate of 1/beta is negative."""
         return 1 / float(self.values[0]) if self.values[0] > 0 else np.inf
 
     def interval(self, level: float = 0.95) -> Array:
-        """(5, 2) ends of what covers the truth with this probability."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        """Confidence intervals (5, 2) of a level."""
+        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     def predict(self, recording: Recording, period: float | None = None) -> EquationSides:
         """Both sides of (29) on another recording, as means over windows.
 
         Args:
             recording: As for `identify_orifices`.
-            period: Likewise.
+            period: As for `identify_orifices`.
         """
         signals = cylinder_signals(self.machine, recording, self.joint, period)
         return OrificeEquations(self.machine, self.joint, signals, self.window, False).sides(
@@ -143,44 +141,43 @@ def identify_orifices(
     period: float | None = None,
     noise: Mapping[str, float] | None = None,
 ) -> OrificeCoefficients:
-    """X = [1/beta, c1, c2, c3, c4] of one cylinder, its areas and hose volumes known.
+    """Identify X = [1/beta, c1, c2, c3, c4] of one cylinder with known areas and hose volumes.
 
     "weak": (29) times test functions phi, integrated by parts,
 
         -int phi' F dt / beta + sum_j c_j int phi z_j dt = int phi' (A_A ln V_A - A_B ln V_B) dt,
 
-    as Y = -(A_A ln V_A - A_B ln V_B)': nothing measured is differentiated. Windows in which the
-    opening crosses zero or its end are left out, as the integrands have kinks there. Rows are
-    taken from every other sample, with the samples between them as instruments: noise that is
-    white does not bias X. Standard errors propagate the sensors' white noise to X; what residuals
-    the noise does not explain adds the covariance of `estimators.instrumental_variables`, with its
-    correlation in time.
+    as Y = -(A_A ln V_A - A_B ln V_B)': no measured signal is differentiated. Windows in which the
+    opening crosses zero or its end are omitted, as the integrands have kinks there. Rows use every
+    other sample, with the samples between them as instruments, so that white noise does not bias
+    X. Standard errors propagate the white noise of the sensors to X; residuals beyond that noise
+    add the covariance of `estimators.instrumental_variables`, with its correlation in time.
 
     "chambers": the same with the two equations of (23) instead of their difference (29). In (29)
-    c1 and c2 (and c3, c4) differ only by how V_A / V_B changes along the stroke; here each has
-    an equation of its own.
+    c1 and c2 (and c3, c4) differ only by the change of V_A / V_B along the stroke; here each has
+    its own equation.
 
-    "ls": the paper's (36) on F' and x' by the Kalman smoother, at every sample. It filters force
-    and stroke by the noise of each, not alike: oscillations that are below the stroke's noise stay
-    on one side only, which biases 1/beta towards zero, and its interval does not tell.
+    "ls": equation (36) of the paper with F' and x' by the Kalman smoother, at every sample. Force
+    and stroke are filtered differently by their own noise: oscillations below the noise of the
+    stroke remain on one side only, which biases 1/beta towards zero beyond its interval.
 
-    Not in these equations, and in X where it matters: leakage, entrapped gas, relief and check
-    valves, cushioning, the compliance of boom and mountings.
+    The equations neglect leakage, entrapped gas, relief and check valves, cushioning, and the
+    compliance of boom and mountings, which then bias X.
 
     Args:
-        machine: With hydraulics; of its valve only the opening's numbers and the margin are used.
-        recordings: One or several, see `cylinder_signals.cylinder_signals`.
+        machine: Machine with hydraulics; of its valve only the opening and the margin are used.
+        recordings: One or several recordings, see `cylinder_signals.cylinder_signals`.
         joint: The cylinder's.
         method: "weak", "chambers" or "ls".
-        window: Length of the test functions [s], at least 64 steps are taken. About a period of
-            the oil's oscillation, where it is excited, else it hardly matters.
-        period: Of a periodic motion [s], whose periods are averaged first.
-        noise: Standard deviations of some of x, opening, p_a, p_b, p_s, p_r (after averaging),
-            which are estimated otherwise.
+        window: Length of the test functions [s], at least 64 steps; about a period of the oil's
+            oscillation if that is excited.
+        period: Period of a periodic motion [s], whose periods are averaged first.
+        noise: Standard deviations of some of x, opening, p_a, p_b, p_s, p_r after averaging; the
+            others are estimated.
 
     Raises:
-        InputError: Unknown method, joint or sensor; parameters that the motion does not tell.
-        RecordingError: Columns missing, or samples that cannot serve.
+        InputError: The method, joint or sensor is unknown, or parameters are not identifiable.
+        RecordingError: Columns are missing, or samples are not suitable.
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
@@ -215,10 +212,10 @@ def identify_orifices(
 def _opening_noise(
     machine: Machine, recording: Recording, joint: str, count: int
 ) -> dict[str, float]:
-    """Noise of an opening that came through the spool's equation, over `count` samples.
+    """Noise of an opening that is computed from the valve signal, over `count` samples.
 
-    What passes of the signal's white noise is as strong at low frequencies, to which windows
-    answer, as before, and hardly to be seen from sample to sample.
+    The spool dynamics keep the noise at the low frequencies of the windows, and remove it from
+    differences between samples.
     """
     _, valve = cylinder_and_valve(machine, joint)
     if f"spool_{joint}" in recording.channels or not valve.bandwidth:
@@ -231,7 +228,7 @@ def _opening_noise(
 def _weak_form_estimate(
     sets: list[OrificeEquations], noise: list[dict[str, float]], joint: str
 ) -> tuple[Array, Array, Array, float, float]:
-    """X, covariance, freedom, condition number, misfit."""
+    """X, covariance, degrees of freedom, condition number and misfit of the weak form."""
     count = len(sets[0].combination)
     start, W, Z, y, groups, samples = 0, [], [], [], [], []
     for rows in sets:
@@ -280,7 +277,7 @@ def _weak_form_estimate(
     misfit = found / max(explained, 1e-300)
     other = max(0.0, 1 - 1 / misfit) * estimate.covariance
     both = np.diag(propagated + other)
-    # Welch and Satterthwaite: the propagated part is known as well as the sensors' noise
+    # Welch-Satterthwaite: the propagated part is taken as exactly known
     freedom = estimate.degrees_of_freedom * (both / np.maximum(np.diag(other), 1e-9 * both)) ** 2
     return X, propagated + other, freedom, estimate.scaled_condition, misfit
 
@@ -288,7 +285,7 @@ def _weak_form_estimate(
 def _pointwise_estimate(
     machine: Machine, joint: str, runs: list[CylinderSignals]
 ) -> tuple[Array, Array, Array, float, float]:
-    """The same by (36), sample by sample."""
+    """X, covariance, degrees of freedom, condition number and misfit by (36), per sample."""
     cylinder, _ = cylinder_and_valve(machine, joint)
     areas = np.array([cylinder.area_a, -cylinder.area_b])
     start, W, y, samples = 0, [], [], []
@@ -314,10 +311,10 @@ def _pointwise_estimate(
 
 
 def _check_identifiable(sets: list[OrificeEquations], joint: str) -> None:
-    """Refuse what a motion cannot tell, by name.
+    """Reject parameters that a motion does not determine.
 
-    A column serves if its halves correlate, or if the sum of their products is many times the
-    standard deviation that it would have if they were noise.
+    A column is accepted if its halves correlate, or if the sum of their products is many times its
+    standard deviation for pure noise.
     """
     for j, (name, reason) in _UNIDENTIFIABLE_REASONS.items():
         total = energy = spread = 0.0
@@ -328,7 +325,7 @@ def _check_identifiable(sets: list[OrificeEquations], joint: str) -> None:
             energy += 0.5 * float((halves**2).sum())
             spread += float((products**2).sum())
         if not (total > _MIN_CORRELATION * energy or total > _MIN_SIGNIFICANCE * np.sqrt(spread)):
-            raise InputError(f"{name} of '{joint}' cannot be told: {reason}")
+            raise InputError(f"{name} of '{joint}' cannot be determined: {reason}")
 
 
 def _check_values(
@@ -341,8 +338,7 @@ def _check_values(
             low, high = (min(r.x.min() for r in runs), max(r.x.max() for r in runs))
             other = "" if method == "chambers" else ", or take method 'chambers'"
             raise InputError(
-                f"{pair} of '{joint}' cannot be told apart along {low:.3g} to {high:.3g} of its "
-                f"stroke ({PARAMETER_NAMES[j]} = {values[j]:.3g} +- {std[j]:.2g}): record "
-                f"longer strokes"
-                f"{other}"
+                f"{pair} of '{joint}' cannot be separated along {low:.3g} to {high:.3g} of its "
+                f"stroke ({PARAMETER_NAMES[j]} = {values[j]:.3g} +- {std[j]:.2g}): record longer "
+                f"strokes{other}"
             )

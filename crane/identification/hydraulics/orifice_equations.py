@@ -1,15 +1,16 @@
-"""Rows of the equations that hold bulk modulus and orifice coefficients.
+"""Equations of bulk modulus and orifice coefficients, in weak form.
 
-The rates of the chambers' pressures, equation (23) with the flows (21), (22), over V and beta:
+The pressure rates of the chambers, equation (23) with the flows (21), (22), over V and beta:
 
     A:  p_A' / beta - (c1 y+ r1 + c3 y- r3) / V_A = -(ln V_A)'
     B:  p_B' / beta + (c2 y+ r2 + c4 y- r4) / V_B = -(ln V_B)'
 
     r1 = root(p_S - p_A), r2 = root(p_B - p_R), r3 = root(p_A - p_R), r4 = root(p_S - p_B),
 
-y+ = max(y, 0), y- = min(y, 0) of the opening, root(d) = sign(d) sqrt(|d|): an edge passes oil
-either way. A valve with a margin limits r1 and r4 to its root and lets nothing back. Area A times
-the first less area B times the second is equation (29), A X = Y, X = [1/beta, c1, c2, c3, c4].
+with y+ = max(y, 0), y- = min(y, 0) of the opening and root(d) = sign(d) sqrt(|d|) for flow in both
+directions. A valve with a margin limits r1 and r4 to the root of the margin and has no return
+flow. Area A times the first equation minus area B times the second is equation (29), A X = Y, X =
+[1/beta, c1, c2, c3, c4].
 
 Equations are those of the electro-hydraulic forwarder paper (IROS 2012).
 """
@@ -17,7 +18,9 @@ Equations are those of the electro-hydraulic forwarder paper (IROS 2012).
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from crane.common.errors import RecordingError
 from crane.common.samples import Array
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,
@@ -25,8 +28,11 @@ from crane.identification.hydraulics.cylinder_signals import (
     opening_regions,
     shift_signal,
 )
-from crane.identification.signals.weak_form import WeakFormWindows
 from crane.machine import Machine
+
+_EXPONENT = 6
+_MIN_HALF_WIDTH = 32  # least number of steps to either side of a centre
+_WINDOWS_PER_LENGTH = 8  # windows per window length
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +41,8 @@ class EquationSides:
 
     Attributes:
         time: (K,) [s].
-        predicted: A X by the estimated parameters (K,).
-        measured: Y as measured (K,).
+        predicted: (K,) A X for the estimated parameters.
+        measured: (K,) measured Y.
     """
 
     time: Array
@@ -45,28 +51,28 @@ class EquationSides:
 
     @property
     def relative_error(self) -> float:
-        """Norm of right less left over that of right."""
+        """Norm of the difference over the norm of the measured side."""
         return float(
             np.linalg.norm(self.measured - self.predicted) / np.linalg.norm(self.measured)
         )
 
 
 class OrificeEquations:
-    """Rows of one recording, E equations on two halves of the samples of K windows.
+    """Equations of one recording: E equations on two halves of the samples of K windows.
 
     Args:
         machine: With hydraulics.
         joint: The cylinder's.
-        signals: Of the recording.
-        window_length: Length [s].
-        per_chamber: Whether both equations (23), or their difference (29).
+        signals: Signals of the recording.
+        window_length: Length of the windows [s].
+        per_chamber: Whether to use both equations (23), or their difference (29).
 
     Attributes:
-        combination: Chambers' equations (A, B) in each equation (E, 2).
+        combination: (E, 2) weights of the equations of chambers A and B.
         windows: Test functions.
-        is_smooth: Windows without kinks of the opening (K,).
-        W: Of X (E, 2, K, 5).
-        y: Right sides (E, 2, K).
+        is_smooth: (K,) mask of windows without kinks of the opening.
+        W: (E, 2, K, 5) columns of X.
+        y: (E, 2, K) right-hand sides.
     """
 
     def __init__(
@@ -81,9 +87,8 @@ class OrificeEquations:
         areas = np.array([cylinder.area_a, -cylinder.area_b])
         self.machine, self.joint, self.signals = machine, joint, signals
         self.combination = np.eye(2) if per_chamber else areas[None]
-        self._difference_weights = (
-            areas if per_chamber else np.ones(1)
-        )  # of the equations, in (29)
+        # weights of the equations in (29)
+        self._difference_weights = areas if per_chamber else np.ones(1)
         self.windows = w = WeakFormWindows.create(len(signals.time), signals.step, window_length)
         self.is_smooth = w.are_uniform(opening_regions(signals.opening))
         states, columns = self._combined_terms(signals)
@@ -102,7 +107,7 @@ class OrificeEquations:
         )
 
     def sides(self, X: Array) -> EquationSides:
-        """Both sides of (29) by X (5,), all windows."""
+        """Both sides of (29) for X (5,) in all windows."""
         W, y = (
             np.tensordot(self._difference_weights, self.W, 1),
             np.tensordot(self._difference_weights, self.y, 1),
@@ -111,7 +116,7 @@ class OrificeEquations:
         return EquationSides(time, (W @ X).mean(axis=0), y.mean(axis=0))
 
     def noise_sensitivity(self, X: Array, sensor: str, offset: float) -> tuple[Array, Array]:
-        """By what noise of a sensor moves the differentiated part, and the other, (E, N) each."""
+        """Changes (E, N) of the differentiated part and of the other part by noise of a sensor."""
         ends = []
         for sign in (1, -1):
             states, columns = self._combined_terms(
@@ -123,7 +128,7 @@ class OrificeEquations:
 
 
 def chamber_terms(machine: Machine, joint: str, signals: CylinderSignals) -> tuple[Array, Array]:
-    """Of both chambers what is differentiated, and what is not.
+    """Terms of both chambers that are differentiated, and the others.
 
     Returns:
         (p_A, ln V_A), (p_B, ln V_B) as (2, 2, N), and the columns of c1 to c4 (2, 4, N), so that
@@ -159,5 +164,76 @@ def chamber_terms(machine: Machine, joint: str, signals: CylinderSignals) -> tup
 
 
 def _signed_sqrt(drop: Array) -> Array:
-    """Signed square root."""
+    """Signed square root sign(d) sqrt(|d|)."""
     return np.copysign(np.sqrt(np.abs(drop)), drop)
+
+
+@dataclass(frozen=True, eq=False)
+class WeakFormWindows:
+    """Windows of test functions (1 - s^2)^6, each on even and on odd sample offsets.
+
+    For phi that vanishes at both ends of its window, int phi f' dt = -int phi' f dt: no measured
+    signal is differentiated. With s from -1 to 1 the first five derivatives of phi vanish at the
+    ends, so that sums over equidistant samples approximate the integrals to the order of (pi
+    samples)^-7 for a smooth integrand. White noise of one half is independent of that of the other
+    half, so each half is an instrument for the other.
+
+    Attributes:
+        centres: (K,) samples of the centres.
+        phi: (2, 2 n + 1) weights of the mean over a window by either half; their sum is 1.
+        phi_derivative: (2, 2 n + 1) weights of the mean derivative by either half [1/s].
+    """
+
+    centres: np.ndarray
+    phi: Array
+    phi_derivative: Array
+
+    @classmethod
+    def create(cls, count: int, step: float, length: float) -> "WeakFormWindows":
+        """Create windows of `length` [s], at least 64 steps, over `count` samples.
+
+        Raises:
+            RecordingError: There are fewer samples than in one window.
+        """
+        half_width = 4 * max(round(length / step / 8), _MIN_HALF_WIDTH // 4)
+        spacing = 2 * max(2 * half_width // _WINDOWS_PER_LENGTH // 2, 1)
+        if count < 2 * half_width + 1:
+            raise RecordingError(
+                f"{count} samples are fewer than the {2 * half_width + 1} of one window, record "
+                f"longer"
+            )
+        offsets = np.arange(-half_width, half_width + 1.0)
+        s = offsets / half_width
+        half = np.stack([offsets % 2 == 0, offsets % 2 == 1])
+        phi = (1 - s**2) ** _EXPONENT * half
+        phi_derivative = s * (1 - s**2) ** (_EXPONENT - 1) * half
+        return cls(
+            np.arange(half_width, count - half_width, spacing),
+            phi / phi.sum(axis=1, keepdims=True),
+            phi_derivative / (phi_derivative @ offsets * step)[:, None],
+        )
+
+    @property
+    def half_width(self) -> int:
+        """Steps from a centre to either end of its window."""
+        return self.phi.shape[1] // 2
+
+    def integrate(self, weights: Array, f: Array) -> Array:
+        """Weighted sums (2, K) of a signal (N,) over all windows."""
+        view = sliding_window_view(f, weights.shape[1])[self.centres - self.half_width]
+        return np.asarray(weights @ view.T)
+
+    def apply_transpose(self, weights: Array, rows: Array, count: int) -> Array:
+        """Transpose of `integrate` (N, p), applied to rows (2, K, p)."""
+        out = np.zeros((count, rows.shape[2]))
+        for half in range(2):
+            for offset in np.flatnonzero(weights[half]):
+                out[self.centres - self.half_width + offset] += weights[half, offset] * rows[half]
+        return out
+
+    def are_uniform(self, labels: np.ndarray) -> np.ndarray:
+        """Mask (K,) of windows in which the labels (N,) are constant."""
+        changes = np.append(0, np.cumsum(np.diff(labels) != 0))
+        return np.asarray(
+            changes[self.centres + self.half_width] == changes[self.centres - self.half_width]
+        )

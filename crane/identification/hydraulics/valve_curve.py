@@ -1,13 +1,14 @@
-"""Neutral signal, dead band and flow gain of a compensated valve from steady speeds.
+"""Identification of neutral signal, dead band and flow gains of a compensated valve.
 
-Pressure compensation makes the flow a function of the signal U [V] alone. With e = U - neutral
-towards extending (turned where `full` is below `neutral`), steady speed v and half a dead band w,
+With pressure compensation the flow is a function of the signal U [V] alone. With e = U - neutral,
+positive for extending (the sign changes if `full` is below `neutral`), the steady speed v and the
+half dead band w,
 
     v = s_up max(e - w, 0) - s_down max(-e - w, 0),
 
-and with the nominal signal range S = |full - neutral| that is v A = gain (|u| - u0) / (1 - u0),
-u = e / S, u0 = w / S, gain = s A (S - w): A is the inlet's area, chamber A to extend and B to
-retract.
+With the nominal signal range S = |full - neutral| this is v A = gain (|u| - u0) / (1 - u0), u = e
+/ S, u0 = w / S, gain = s A (S - w), with the area A of the inlet: of chamber A for extending, of B
+for retracting.
 """
 
 from dataclasses import dataclass
@@ -30,28 +31,27 @@ from crane.recordings.recording import Recording
 
 PARAMETER_NAMES = ("edge up", "edge down", "slope up", "slope down")
 _PARAMETER_UNITS = ("V", "V", "{0}/s/V", "{0}/s/V")
-_STANDSTILL_SHARE = 0.01  # of the fastest speed, at which a signal moves nothing
-_MIN_SIGNAL_SPREAD = 0.05  # of the signal's range, by which levels of one direction must differ
+_STANDSTILL_SHARE = 0.01  # of the fastest speed, below which the joint stands still
+_MIN_SIGNAL_SPREAD = 0.05  # of the signal's range: least spread of levels in one direction
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ValveCurve(Result):
-    """Steady speed over signal.
+    """Identified curve of the steady speed over the valve signal.
 
     Attributes:
         joint: The cylinder's.
-        values: (4,) signals where extending and retracting begin [V], and how the speed in that
-            direction grows with the signal [m/s/V] or [rad/s/V], both positive.
-        covariance: (4, 4).
-        degrees_of_freedom: Degrees of freedom behind it.
-        signal_range: Nominal |full - neutral| [V] with its sign: negative where a lower signal
-            extends.
-        inlet_areas: Of the inlets (2,), extending and retracting [m2].
-        signal: Steady samples used (M,) [V].
-        speed: Their speeds (M,).
+        values: (4,) signals at the start of extending and retracting [V], and slopes of the speed
+            in these directions [m/s/V] or [rad/s/V], both positive.
+        covariance: (4, 4) covariance of the values.
+        degrees_of_freedom: Degrees of freedom of the covariance.
+        signal_range: full - neutral [V]; negative if a lower signal extends.
+        inlet_areas: (2,) areas of the inlets for extending and retracting [m2].
+        signal: (M,) signals of the steady samples [V].
+        speed: (M,) speeds of the steady samples.
         noise: Standard deviation of the speeds about the curve.
-        ringing: Lowest and highest frequency [Hz] and largest amplitude of speeds that ring while
-            the signal is held, of which means over periods are taken; None where none does.
+        ringing: Lowest and highest frequency [Hz] and largest amplitude of speeds that ring at a
+            constant signal and are averaged over periods; None if there are none.
     """
 
     joint: str
@@ -66,10 +66,10 @@ class ValveCurve(Result):
     ringing: tuple[float, float, float] | None = None
 
     def valve_parameters(self) -> tuple[tuple[str, ...], Array, Array]:
-        """What a machine file takes: names, values (5,) and Jacobian (5, 4) of them.
+        """Parameters of a machine file: names, values (5,) and their Jacobian (5, 4).
 
-        neutral [V], dead_band as share u0 and, as half width, in volts, flow of u = 1 extending
-        and retracting [m3/s].
+        They are neutral [V], dead_band as the share u0, half width [V], and flows at u = 1 for
+        extending and retracting [m3/s].
         """
         up, down, s_up, s_down = self.values
         turn, size = np.sign(self.signal_range), abs(self.signal_range)
@@ -97,16 +97,16 @@ class ValveCurve(Result):
 
     @property
     def dead_band(self) -> float:
-        """Share u0 of the nominal stroke."""
+        """Dead band as the share u0 of the nominal stroke."""
         return float(self.valve_parameters()[1][1])
 
     @property
     def full_flows(self) -> tuple[float, float]:
-        """Flow of u = 1, extending and retracting [m3/s]."""
+        """Flows at u = 1 for extending and retracting [m3/s]."""
         return float(self.valve_parameters()[1][3]), float(self.valve_parameters()[1][4])
 
     def parameter_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float, float]]:
-        """By name value, and both ends of what covers the truth with this probability."""
+        """Value and confidence interval of each parameter by name."""
         from scipy.stats import t
 
         factor = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom)
@@ -125,7 +125,7 @@ class ValveCurve(Result):
         return _steady_speed(self.values, signal, np.sign(self.signal_range))
 
     def to_text(self, unit: str = "m") -> str:
-        """A table of all of them."""
+        """Table of all parameters."""
         units = [text.format(unit) for text in _PARAMETER_UNITS] + ["V", "", "V", "m3/s", "m3/s"]
         lines = [
             f"valve of {self.joint}: {len(self.signal)} steady samples",
@@ -138,10 +138,10 @@ class ValveCurve(Result):
         if self.ringing is not None:
             low, high, size = self.ringing
             at = f"{low:.3g}" if high < 1.02 * low else f"{low:.3g} to {high:.3g}"
-            told = (
-                f"the speed rings at {at} Hz by up to {size:.3g} {unit}/s while the signal is held"
+            lines.append(
+                f"the speed rings at {at} Hz by up to {size:.3g} {unit}/s while the signal is "
+                "held: means over its periods are taken"
             )
-            lines.append(f"{told}: means over its periods are taken")
         return "\n".join(lines) + "\n"
 
 
@@ -149,27 +149,28 @@ class ValveCurve(Result):
 def identify_valve(
     machine: Machine, recording: Recording, joint: str, settle: float = 0.5
 ) -> ValveCurve:
-    """Dead band and gains of one valve from slow ramps or a staircase of its signal.
+    """Identify dead band and gains of one valve from slow ramps or steps of its signal.
 
-    Samples count whose signal and speed hardly changed over the last `settle` seconds, or, where
-    the speed rings while the signal is held, whose means over its period did. With
-    pressures recorded, those that move are left out where the compensator has no margin (supply
-    less inlet below the valve's margin), or where the inlet is sucked empty (below half of the
-    tank's pressure) since the load runs ahead. The spool's lag moves the edges by lag times rate
-    of a ramp; up and down together cancel that.
+    Samples are used if signal and speed were steady over the last `settle` seconds, or, if the
+    speed rings at a constant signal, if their means over its period were. If pressures are
+    recorded, moving samples are omitted where the compensator has no margin (supply minus inlet
+    below the margin of the valve), or where the inlet cavitates (below half of the tank pressure)
+    under a pulling load. The lag of the spool shifts the edges by lag times rate of a ramp; ramps
+    in both directions cancel this.
 
     Args:
-        machine: With hydraulics; of its valve `neutral`, `full` and `margin` are used, the first
-            two for direction and range only.
-        recording: With the joint and `voltage_<joint>`; pressures as in `cylinder_signals`.
-            A noisy velocity is replaced by a smoother's of the coordinate.
+        machine: Machine with hydraulics; of its valve `margin` is used, and `neutral` and `full`
+            for direction and range.
+        recording: Recording with the joint and `voltage_<joint>`; pressures as in
+            `cylinder_signals`. A noisy velocity is replaced by that of a smoother of the
+            coordinate.
         joint: The cylinder's.
-        settle: [s], several times the spool's and the load's answer.
+        settle: Duration [s] of several response times of spool and load.
 
     Raises:
         InputError: The joint has no cylinder.
-        RecordingError: A column is missing, nothing is steady, or one direction is not recorded
-            at two signals.
+        RecordingError: A column is missing, no sample is steady, or a direction is not recorded at
+            two signals.
     """
     cylinder, valve = cylinder_and_valve(machine, joint)
     signal = channel_values(recording, f"voltage_{joint}", "V")
@@ -196,7 +197,7 @@ def identify_valve(
                 f"a slow ramp or steps of more than {settle:g} s of 'voltage_{joint}' that way"
             )
     at = np.flatnonzero(is_steady)
-    # so many samples as tell anything anew
+    # more samples add no information
     at = at[:: max(1, len(at) // 4000)]
     U, speeds = signal[at], v[at]
     values = _fit_curve(U, speeds, sign, fastest)
@@ -225,7 +226,7 @@ def _steady_speed(values: Array, U: Array, sign: float) -> Array:
 
 
 def _steady_speed_jacobian(values: Array, U: Array, sign: float) -> Array:
-    """Of `_steady_speed` (M, 4)."""
+    """Jacobian (M, 4) of `_steady_speed`."""
     up, down, s_up, s_down = values
     rising, falling = np.maximum(sign * (U - up), 0), np.maximum(sign * (down - U), 0)
     return np.column_stack(
@@ -234,7 +235,7 @@ def _steady_speed_jacobian(values: Array, U: Array, sign: float) -> Array:
 
 
 def _fit_curve(U: Array, v: Array, sign: float, fastest: float) -> Array:
-    """Least squares in edges and slopes, from straight lines through each direction."""
+    """Fit edges and slopes by least squares, starting from straight lines in each direction."""
     from scipy.optimize import least_squares
 
     start = np.empty(4)

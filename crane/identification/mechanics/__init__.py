@@ -1,1 +1,1 @@
-"""Inertial and friction parameters, and payloads."""
+"""Identification of inertial parameters, friction and payloads."""

@@ -1,4 +1,4 @@
-"""Base parameters: what of a machine's parameters can be told from its drives' forces."""
+"""Base parameters: identifiable combinations of the parameters of a machine."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.mechanics.model_term import MotionSamples
 from crane.machine import Machine
 
-_RANK_TOLERANCE = 1e-8  # of a column's norm, what of it must be new
-_ZERO_TOLERANCE = 1e-10  # of the largest norm, below which a column is zero
-_DEFAULT_SPAN = 1.0  # [rad], [machine's size] of joints without limits
-# Preferred as base parameters, first: what is told from one axis before what needs many.
+_RANK_TOLERANCE = 1e-8  # independent part of a column, relative to its norm
+_ZERO_TOLERANCE = 1e-10  # norm of a zero column, relative to the largest
+_DEFAULT_SPAN = 1.0  # [rad], of the characteristic length, for joints without limits
+# order in which parameters are preferred as base parameters
 _PREFERENCE_ORDER = {
     "Izz": 0,
     "mx": 1,
@@ -34,15 +34,15 @@ _PREFERENCE_ORDER = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BaseParameters(OneLineRepr):
-    """The smallest set of parameters with the same effect: W beta = W[:, independent] K beta.
+    """Smallest set of parameters with the same effect: W beta = W[:, independent] K beta.
 
     Attributes:
-        names: (p,) of all parameters.
-        independent: (r,) columns of W that carry the base parameters.
-        grouping: K (r, p): base parameters are K beta; identity in the independent columns.
-        unobservable: Names of parameters without any effect.
-        units: (p,) to compare parameters with: of a body of 1 kg in a machine of size l 1, l and
-            l^2; of friction and the like what makes as much force at most.
+        names: (p,) names of all parameters.
+        independent: (r,) columns of W of the base parameters.
+        grouping: (r, p) matrix K: base parameters are K beta; identity in the independent columns.
+        unobservable: Names of parameters without an effect.
+        units: (p,) scales of the parameters: 1, l and l^2 for a body of 1 kg and the
+            characteristic length l; for others the value with the same largest force.
     """
 
     names: tuple[str, ...]
@@ -57,10 +57,10 @@ class BaseParameters(OneLineRepr):
         return len(self.independent)
 
     def identifiable_part(self, rows: Array) -> "BaseParameters":
-        """What of the base parameters a motion tells, rows (m, r) of their columns.
+        """Identifiable part of the base parameters for a motion with the rows (m, r).
 
-        Of the columns those are taken first of which much is new: taken in another order, many
-        of which a little is new may together hold nothing new.
+        Columns with a large independent part are taken first: in another order many columns with a
+        small independent part may together be dependent.
         """
         names, units = [self.names[i] for i in self.independent], self.units[self.independent]
         order = _pivot_order(rows)
@@ -73,7 +73,7 @@ class BaseParameters(OneLineRepr):
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Each base parameter in words, such as "link7.mx + 0.22 payload.m"."""
+        """Text of each base parameter, such as "link7.mx + 0.22 payload.m"."""
         out = []
         for row, first in zip(self.grouping, self.independent, strict=True):
             others = []
@@ -85,15 +85,15 @@ class BaseParameters(OneLineRepr):
         return tuple(out)
 
     def values(self, parameters: Array) -> Array:
-        """Base parameters (r,) of parameters (p,)."""
+        """Base parameters (r,) for parameters (p,)."""
         return self.grouping @ parameters
 
 
 def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> MotionSamples:
-    """Closed postures all over the strokes, with random velocities and accelerations.
+    """Random closed configurations within the strokes, with velocities and accelerations.
 
     Raises:
-        InputError: The loops close nowhere within the limits.
+        InputError: The loops do not close within the limits.
     """
     machine, rng = model.machine, np.random.default_rng(seed)
     lower, upper = stroke_limits(machine)
@@ -109,10 +109,10 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
             break
     if len(q_a) < count:
         raise InputError(
-            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random postures "
-            "within its limits, narrow the limits"
+            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random "
+            "configurations within its limits, narrow the limits"
         )
-    # joints that move little per coordinate are moved faster, so that all columns are alike
+    # velocities are scaled by the ranges, so that columns are comparable
     span, characteristic_time = upper - lower, machine.closure.characteristic_time
     v_a, a_a = (
         size * span * rng.normal(size=(count, len(lower)))
@@ -122,7 +122,7 @@ def random_samples(model: IdentificationModel, count: int, seed: int = 0) -> Mot
 
 
 def stroke_limits(machine: Machine) -> tuple[Array, Array]:
-    """Limits of the active joints; those without are taken around home."""
+    """Limits of the active joints; without limits a default range around home."""
     home = machine.home[machine.closure.active]
     span = machine.upper - machine.lower
     is_unlimited, margin = (
@@ -138,30 +138,30 @@ def stroke_limits(machine: Machine) -> tuple[Array, Array]:
 def base_parameters(
     model: IdentificationModel, samples: MotionSamples | None = None, seed: int = 0
 ) -> BaseParameters:
-    """Base parameters of a model, numerically (Gautier, 1991).
+    """Compute the base parameters of a model numerically (Gautier, 1991).
 
-    The columns of W over random closed postures are taken one by one, those of Izz, mx, my and
-    of the last bodies first; one that is a combination of those before it joins their groups.
+    The columns of W for random closed configurations are taken one by one, those of Izz, mx, my
+    and of distal bodies first; a column that depends on those before it is grouped with them.
 
     Args:
         model: The model.
-        samples: A motion, if what it can tell is asked for; all of the strokes if not given.
-        seed: Of the random postures.
+        samples: Samples of a motion; default random samples within the strokes.
+        seed: Seed of the random samples.
 
     Raises:
-        InputError: The loops close nowhere within the limits.
+        InputError: The loops do not close within the limits.
     """
     p, n = len(model.names), len(model.machine.active)
     if samples is None:
         samples = random_samples(model, max(60, 4 * p // n), seed)
     closure, bodies = model.machine.closure, 10 * len(model.bodies)
-    # forces as virtual work per 1 rad and the machine's size, so that drives compare
+    # forces as virtual work per 1 rad or characteristic length, to compare drives
     rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)
     units = np.ones(p)
     body = [1.0, *[closure.characteristic_length] * 3, *[closure.characteristic_length**2] * 6]
     units[:bodies] = np.tile(body, len(model.bodies))
     norms = np.linalg.norm(rows, axis=0) * units
-    if norms[bodies:].any():  # friction and the like compare among themselves
+    if norms[bodies:].any():  # other parameters are compared among themselves
         units[bodies:] = norms[:bodies].max(initial=0.0) / norms[bodies:].max() or 1.0
     return group_parameters(
         model.names, rows, units, lambda column: _column_preference(model, column)
@@ -174,9 +174,9 @@ def group_parameters(
     units: Array,
     preference: Callable[[int], Any] = lambda column: column,
 ) -> BaseParameters:
-    """Base parameters of a regressor (m, p) and units (p,), columns of small preference first.
+    """Base parameters of a regressor (m, p) with units (p,); small preference values first.
 
-    A column counts if what is new of it exceeds 1e-8 of its norm.
+    A column is independent if its part orthogonal to the chosen ones exceeds 1e-8 of its norm.
     """
     norms = np.linalg.norm(rows, axis=0)
     zero = norms * units <= _ZERO_TOLERANCE * (norms * units).max(initial=0.0)
@@ -185,7 +185,7 @@ def group_parameters(
     directions = np.empty((len(rows), 0))
     for i in sorted(np.flatnonzero(~zero).tolist(), key=preference):
         rest = scaled[:, i]
-        for _ in range(2):  # twice is enough (Kahan, Parlett)
+        for _ in range(2):  # twice is sufficient (Kahan, Parlett)
             rest = rest - directions @ (directions.T @ rest)
         length = np.linalg.norm(rest)
         if length > _RANK_TOLERANCE:
@@ -202,10 +202,10 @@ def group_parameters(
 
 
 def _pivot_order(columns: Array) -> list[int]:
-    """Columns in the order of what is new of them, as of columns of length one.
+    """Order of the columns by their independent parts, for columns of length one.
 
-    As with pivoting (Businger, Golub, 1965), but the first of those of which at least half as
-    much is new as of any, so that rounding does not choose among those of which as much is.
+    It is pivoting (Businger, Golub, 1965) that takes the first column with at least half of the
+    largest independent part, so that rounding does not decide between equal ones.
     """
     norms = np.linalg.norm(columns, axis=0)
     rest, order = columns / np.where(norms, norms, 1.0), list[int]()
@@ -220,7 +220,7 @@ def _pivot_order(columns: Array) -> list[int]:
 
 
 def _column_preference(model: IdentificationModel, column: int) -> tuple[int, int, int]:
-    """Bodies before other parameters of the same effect, distal ones first."""
+    """Preference of a column: bodies before other parameters, distal bodies first."""
     bodies = 10 * len(model.bodies)
     if column >= bodies:
         return (1, 0, column)

@@ -1,4 +1,4 @@
-"""Settings of an identification chosen by what is left out of the training."""
+"""Cross-validation of settings of an identification within the training data."""
 
 import itertools
 import warnings
@@ -12,27 +12,28 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.units import format_table
+from crane.identification.mechanics.equation_setup import RecordingOrMotion, prepare_motions
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions
+from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.priors import prior_from_names, read_priors
 from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
 from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
 
 FOLD_COUNT = 5
-_MIN_FOLD_SAMPLES = 50  # samples of a part
+_MIN_FOLD_SAMPLES = 50  # least number of samples of a fold
 _BANDWIDTH = "bandwidth"
 
 
 @dataclass(frozen=True)
 class CrossValidationTrial:
-    """Settings, and how well they predict what they were not learned from.
+    """Settings and their prediction errors on held-out folds.
 
     Attributes:
-        settings: By name.
-        errors: (k,) norm of the residuals over that of the forces of each part left out; infinite
-            where it cannot be identified without it, nan where nothing moves in it.
+        settings: Settings by name.
+        errors: (k,) norm of the residuals over that of the forces of each held-out fold; infinite
+            if the identification fails without it, nan if nothing moves in it.
     """
 
     settings: Mapping[str, object]
@@ -40,7 +41,7 @@ class CrossValidationTrial:
 
     @property
     def mean_error(self) -> float:
-        """Root mean square of the errors of parts that move."""
+        """Root mean square of the errors of folds with motion."""
         errors = self.errors[~np.isnan(self.errors)]
         return float(np.sqrt(np.mean(errors**2))) if len(errors) else np.inf
 
@@ -52,31 +53,31 @@ def cross_validate(
     progress: Progress | None = None,
     **options: Any,
 ) -> list[CrossValidationTrial]:
-    """Errors of settings on parts of the training that were left out of it, the best first.
+    """Cross-validate settings on folds of the training data; the best are first.
 
-    Each recording is cut into five parts of equal length; each part is predicted by what the
-    others teach. All are judged by the same rows, through the same low-pass: that of the lowest
-    bandwidth tried.
+    Each recording is divided into five folds of equal length; each fold is predicted by an
+    identification from the others. All settings are compared by the same rows and the low-pass of
+    the lowest bandwidth.
 
     Args:
         machine: The machine.
-        recording: The training, one or several.
-        candidates: Values by name: "bandwidth" [Hz], or what is known of parameters by name, such
-            as {"bodies": ["1 %", "10 %"]}; all combinations are tried.
-        progress: Takes the finished share.
-        options: Of `identify`, the same for all.
+        recording: Training data, one or several recordings.
+        candidates: Values by name: "bandwidth" [Hz], or priors of parameters, such as {"bodies":
+            ["1 %", "10 %"]}; all combinations are evaluated.
+        progress: Called with the finished share, 0 to 1.
+        options: Options of `identify` for all settings.
 
     Raises:
-        InputError: Nothing is tried or what cannot be, or a recording is too short for its parts.
-        RecordingError: A recording cannot serve.
+        InputError: There are no candidates, one is not valid, or a recording is too short.
+        RecordingError: A recording is not suitable.
     """
     progress = progress_reporter(progress)
     if not candidates or not all(candidates.values()):
-        raise InputError("nothing is tried, give values such as bandwidth=2,5,10")
+        raise InputError("there are no candidates, give values such as bandwidth=2,5,10")
     motions = prepare_motions(machine, recording, options.get("trust", False), None)
     if (shortest := min(len(motion.time) for motion in motions)) < FOLD_COUNT * _MIN_FOLD_SAMPLES:
         raise InputError(
-            f"{shortest} samples are too few for {FOLD_COUNT} parts, give at least "
+            f"{shortest} samples are too few for {FOLD_COUNT} folds, give at least "
             f"{FOLD_COUNT * _MIN_FOLD_SAMPLES}"
         )
     grid = [
@@ -98,14 +99,14 @@ def cross_validate(
             progress((done + 1) / len(grid))
     if not np.isfinite(min(trial.mean_error for trial in trials)):
         raise InputError(
-            "some part of the training is not told by the others whatever the settings, give a "
-            f"prior, higher bandwidths or a longer recording (lastly: {reason})"
+            "some fold of the training data is not determined by the others for any settings, "
+            f"give a prior, higher bandwidths or a longer recording (lastly: {reason})"
         )
     return sorted(trials, key=lambda trial: trial.mean_error)
 
 
 def identify_options(trial: CrossValidationTrial, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What `identify` takes for these settings beside other options."""
+    """Options of `identify` for the settings of a trial and other options."""
     prior_settings = {name: what for name, what in trial.settings.items() if name != _BANDWIDTH}
     out = dict(options)
     if _BANDWIDTH in trial.settings:
@@ -113,14 +114,16 @@ def identify_options(trial: CrossValidationTrial, options: Mapping[str, Any]) ->
     if prior_settings:
         given_prior = {} if (given := out.get("prior")) is None else given
         if not isinstance(given_prior, Mapping | int | float):
-            raise InputError("the prior is numbers of all parameters, give it by name to try some")
+            raise InputError(
+                "the prior is an array of all parameters, give it by name to vary parts of it"
+            )
         out["prior"] = read_priors(given_prior) | read_priors(prior_settings)
     return out
 
 
 def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
-    """A table of settings and errors."""
-    rows = [["settings", "error", "of the parts left out"]]
+    """Table of settings and errors."""
+    rows = [["settings", "error", "of the held-out folds"]]
     for trial in trials:
         words = ", ".join(f"{name}={value}" for name, value in trial.settings.items())
         each = " ".join("-" if np.isnan(x) else f"{100 * x:.2f}" for x in trial.errors)
@@ -131,10 +134,10 @@ def format_trials(trials: Sequence[CrossValidationTrial]) -> str:
 def _check_settings(
     machine: Machine, grid: Sequence[Mapping[str, object]], options: Mapping[str, Any]
 ) -> None:
-    """See that settings are such as an identification takes, whatever is recorded.
+    """Check that settings are valid for an identification, independent of the recording.
 
     Raises:
-        InputError: One is not, or what they need is not installed.
+        InputError: A setting is not valid, or a required library is not installed.
     """
     if options.get("feasible"):
         load_convex_solver()
@@ -158,7 +161,7 @@ def _read_frequency(value: object) -> float:
 def _comparison_bandwidth(
     machine: Machine, candidates: Mapping[str, Sequence[object]], options: Mapping[str, Any]
 ) -> float | None:
-    """The bandwidth by which all are judged; None: that of the first identification."""
+    """Bandwidth of the comparison; None for that of the first identification."""
     if _BANDWIDTH in candidates:
         return min(map(_read_frequency, candidates[_BANDWIDTH]))
     return options.get("bandwidth") or machine.estimation.bandwidth
@@ -172,10 +175,10 @@ def _held_out_error(
     bandwidth: float | None,
     options: Mapping[str, Any],
 ) -> float:
-    """The error of one part of each motion by all the others, nan where nothing moves in it.
+    """Prediction error of one fold of each motion by the others, nan if nothing moves in it.
 
     Raises:
-        CraneError: They do not tell it.
+        CraneError: The identification fails.
     """
     training, held_out = [], []
     for motion in motions:
@@ -190,7 +193,7 @@ def _held_out_error(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         trial = identify_options(CrossValidationTrial(settings, np.empty(0)), options)
-        # of parts the checks know too little; the whole has passed, or will not
+        # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})
         held_out_equations = RegressionEquations(
             identification.model,

@@ -1,10 +1,11 @@
-"""Parameters of bodies that can exist."""
+"""Estimate of all parameters with physically feasible bodies, and its covariance."""
 
 import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.identification.estimation.estimators import Estimate, Prior, estimate_from_minimum
+from crane.identification.estimation.estimators import estimate_from_minimum
+from crane.identification.estimation.regression_problem import Estimate, Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
@@ -16,13 +17,11 @@ from crane.identification.mechanics.feasible_parameters import (
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.regression_equations import RegressionEquations
 
-_MIN_NOISE_SHARE = 1e-4  # of the forces, noise that a feasible estimate counts with at least
-_DEFAULT_RELATIVE_STD = (
-    0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
-)
-_UNINFORMATIVE_STD = 1e3  # that of a body of which a prior says nothing
+_MIN_NOISE_SHARE = 1e-4  # least noise of a feasible estimate, relative to the forces
+_DEFAULT_RELATIVE_STD = 0.3  # default relative standard deviation of the prior of a body
+_UNINFORMATIVE_STD = 1e3  # that of a body without a prior
 _ROUNDING = 1e-9
-_MIN_THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
+_MIN_THICKNESS = 0.05  # least thickness of a body in a prior, relative to its size
 
 
 def feasible_estimate(
@@ -33,30 +32,29 @@ def feasible_estimate(
     unconstrained: Estimate,
     prior: Prior | None,
 ) -> Estimate:
-    """All parameters, with bodies that can exist and friction that is not negative.
+    """Estimate all parameters with feasible bodies and nonnegative friction.
 
-    The covariance is that of the minimum of `feasible`'s own objective,
+    The covariance is that of the minimum of the cost of `solve_feasible`,
 
         H^-1 (W^T D C D W + P) H^-1,    H = W^T D W + P,    D = 1 / noise^2,
 
-    with C the covariance of the residuals, P half of the second derivative of divergence and
-    spread at the estimate, as if what they draw towards were as uncertain as they say. A bound at
-    which friction ends is not counted as knowledge: there the interval is too wide rather than
-    too narrow.
+    with the covariance C of the residuals, and P half of the second derivative of the prior terms
+    at the estimate. Active bounds of friction are not used as information, so intervals there are
+    rather too wide.
 
     Args:
         model: The model, with bodies.
-        base: What of its base parameters the recording tells.
-        equations: The recording.
-        selection: Which columns of the rows they are (., r).
-        unconstrained: Estimate of the base parameters that knows no bounds, for its noise.
-        prior: Of all parameters; the described bodies if not given.
+        base: Base parameters that the recording determines.
+        equations: Regression equations of the recording.
+        selection: (., r) selection of their columns in the equations.
+        unconstrained: Unconstrained estimate of the base parameters, for its noise.
+        prior: Prior of all parameters; default the described bodies.
 
     Returns:
-        All parameters (p,).
+        Estimate of all parameters (p,).
 
     Raises:
-        InputError: A body has no mass.
+        InputError: A body is described without mass.
     """
     count = 10 * len(model.bodies)
     described_values = model.nominal if prior is None else prior[0]
@@ -77,8 +75,7 @@ def feasible_estimate(
     for i in range(0, count, 10):
         mean[i : i + 10] = thicken_body(mean[i : i + 10])
     nonnegative = [i for i, sign in enumerate(model.nonnegative) if sign and i >= count]
-    # the triangular factors of the joints' rows instead of the rows: their columns have the same
-    # lengths and angles
+    # the triangular factors have the same column norms and products as the rows
     K = selection @ base.grouping
     W, y = (
         np.vstack(list(equations.triangular_factors[:, :, :-1] @ K)),
@@ -86,14 +83,14 @@ def feasible_estimate(
     )
     size = np.linalg.norm(y) / np.sqrt(len(equations.y))
     noise = np.maximum(unconstrained.noise, _MIN_NOISE_SHARE * size)
-    # none of the others makes more than all of the force; without that, two that do the same in
-    # this motion may grow without end
+    # no other parameter exceeds the whole force; without this, two parameters with the same effect
+    # could grow without bound
     single_forces = np.linalg.norm(W[:, count:], axis=0) / np.sqrt(len(equations.y))
     parameter_std = np.minimum(
         parameter_std, size / np.where(single_forces > 0, single_forces, size)
     )
     weights = np.repeat(1 / noise, equations.triangular_factors.shape[1])
-    # what is known of one parameter of a body beyond what is of the whole body
+    # prior of single parameters of a body beyond that of the body
     prior_rows = np.diag(np.sqrt(parameter_weights))[parameter_weights > 0]
     W = np.vstack(
         [W, np.column_stack([prior_rows, np.zeros((len(prior_rows), len(parameter_std)))])]
@@ -122,11 +119,11 @@ def feasible_estimate(
 
 
 def _body_prior_weights(mean: Array, std: Array) -> tuple[Array, Array]:
-    """What a prior of bodies (10 nb,) is in the divergence, and beyond it.
+    """Weights of a prior of bodies (10 nb,) in the divergence, and of single parameters.
 
     Returns:
-        Per body (nb,) one over the square of the share of mass and size to which all of it is
-        known at least; and per parameter (10 nb,) what is known beyond that, one over a variance.
+        Per body (nb,) one over the square of its relative standard deviation; and per parameter
+        (10 nb,) the remaining information, one over a variance.
     """
     units = np.array([_body_units(mean[i : i + 10]) for i in range(0, len(mean), 10)])
     share = np.minimum((std.reshape(-1, 10) / units).max(axis=1), _UNINFORMATIVE_STD)
@@ -135,15 +132,15 @@ def _body_prior_weights(mean: Array, std: Array) -> tuple[Array, Array]:
 
 
 def _body_units(body: Array) -> Array:
-    """m, m l, m l^2 (10,) of a body."""
+    """Units m, m l and m l^2 (10,) of the parameters of a body."""
     mass, length = body_size(body)
     return mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
 
 
 def thicken_body(body: Array) -> Array:
-    """A body at least a share of its size thick in every direction.
+    """Body with a least thickness in every direction.
 
-    Rods and plates without thickness lie on the edge of what can exist.
+    Rods and plates without thickness are on the boundary of feasibility.
     """
     P = pseudo_inertia(body)
     mass, length = body_size(body)

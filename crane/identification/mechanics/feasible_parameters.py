@@ -1,7 +1,7 @@
-"""The physically feasible parameters that explain forces best: a convex problem.
+"""Least squares over physically feasible inertial parameters, a convex problem.
 
-A mass, first moment h and inertia I about the origin of a body's frame belong to a body that
-can exist, with mass everywhere positive, if and only if its pseudo-inertia
+A mass m, first moment h and inertia I about the origin of a body's frame are physically feasible,
+with positive mass density, if and only if the pseudo-inertia
 
     P = [[tr(I)/2 1 - I, h], [h^T, m]]   (4, 4)
 
@@ -25,25 +25,22 @@ _SOLVER_TOLERANCES = {
     "tol_gap_abs": 1e-10,
     "tol_gap_rel": 1e-10,
     "tol_feas": 1e-9,
-}  # met or nearly
+}
 _CAUTIOUS_OPTIONS = {"max_step_fraction": 0.9, "static_regularization_constant": 1e-7}
 _SCS_OPTIONS = {"eps": 1e-7, "max_iters": 20000}
-_SINGULARITY_TOLERANCE = (
-    1e-10  # smallest over largest eigenvalue of a prior, its lengths scaled to one
-)
+_SINGULARITY_TOLERANCE = 1e-10  # smallest over largest eigenvalue of the second moments of a prior
 
 
 @dataclass(frozen=True, eq=False)
 class FeasibleSolution:
-    """A physically feasible estimate.
+    """Physically feasible estimate.
 
     Attributes:
-        values: Parameters (p,): m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of each body, then
-            the others.
+        values: (p,) m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of each body, then the others.
         misfit: |weights (W values - y)|^2.
-        divergence: Of each body from its prior (nb,), without unit.
-        smallest_eigenvalues: Smallest eigenvalue of each body's pseudo-inertia (nb,), its length
-            unit chosen so that the prior's second moments have the trace of its mass [kg].
+        divergence: (nb,) divergence of each body from its prior [1].
+        smallest_eigenvalues: (nb,) smallest eigenvalue of the pseudo-inertia of each body [kg], in
+            a length unit in which the second moments of the prior have the trace of its mass.
     """
 
     values: Array
@@ -53,7 +50,7 @@ class FeasibleSolution:
 
 
 def pseudo_inertia(parameters: Array) -> Array:
-    """P (..., 4, 4) from the ten parameters (..., 10) of a body in Pinocchio's order."""
+    """Pseudo-inertia P (..., 4, 4) of the ten parameters (..., 10) in Pinocchio's order."""
     m, hx, hy, hz, xx, xy, yy, xz, yz, zz = np.moveaxis(np.asarray(parameters), -1, 0)
     half = 0.5 * (xx + yy + zz)
     rows = [
@@ -66,13 +63,13 @@ def pseudo_inertia(parameters: Array) -> Array:
 
 
 def body_size(body: Array) -> tuple[float, float]:
-    """Mass [kg], and root of the mean square distance of the mass from the origin [m]."""
+    """Mass [kg] and root mean square distance of the mass from the origin [m]."""
     P = pseudo_inertia(body)
     return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
 
 
 def body_parameters(P: Array) -> Array:
-    """The ten parameters (..., 10) from P (..., 4, 4): the inverse of `pseudo_inertia`."""
+    """Ten parameters (..., 10) of P (..., 4, 4): the inverse of `pseudo_inertia`."""
     P = np.asarray(P)
     xx, yy, zz = (P[..., i, i] for i in range(3))
     columns = [P[..., 3, 3], P[..., 0, 3], P[..., 1, 3], P[..., 2, 3]]
@@ -81,7 +78,7 @@ def body_parameters(P: Array) -> Array:
 
 
 def load_convex_solver() -> Any:
-    """The library that solves it.
+    """Import the convex solver CVXPY.
 
     Raises:
         InputError: It is not installed.
@@ -99,33 +96,33 @@ def solve_feasible(
     parameter_std: Array | None = None,
     nonnegative: Sequence[int] = (),
 ) -> FeasibleSolution:
-    """Minimise misfit and distance to a prior over all bodies that can exist.
+    """Minimize misfit and divergence from a prior over physically feasible bodies.
 
         |weights (W theta - y)|^2 + sum_b prior_weight_b 2 d(P_b, P0_b)
             + sum_i ((theta_i - prior_i) / spread_i)^2
 
         d(P, P0) = tr(P0^-1 P) - log det(P0^-1 P) - 4,   L^-1 P_b L^-T >= 1e-4,  P0_b = L L^T.
 
-    d is the divergence between normal distributions of mass: it depends neither on frames nor
-    on units, grows without end towards what cannot exist, and is |L^-1 P L^-T - 1|^2 / 2 near
-    the prior, so that prior_weight is 1 / (relative standard deviation of a body)^2 where the
-    weights are 1 / (standard deviation of the forces). X = L^-1 P L^-T is also what is solved
-    for: it is near 1 for bodies of any size. W may have dependent columns.
+    d is the divergence between normal distributions of mass: it is independent of frames and
+    units, goes to infinity at the boundary of feasibility, and is |L^-1 P L^-T - 1|^2 / 2 near the
+    prior, so that prior_weight is 1 / (relative standard deviation of a body)^2 if the weights are
+    1 / (standard deviation of the forces). The unknown is X = L^-1 P L^-T, near 1 for bodies of
+    any size. W may have dependent columns.
 
     Args:
         W: Regressor (m, p), ten columns per body, then others.
         y: Forces (m,).
         weights: One over the noise of each row (m,).
-        bodies: Names (nb,).
-        prior: Parameters (p,), those of bodies that can exist.
-        prior_weight: > 0, of each body (nb,) or of all.
-        parameter_std: Standard deviations (p - 10 nb,) of the others about the prior; infinite, as
-            all are if left out, where it says nothing.
-        nonnegative: Columns among the others that are not negative, such as friction.
+        bodies: Names of the bodies (nb,).
+        prior: Prior means (p,), with feasible bodies.
+        prior_weight: Positive weight of each body (nb,) or of all.
+        parameter_std: Prior standard deviations (p - 10 nb,) of the other parameters; default
+            infinite, without a prior.
+        nonnegative: Columns of other parameters that must not be negative, such as friction.
 
     Raises:
-        InputError: Shapes, a body of the prior that cannot exist, or no CVXPY.
-        CraneError: The solver gave up.
+        InputError: Shapes differ, a body of the prior is not feasible, or CVXPY is missing.
+        CraneError: The solver fails.
 
     Source: Lee, Wensing, Park 2020, IEEE Transactions on Robotics 36(1).
     """
@@ -141,12 +138,12 @@ def solve_feasible(
         for body, p in zip(bodies, prior[:split].reshape(-1, 10), strict=True)
     ]
 
-    # [W y] weighted, compressed to its triangular factor; then columns for X and of length one.
+    # triangular factor of the weighted [W y]
     weighted_factor = np.linalg.qr(np.column_stack([W, y]) * np.asarray(weights)[:, None]).R
     R, d = weighted_factor[:size, :size], weighted_factor[:size, size]
     maps = [_scaled_parameter_map(L) for L in factors]
-    # What is solved for is near zero: X - 1, and the others from where the prior's bodies
-    # leave them, in units of what the forces or their prior tell.
+    # The unknowns are near zero: X - 1, and the other parameters relative to their estimate for
+    # the bodies of the prior, in units of the forces or of their prior.
     d = d - R[:, :split] @ prior[:split]
     is_known = np.isfinite(parameter_std)
     length = np.linalg.norm(R[:, split:], axis=0)
@@ -170,24 +167,10 @@ def solve_feasible(
         cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MIN_EIGENVALUE * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
-    # its own tolerances where ours are out of reach, and a solver that needs no factors where
-    # columns do the same
-    solvers = (
-        *((cp.CLARABEL, x) for x in (_SOLVER_TOLERANCES, {}, _CAUTIOUS_OPTIONS)),
-        (cp.SCS, _SCS_OPTIONS),
-    )
-    for solver, options in solvers:
-        with suppress(cp.SolverError):  # told below
-            problem.solve(solver=solver, **options)
-            break
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        raise CraneError(
-            f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"
-        )
-
+    _solve_convex_problem(problem)
     solved = [0.5 * (x.value + x.value.T) for x in X]
     others = start + unit * z.value
-    others[bounded] = np.maximum(others[bounded], 0)  # to rounding
+    others[bounded] = np.maximum(others[bounded], 0)  # rounding errors
     inertias = [L @ x @ L.T for L, x in zip(factors, solved, strict=True)]
     values = np.concatenate([*(body_parameters(P) for P in inertias), others])
     return FeasibleSolution(
@@ -203,13 +186,35 @@ def solve_feasible(
     )
 
 
-def divergence_hessian_root(body: Array) -> Array:
-    """L (16, 10) with L^T L the second derivative of d(P, P0) by the parameters of a body.
+def _solve_convex_problem(problem: Any) -> None:
+    """Solve a convex problem, with looser tolerances or another solver if necessary.
 
-    d = tr(P0^-1 P) - log det(P0^-1 P) - 4, so d'' = |P^-1/2 dP P^-1/2|^2, whatever P0 is.
+    Raises:
+        CraneError: All solvers fail.
+    """
+    cp = load_convex_solver()
+    # the last solver needs no factorization, for dependent columns
+    solvers = (
+        *((cp.CLARABEL, x) for x in (_SOLVER_TOLERANCES, {}, _CAUTIOUS_OPTIONS)),
+        (cp.SCS, _SCS_OPTIONS),
+    )
+    for solver, options in solvers:
+        with suppress(cp.SolverError):  # reported below
+            problem.solve(solver=solver, **options)
+            break
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        raise CraneError(
+            f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"
+        )
+
+
+def divergence_hessian_root(body: Array) -> Array:
+    """Root L (16, 10) of the second derivative L^T L of d(P, P0) by the parameters of a body.
+
+    For d = tr(P0^-1 P) - log det(P0^-1 P) - 4 it is d'' = |P^-1/2 dP P^-1/2|^2 for any P0.
 
     Args:
-        body: Parameters (10,), of P.
+        body: Parameters (10,) of P.
     """
     cholesky_factor = np.linalg.cholesky(pseudo_inertia(body))
     first = np.linalg.solve(cholesky_factor, pseudo_inertia(np.eye(10)))
@@ -248,10 +253,10 @@ def _check_arguments(
 
 
 def _prior_factor(body: str, parameters: Array) -> Array:
-    """L (4, 4) of P0 = L L^T of a body's prior.
+    """Cholesky factor L (4, 4) of the prior P0 = L L^T of a body.
 
     Raises:
-        InputError: The body cannot exist, or is flat.
+        InputError: The body is not feasible, or flat.
     """
     P = pseudo_inertia(parameters)
     mass, first = parameters[0], parameters[1:4]
@@ -278,7 +283,7 @@ def _scaled_parameter_map(L: Array) -> Array:
 
 
 def _normalized_inertia(P: Array, prior: Array) -> Array:
-    """P in a length unit in which the prior's second moments have the trace of its mass."""
+    """P in a length unit in which the second moments of the prior have the trace of its mass."""
     length = np.sqrt(np.trace(prior[:3, :3]) / prior[3, 3])
     unit = np.array([1 / length] * 3 + [1.0])
     return P * np.outer(unit, unit)

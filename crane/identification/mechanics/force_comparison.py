@@ -1,24 +1,44 @@
-"""Measured forces beside modelled ones."""
+"""Measured and modelled forces, and checks of recorded forces against a model."""
 
+import itertools
 import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
+from crane.identification.mechanics.recording_checks import (
+    delay_message,
+    reject_unless_trusted,
+    signal_delay,
+)
+from crane.identification.signals.signal_processing import Motion, sampling_step
+from crane.recordings.recording import Recording
+
+_MAX_FORCE_FACTOR = 30.0  # largest ratio of a force to that of the model
+_MIN_CORRELATION = 0.9  # least correlation for a significant factor
+_BLOCK_COUNT = 10  # of time, for the standard error of that factor
+_VALIDATION_FACTOR = 4.0  # times the error on training data, above which a warning is given
+_NEGLIGIBLE_ERROR = 1e-6  # negligible error relative to the forces
+_MAX_SHARED_SHARE = 0.2  # of the samples of a recording that another one may contain
+_COMPARED_SAMPLES = 2000  # compared samples
+_DELAY_CONFIDENCE = 0.999  # confidence level of a reported delay
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ForceComparison(OneLineRepr):
-    """Measured and modelled forces of one recording, both through the same filter.
+    """Measured and modelled forces of one recording after the same filter.
 
     Attributes:
         time: (M,) [s].
-        measured: (M, n) [N], [N m].
-        modelled: (M, n).
-        is_moving: (M, n) which rows count: those away from zero velocity.
-        joints: Names (n,).
+        measured: (M, n) measured forces [N], [N m].
+        modelled: (M, n) modelled forces.
+        is_moving: (M, n) mask of the rows away from standstill.
+        joints: (n,) names.
     """
 
     time: Array
@@ -29,7 +49,7 @@ class ForceComparison(OneLineRepr):
 
     @property
     def residuals(self) -> Array:
-        """(M, n) measured less modelled."""
+        """Residuals (M, n): measured minus modelled forces."""
         return self.measured - self.modelled
 
     def _rms(self, values: Array) -> Array:
@@ -41,24 +61,215 @@ class ForceComparison(OneLineRepr):
 
     @property
     def rmse(self) -> Array:
-        """(n,) root mean square of the residuals [N], [N m], nan where nothing moves."""
+        """Root mean square (n,) of the residuals [N], [N m], nan for joints without motion."""
         return self._rms(self.residuals)
 
     @property
     def relative_error(self) -> Array:
-        """(n,) the same over the root mean square of the measured force, nan of a free one."""
+        """RMS of the residuals over that of the measured force (n,), nan of a free joint."""
         size = self._rms(self.measured)
         return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
 
     @property
     def percentage_error(self) -> Array:
-        """(n,) equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
+        """Error (n,) of equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
         return 100 * self.relative_error**2
 
     @property
     def overall_relative_error(self) -> float:
-        """Norm of all residuals over that of all measured forces, nan where these are zero."""
+        """Norm of all residuals over that of all measured forces, nan if these are zero."""
         residual_norm, force_norm = (
             np.linalg.norm(x[self.is_moving]) for x in (self.residuals, self.measured)
         )
         return float(residual_norm / force_norm) if force_norm else math.nan
+
+
+def check_forces(
+    motion: Motion,
+    modelled: Array,
+    joints: Sequence[str],
+    longest_delay: float = 0.05,
+    trust: bool = False,
+) -> None:
+    """Check recorded forces against those (N, n) of a model with rough parameters.
+
+    Effects of friction and rotors are excluded: the scale c of a joint is that of the regression
+    tau = c modelled + c0 + c1 sign(v) + c2 v + c3 |v| + c4 a, with the standard error by ten
+    blocks of time. If the model explains little of the remaining force, c is not significant, and
+    a force of many times the model's causes a warning only.
+
+    Raises:
+        RecordingError: The forces differ significantly by more than a factor of thirty, in sign,
+            or by a delay.
+    """
+    messages = []
+    for i, joint in enumerate(joints):
+        measured, expected = motion.tau[:, i], modelled[:, i]
+        if np.ptp(expected) == 0 or np.ptp(measured) == 0:
+            continue
+        scale, error, correlation = _force_scale(
+            measured, expected, motion.v[:, i], motion.a[:, i]
+        )
+        size = abs(scale)
+        if (
+            correlation > _MIN_CORRELATION
+            and not 1 / _MAX_FORCE_FACTOR < size < _MAX_FORCE_FACTOR
+            and error < size / 4
+        ):
+            power = math.log10(max(size, 1e-300))
+            looks = "look at its unit and its gear ratio"
+            if 2.3 < abs(power) < 3.7:
+                looks = f"it looks {'1000-fold' if power > 0 else 'like kN'}, give SI units"
+            reject_unless_trusted(
+                f"'{joint}_force' is {scale:.3g} times the model's, {looks}", trust
+            )
+            continue
+        if correlation > _MIN_CORRELATION and scale < -4 * error and size > 1 / _MAX_FORCE_FACTOR:
+            text = f"'{joint}_force' is {scale:.2g} times the model's, turn its sign"
+            reject_unless_trusted(text, trust)
+            continue
+        ratio = math.sqrt(np.mean(measured**2) / np.mean(expected**2))
+        is_known = 1 / _MAX_FORCE_FACTOR < size < _MAX_FORCE_FACTOR and error < size / 2
+        if not is_known and not 1 / _MAX_FORCE_FACTOR < ratio < _MAX_FORCE_FACTOR:
+            messages.append(f"'{joint}_force' is {ratio:.3g} times the model's")
+        lag = signal_delay(motion.time, expected, measured)
+        # a rough model gives a delay only if the shift explains nearly everything: friction looks
+        # like inertia a quarter of a period later
+        if not 0.5 < ratio < 2.0:
+            continue
+        shifted_correlation = _shifted_correlation(
+            expected, measured, round(lag / sampling_step(motion.time))
+        )
+        if abs(lag) > longest_delay and shifted_correlation > max(
+            0.9, _shifted_correlation(expected, measured, 0) + 0.05
+        ):
+            reject_unless_trusted(delay_message(f"{joint}_force", lag, "its model"), trust)
+    if messages:
+        text = (
+            f"{', '.join(messages)}: friction and rotors may outweigh the bodies there, or the "
+            "unit is wrong, this recording cannot say"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def warn_delays(
+    joints: Sequence[str], delays: Array, std: Array, blocks: int, longest_delay: float = 0.05
+) -> None:
+    """Warn of delays (n,) [s] of forces, see `force_delays`.
+
+    Early forces are reported only above `longest_delay`, as friction causes small leads.
+    """
+    from scipy.stats import t
+
+    if not blocks:
+        return
+    limit, messages = float(t.ppf(_DELAY_CONFIDENCE, blocks - 1)), []
+    for joint, seconds, error in zip(joints, delays, std, strict=True):
+        if seconds > limit * error or seconds < -max(longest_delay, limit * error):
+            side = "behind" if seconds > 0 else "ahead of"
+            messages.append(
+                f"'{joint}_force' is {1e3 * abs(seconds):.0f} ms (+- {1e3 * error:.1g}) {side} its"
+                " motion"
+            )
+    if messages:
+        text = f"{', '.join(messages)}: record them with one clock, or shift them"
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def warn_validation(training: ForceComparison, validation: ForceComparison) -> None:
+    """Warn if errors on held-out data are far above those on training data."""
+    messages = []
+    pairs = zip(
+        training.joints,
+        training.relative_error,
+        validation.relative_error,
+        training.rmse,
+        validation.rmse,
+        strict=True,
+    )
+    for joint, training_error, validation_error, rmse, validation_rmse in pairs:
+        if (
+            validation_error > max(_VALIDATION_FACTOR * training_error, _NEGLIGIBLE_ERROR)
+            and validation_rmse > _VALIDATION_FACTOR * rmse
+        ):
+            messages.append(
+                f"'{joint}' {validation_error / training_error:.3g} times "
+                f"({100 * validation_error:.3g} %)"
+            )
+    if messages:
+        text = (
+            "errors on the validation are far above those on the training: "
+            f"{', '.join(messages)}: the recordings do not belong together, or the training data "
+            "determine too little"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def check_shared_samples(
+    recordings: Sequence[Recording | Motion],
+    validation: Sequence[Recording | Motion],
+    trust: bool = False,
+) -> None:
+    """Reject repeated training data, and warn of held-out data that are training data.
+
+    Raises:
+        RecordingError: Two of the recordings share instants and forces.
+    """
+    for (i, one), (j, other) in itertools.combinations(enumerate(recordings, start=1), 2):
+        if (share := _shared_share(one, other)) > _MAX_SHARED_SHARE:
+            reject_unless_trusted(
+                f"{share:.0%} of recording {j}'s samples are in recording {i} as well: used "
+                "twice they make intervals too narrow, give each once",
+                trust,
+            )
+    share = max(
+        (_shared_share(*pair) for pair in itertools.product(recordings, validation)), default=0
+    )
+    if share > _MAX_SHARED_SHARE:
+        text = (
+            f"{share:.0%} of the held-out samples are training data: their errors do not apply to "
+            "other motions, give other data"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def _shared_share(one: Recording | Motion, other: Recording | Motion) -> float:
+    """Share of the other's samples that one contains at the same time with the same forces.
+
+    Only samples with changing forces are used, as simulations from rest begin alike.
+    """
+    some = slice(None, None, max(1, len(other.time) // _COMPARED_SAMPLES))
+    time, tau = other.time[some], other.tau[some]
+    if one.tau.shape[1] != tau.shape[1]:
+        return 0.0
+    at = np.minimum(np.searchsorted(one.time, time), len(one.time) - 1)
+    same = (one.time[at] == time) & (one.tau[at] == tau).all(axis=1)
+    changing = (tau[1:] != tau[:-1]).any(axis=1)
+    return float(np.mean(same[1:][changing])) if changing.any() else 0.0
+
+
+def _force_scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, float]:
+    """Scale of y against x beside friction and rotors, its standard error, and correlation."""
+    others = np.column_stack([np.ones_like(v), np.sign(v), v, np.abs(v), a])
+    size = np.linalg.norm(others, axis=0)
+    U, values, _ = np.linalg.svd(others / np.where(size > 0, size, 1.0), full_matrices=False)
+    U = U[:, values > 1e-9 * values[0]]
+    residuals, energy = [], []
+    for column in (y, x):
+        rest = column - U @ (U.T @ column)
+        residuals.append(rest)
+        energy.append(float(rest @ rest))
+        if energy[-1] < 1e-18 * float(column @ column):  # explained by friction alone
+            return 0.0, math.inf, 0.0
+    scale = float(residuals[0] @ residuals[1]) / energy[1]
+    products = residuals[1] * (residuals[0] - scale * residuals[1])
+    parts = np.array([part.sum() for part in np.array_split(products, _BLOCK_COUNT)])
+    error = math.sqrt(float(parts @ parts) * _BLOCK_COUNT / (_BLOCK_COUNT - 1)) / energy[1]
+    return scale, error, abs(scale) * math.sqrt(energy[1] / energy[0])
+
+
+def _shifted_correlation(one: Array, other: Array, shift: int) -> float:
+    """Correlation of one signal with another one shifted by a number of samples."""
+    count = len(one) - abs(shift)
+    offsets = max(shift, 0), max(-shift, 0)
+    return float(np.corrcoef(one[offsets[1] :][:count], other[offsets[0] :][:count])[0, 1])

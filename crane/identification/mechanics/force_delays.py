@@ -1,4 +1,4 @@
-"""By how much recorded forces come after the motion that they belong to."""
+"""Estimation of delays between recorded forces and motion."""
 
 import numpy as np
 
@@ -6,46 +6,46 @@ from crane.common.samples import Array
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
-from crane.identification.signals.spectrum import spectral_edge_frequency
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 
-_CUTOFF_FACTOR = 10.0  # times the frequency of the motion: cutoff of what is compared
-_POWER_SHARE = 0.995  # of the power of the coordinates is below that frequency
-_SAMPLES_PER_PERIOD = 20.0  # samples per cutoff's period where the regressor is computed
-_ROW_STRIDE = 5  # of these, one is a row
-_MAX_SAMPLES = 30_000  # samples that are looked at
-_STANDSTILL_SHARE = 0.05  # of a joint's largest velocity, below which friction is not the model's
-_MAX_BLOCKS, _MIN_BLOCKS = 20, 5  # whose scatter tells the standard errors
-_PERIODS_PER_BLOCK = 2.0  # of the motion in a block
+_CUTOFF_FACTOR = 10.0  # cutoff, times the frequency of the motion
+_POWER_SHARE = 0.995  # of the power of the coordinates, below that frequency
+_SAMPLES_PER_PERIOD = 20.0  # samples of the regressor per period of the cutoff
+_ROW_STRIDE = 5  # samples per row
+_MAX_SAMPLES = 30_000  # samples that are used
+_STANDSTILL_SHARE = 0.05  # of a joint's largest velocity, below which rows are omitted
+_MAX_BLOCKS, _MIN_BLOCKS = 20, 5  # number of blocks for standard errors
+_PERIODS_PER_BLOCK = 2.0  # periods of the motion per block
 _MAX_ITERATIONS = 10
 _TINY = 1e-300
-_MAX_SHIFT_STEP = 0.25  # periods of the cutoff by which one round shifts at most
+_MAX_SHIFT_STEP = 0.25  # largest shift of an iteration in periods of the cutoff
 _SINGULAR_VALUE_TOLERANCE = 1e-9  # singular values, relative, that count as zero
 
 
 def force_delays(
     model: IdentificationModel, base: BaseParameters, motion: Motion, slow: Array
 ) -> tuple[Array, Array, int]:
-    """Delays of the forces (n,) [s], their standard errors, and the blocks of time behind them.
+    """Delays of the forces (n,) [s], their standard errors (n,), and the number of blocks.
 
-    A force that comes late by d is tau(t) = m(t - d), to first order m - d m'. Each joint's
-    -m' is a column beside those of the model, so what parameters can take of a delay (the weight
-    that rises with the stroke is like viscous friction) is no sign of it:
+    A force with the delay d is tau(t) = m(t - d), to first order m - d m'. The column -m' of each
+    joint is added to those of the model, so that effects that parameters can explain are not
+    attributed to a delay:
 
         tau = W beta - sum_j d_j m_j' + noise,
 
-    solved for beta and d, forces shifted back by d, until d settles. Both sides are low-passed
-    at ten times the motion's frequency; rows near standstill and as far as the filter reaches from
-    it are left out. Standard errors are those of blocks of two periods that count as independent;
-    where a recording has fewer than five of them, or a joint too few rows, nothing is told: nan.
+    It is solved for beta and d with forces shifted back by d, until d converges. Both sides are
+    low-passed at ten times the frequency of the motion; rows near standstill and within the reach
+    of the filter are omitted. Standard errors use blocks of two periods as independent; the result
+    is nan for fewer than five blocks or too few rows.
 
-    Friction that has to be overcome before a joint moves makes forces come early by some
-    milliseconds; nothing makes them late but a clock, a filter, or a sensor.
+    Presliding friction makes forces lead by some milliseconds; late forces are caused by clocks,
+    filters or sensors only.
 
     Args:
-        model: See there.
-        base: Its base parameters.
-        motion: Recorded.
-        slow: Velocities (n,) below which rows are left out, if above a share of the largest.
+        model: The model.
+        base: Base parameters of the model.
+        motion: Recorded motion.
+        slow: Standstill velocities (n,), if above a share of the largest velocity.
     """
     from scipy.ndimage import binary_dilation
 
@@ -72,7 +72,7 @@ def force_delays(
     )[chosen]
     is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
     is_used[:filter_reach] = is_used[-filter_reach:] = False
-    is_used[:, ~model.machine.is_driven] = False  # a force that is zero has no time
+    is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero
     rows = np.zeros_like(is_used)
     rows[::_ROW_STRIDE] = is_used[::_ROW_STRIDE]
     if rows.sum() < 4 * (W.shape[2] + n):
@@ -122,7 +122,7 @@ def _iterate_delays(
 
 
 def _truncated_svd(A: Array) -> tuple[Array, Array, Array]:
-    """Singular values that count, of a matrix with columns of length one, and their vectors."""
+    """Truncated singular value decomposition of a matrix with columns of length one."""
     length = np.linalg.norm(A, axis=0)
     length[length == 0] = 1.0
     U, values, V = np.linalg.svd(A / length, full_matrices=False)
@@ -131,7 +131,7 @@ def _truncated_svd(A: Array) -> tuple[Array, Array, Array]:
 
 
 def motion_frequency(q: Array, step: float) -> float:
-    """Below which 99.5 % of the power of coordinates (N, n) is, of the fastest joint [Hz]."""
+    """Frequency [Hz] below which 99.5 % of the power of the fastest coordinate (N, n) lies."""
     return max(
         spectral_edge_frequency(_POWER_SHARE, column, step) for column in q.T if np.ptp(column) > 0
     )

@@ -1,4 +1,4 @@
-"""Which parameters a recording determines, and in which directions it does not."""
+"""Identifiability: magnitudes of parameters, and undetermined directions."""
 
 from collections.abc import Sequence
 
@@ -11,18 +11,18 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
 
-_MIN_NAMED_SHARE = 0.25  # share in a direction that is named
-_MAX_NAMED = 4  # parameters that are named of a direction
+_MIN_NAMED_SHARE = 0.25  # least component that a text names
+_MAX_NAMED = 4  # parameters that a text names
 _FORCE_PARAMETERS = ("coulomb", "stiction", "presliding", "memory")
-_MIN_STROKE_SHARE = 0.5  # of its stroke, that a joint should move over
+_MIN_STROKE_SHARE = 0.5  # share of the stroke that a joint should cover
 
 
 def base_magnitudes(base: BaseParameters, parameter_sizes: Array) -> Array:
-    """How large base parameters (r,) can be: sqrt(sum_j (K_ij s_j)^2) of the group K_i.
+    """Magnitudes (r,) of base parameters: sqrt(sum_j (K_ij s_j)^2) for the group K_i.
 
     Args:
-        base: What of its base parameters a recording tells.
-        parameter_sizes: s of all parameters (p,), see `parameter_magnitudes`.
+        base: Base parameters that a recording determines.
+        parameter_sizes: Magnitudes s (p,) of all parameters, see `parameter_magnitudes`.
     """
     return np.asarray(np.sqrt(base.grouping**2 @ parameter_sizes**2))
 
@@ -30,17 +30,17 @@ def base_magnitudes(base: BaseParameters, parameter_sizes: Array) -> Array:
 def parameter_magnitudes(
     model: IdentificationModel, base: BaseParameters, factors: Array
 ) -> Array:
-    """How large parameters (p,) can be on such a machine, of one without any effect 0.
+    """Magnitudes (p,) of parameters of such a machine, 0 without an effect.
 
-    A body's are its described mass m, m l and m l^2, l the root of the mean square distance of its
-    mass from its joint (bodies without mass count as the mean of the others); of friction and the
-    like what would alone make as much force as a drive's whole force in this recording; of all
-    parts of one joint's friction that are forces the least of these.
+    Those of a body are its described mass m, m l and m l^2 with the root mean square distance l of
+    its mass from its joint (for bodies without mass the mean of the others). For other parameters
+    it is the value that alone causes the whole force of a drive in this recording; for all
+    friction forces of one joint the least of these.
 
     Args:
         model: The model.
-        base: What of its base parameters the recording tells.
-        factors: Triangular factors (g, r + 1, r + 1) of [W y] of each drive's rows.
+        base: Base parameters that the recording determines.
+        factors: Triangular factors (g, r + 1, r + 1) of [W y] for the rows of each drive.
     """
     count = 10 * len(model.bodies)
     out = np.zeros(len(model.names))
@@ -52,7 +52,7 @@ def parameter_magnitudes(
         mass, length = size if min(size) > 0 else usual
         out[10 * i : 10 * i + 10] = mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
     force = np.linalg.norm(factors[:, :, -1], axis=1)
-    # where nothing drives, what the described parts of the force are that add up to nothing
+    # for free joints the norm of the described force components
     parts = np.linalg.norm(factors[:, :, :-1], axis=1) * base.values(model.nominal)
     force = np.where(force > 0, force, np.linalg.norm(parts, axis=1))
     single_forces = np.linalg.norm(factors[:, :, :-1] @ base.grouping[:, count:], axis=1)
@@ -62,7 +62,7 @@ def parameter_magnitudes(
     )
     factors_of_force = share.min(axis=0, initial=np.inf)
     out[count:] = np.where(np.isfinite(factors_of_force), factors_of_force, 0.0)
-    # friction that fades with speed or time is a force too, which few rows show
+    # friction that decays with speed or time affects few rows
     force_parameters: dict[str, list[int]] = {}
     for i, name in enumerate(model.names[count:], start=count):
         where, _, kind = name.rpartition(".")
@@ -76,14 +76,14 @@ def parameter_magnitudes(
 def weak_directions(
     names: Sequence[str], covariance: Array, magnitude: Array
 ) -> list[tuple[float, str]]:
-    """Directions whose standard deviation exceeds what is possible, the weakest first.
+    """Directions whose standard deviation exceeds the magnitudes, the weakest first.
 
-    Eigenvectors of the covariance of theta_i / magnitude_i; for equal noise, those are the
-    singular directions of the regressor with columns scaled by the magnitudes.
+    They are eigenvectors of the covariance of theta_i / magnitude_i; for equal noise, singular
+    directions of the regressor with columns scaled by the magnitudes.
 
     Returns:
-        Standard deviation in units of the magnitudes, and the direction in words, such as
-        "0.71 boom.mx + 0.70 stick.mx".
+        Standard deviation in units of the magnitudes, and text of the direction, such as "0.71
+        boom.mx + 0.70 stick.mx".
     """
     unit = np.maximum(magnitude, np.finfo(float).tiny)
     scaled = covariance / unit / unit[:, None]
@@ -105,7 +105,7 @@ def weak_directions(
 
 
 def motion_advice(machine: Machine, motions: Sequence[Motion]) -> str:
-    """What to move more, to tell what was not told."""
+    """Text that recommends a motion to determine more parameters."""
     span = machine.upper - machine.lower
     moved = np.concatenate([[motion.q.min(axis=0), motion.q.max(axis=0)] for motion in motions])
     shares = np.ptp(moved, axis=0) / np.where(np.isfinite(span), span, np.inf)

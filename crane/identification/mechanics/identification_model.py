@@ -1,42 +1,61 @@
-"""tau = W beta: the drives' forces as linear functions of a machine's parameters."""
+"""Identification model tau = W beta: drive forces as linear functions of parameters."""
 
+import fnmatch
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError
-from crane.common.samples import Array, as_samples
+from crane.common.errors import InputError, suggest_names
+from crane.common.samples import Array, as_number, as_samples
+from crane.description.estimation_settings import TermValues
 from crane.dynamics.joint_forces import JointForces
-from crane.identification.mechanics.inertial_terms import InertialTerm, body_names
-from crane.identification.mechanics.model_term import ModelTerm, MotionSamples
-from crane.identification.mechanics.term_selection import TermChanges, select_terms
+from crane.identification.mechanics.force_terms import (
+    FrictionalMemory,
+    GasSpringTerm,
+    PreslidingFriction,
+    friction_term,
+    root_friction_term,
+)
+from crane.identification.mechanics.model_term import (
+    ForceDirection,
+    InertialTerm,
+    ModelTerm,
+    MotionSamples,
+    RotorInertiaTerm,
+    body_names,
+)
 from crane.machine import Machine
+
+TermChanges = Mapping[str, TermValues | None]
+"""Values of a term by name, () if it has none; None removes the term."""
+_FRICTION_KINDS = ("coulomb", "coulomb_offset", "viscous", "viscous_offset")
 
 
 class IdentificationModel:
-    """The parameters of a machine and their linear effect on the drives' forces.
+    """Identification model: drive forces as linear functions of the parameters of a machine.
 
         tau_A = W(q_A, v_A, a_A) beta + known,
 
-    known = gamma^T (I_r a - f) with the passive forces f and the rotor inertias I_r of the machine
-    that no term scales.
+    with known = gamma^T (I_r a - f), the passive forces f and rotor inertias I_r of the machine
+    that are not estimated by a term.
 
     Args:
         machine: The machine.
-        terms: Groups of columns; or what is to be estimated beside or instead of what its
-            description asks for, by name, see `select_terms`.
-        known_forces: Samples -> (N, n), in the place of these forces.
+        terms: Terms of the model; or changes of the default terms by name, see `select_terms`.
+        known_forces: Function samples -> (N, n) in place of these known forces.
 
     Attributes:
-        names: (p,) of the parameters.
-        nominal: (p,) values by the machine's description.
-        nonnegative: (p,) whether a parameter cannot be negative.
-        bodies: Names of the bodies, whose inertial parameters are the first 10 nb columns, or ()
-            where the model has none.
+        names: (p,) names of the parameters.
+        nominal: (p,) values by the description of the machine.
+        nonnegative: (p,) whether a parameter must not be negative.
+        bodies: Names of the bodies, whose inertial parameters are the first 10 nb columns; ()
+            without bodies.
 
     Raises:
-        InputError: Two parameters of the same name.
+        InputError: Two parameters have the same name.
     """
 
     def __init__(
@@ -82,7 +101,7 @@ class IdentificationModel:
         step: float | None = None,
         starts: Sequence[int] = (0,),
     ) -> MotionSamples:
-        """Close the loops along a motion, (N, n) each; see `MotionSamples`."""
+        """Close the loops along a motion (N, n); see `MotionSamples`."""
         active = self.machine.active
         q_a, v_a, a_a = (
             np.atleast_2d(as_samples(x, len(active), name, active))
@@ -93,11 +112,11 @@ class IdentificationModel:
         return MotionSamples(q_a, v_a, a_a, q, closure.gamma(q), step, starts)
 
     def regressor(self, samples: MotionSamples) -> Array:
-        """W (N, n, p)."""
+        """Regressor W (N, n, p)."""
         return np.concatenate([term.columns(samples) for term in self.terms], axis=2)
 
     def known_forces(self, samples: MotionSamples) -> Array:
-        """Forces (N, n) that no parameter changes: tau = W beta + known."""
+        """Known forces (N, n), independent of the parameters: tau = W beta + known."""
         if self._known_forces_function is not None:
             return self._known_forces_function(samples)
         v = np.einsum("kij,kj->ki", samples.gamma, samples.v_a)
@@ -108,3 +127,164 @@ class IdentificationModel:
                 np.einsum("kij,kj->ki", samples.gamma, samples.a_a) + drift
             )
         return np.einsum("kij,ki->kj", samples.gamma, force)
+
+
+@dataclass(frozen=True)
+class TermKind:
+    """Kind of a term.
+
+    Attributes:
+        description: Text of its values.
+        value_count: Least and largest number of values.
+    """
+
+    description: str = ""
+    value_count: tuple[int, int] = (0, 0)
+
+
+TERM_KINDS = {
+    **{name: TermKind() for name in (*_FRICTION_KINDS, "root", "rotor_inertia", "gas_scale")},
+    "stiction": TermKind("the Stribeck velocities", (0, 9)),
+    "presliding": TermKind("the characteristic distance", (1, 1)),
+    "memory": TermKind("the time constant and the characteristic speed", (2, 2)),
+}
+
+
+def default_terms(machine: Machine) -> list[ModelTerm]:
+    """Default terms: bodies, and friction of driven (four kinds) and other joints (viscous)."""
+    return _build_terms(machine, _default_kinds(machine))
+
+
+def select_terms(machine: Machine, changes: TermChanges) -> list[ModelTerm]:
+    """Terms of a model: default terms, those of the machine's `estimation`, and changes.
+
+    A name is WHERE.KIND. WHERE is a joint, a pattern of joints (q*), or active joints with factors
+    that a motor turns together (q5+q6, q6+0.5*q5); KIND is one of `TERM_KINDS`.
+
+    Args:
+        machine: The machine.
+        changes: Changes as in a machine file under `identification`, `terms`; later ones take
+            precedence.
+
+    Raises:
+        InputError: A name is unknown, or values are not valid or not positive.
+    """
+    values_by_element, requested = _default_kinds(machine), set()
+    for name, values in (*machine.estimation.terms.items(), *changes.items()):
+        where, _, kind = name.rpartition(".")
+        if kind not in TERM_KINDS:
+            raise InputError(
+                f"term '{name}': '{kind}' is unknown, {suggest_names(TERM_KINDS, kind)}"
+            )
+        if not where:
+            raise InputError(f"term '{name}' does not say of what, write q1.{kind} or q*.{kind}")
+        low, high = TERM_KINDS[kind].value_count
+        if values is not None and not low <= len(values) <= high:
+            hint = f"give {TERM_KINDS[kind].description}" if high else "it takes none"
+            raise InputError(f"term '{name}' has {len(values)} values, {hint}")
+        for number in values or ():
+            as_number(number, f"a value of term '{name}'", "", greater_than=0)
+        for element in _matching_elements(machine, where, kind):
+            kinds = values_by_element.setdefault(element, {})
+            if values is None:
+                kinds.pop(kind, None)
+                continue
+            kinds[kind] = values
+            requested.add((element, kind))
+    for element, kinds in values_by_element.items():
+        # Dahl's law replaces Coulomb friction
+        if "presliding" in kinds and (element, "coulomb") not in requested:
+            kinds.pop("coulomb", None)
+    return _build_terms(machine, values_by_element)
+
+
+def parse_combination(name: str) -> ForceDirection | None:
+    """Direction of joints that a motor turns together, None for a single name.
+
+    Raises:
+        InputError: A factor is no number or 0, or a joint is named twice.
+    """
+    if "+" not in name:
+        return None
+    factors: dict[str, float] = {}
+    for part in name.split("+"):
+        factor, star, joint = (word.strip() for word in part.rpartition("*"))
+        try:
+            share = float(factor) if star else 1.0
+        except ValueError:
+            share = 0.0
+        if not share or not math.isfinite(share):
+            raise InputError(f"'{name}': '{factor}' is no factor, write q5+0.5*q6")
+        if joint in factors:
+            raise InputError(f"'{name}' names '{joint}' twice, give it once with its factor")
+        factors[joint] = share
+    return ForceDirection(name, factors)
+
+
+def _default_kinds(machine: Machine) -> dict[str, dict[str, TermValues]]:
+    """Values of the default terms by element and kind."""
+    values_by_element: dict[str, dict[str, TermValues]] = {
+        joint: dict.fromkeys(_FRICTION_KINDS, ()) for joint in machine.driven_joints
+    }
+    for joint in machine.joints:
+        law = machine.friction.get(joint)
+        has_coulomb = law is not None and law.coulomb > 0
+        kinds = ("coulomb", "viscous") if has_coulomb else ("viscous",)
+        values_by_element.setdefault(joint, dict.fromkeys(kinds, ()))
+    return values_by_element
+
+
+def _matching_elements(machine: Machine, where: str, kind: str) -> list[str]:
+    """Joints, gas springs or combination that a name refers to, without locked ones."""
+    if kind == "gas_scale":
+        names = [spring.joint for spring in machine.gas_springs]
+    elif where not in machine.joints and (direction := parse_combination(where)) is not None:
+        return [] if direction.has_locked_joint(machine) else [where]
+    else:
+        names = list(machine.joints)
+    found = [where] if where in names else fnmatch.filter(names, where)
+    if not found and not fnmatch.filter(machine.locked_joints, where):
+        raise InputError(
+            f"term '{where}.{kind}': '{where}' is unknown, {suggest_names(names, where)}"
+        )
+    return found
+
+
+def _build_terms(
+    machine: Machine, values_by_element: Mapping[str, Mapping[str, TermValues]]
+) -> list[ModelTerm]:
+    terms: list[ModelTerm] = [InertialTerm(machine)]
+    for where, kinds in values_by_element.items():
+        direction = where if where in machine.joints else parse_combination(where) or where
+        if "gas_scale" in kinds:
+            terms.append(GasSpringTerm(machine, where))
+        if "rotor_inertia" in kinds:
+            terms.append(RotorInertiaTerm(machine, direction))
+        friction_kinds = [kind for kind in _FRICTION_KINDS if kind in kinds]
+        if friction_kinds or "stiction" in kinds:
+            stribeck_velocities = kinds.get("stiction")
+            if stribeck_velocities == ():
+                stribeck_velocities = (_described_stribeck_velocity(machine, where),)
+            terms.append(
+                friction_term(
+                    machine, direction, friction_kinds, stribeck=stribeck_velocities or ()
+                )
+            )
+        if "root" in kinds:
+            terms.append(root_friction_term(machine, direction))
+        if "presliding" in kinds:
+            terms.append(PreslidingFriction(machine, direction, *kinds["presliding"]))
+        if "memory" in kinds:
+            terms.append(FrictionalMemory(machine, direction, *kinds["memory"]))
+    return terms
+
+
+def _described_stribeck_velocity(machine: Machine, joint: str) -> float:
+    """Stribeck velocity of a joint by the description."""
+    law = machine.friction.get(joint)
+    if law is None or not law.stiction:
+        raise InputError(
+            f"term '{joint}.stiction' needs the velocity over which it fades, which the machine "
+            "does not have: give it"
+        )
+    return law.stribeck

@@ -1,4 +1,4 @@
-"""What an identification found, and how well it predicts."""
+"""Result of an identification: parameters, covariance, prediction errors, tables."""
 
 import csv
 import math
@@ -14,40 +14,40 @@ from crane.common.atomic_output import replace_file
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_table
-from crane.identification.estimation.estimators import Estimate
+from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.machine import Machine
 
-_IMPOSSIBLE_FACTOR = 10.0  # times its magnitude, what a parameter cannot be
-_MAX_SHOWN = 3  # directions that a table names
+_IMPOSSIBLE_FACTOR = 10.0  # times the magnitude, above which a parameter is impossible
+_MAX_SHOWN = 3  # directions in a table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Result):
-    """Parameters of a machine from a recording.
+    """Result of an identification.
 
     Attributes:
-        model: What was identified.
-        base: Base parameters that the recording tells.
-        values: (r,) their values.
-        covariance: (r, r).
-        parameters: (p,) values of all parameters, where a prior or feasibility asked for them;
-            else None: forces determine the base parameters only.
-        estimate: Of the estimator, with noise and condition numbers; of all parameters where
-            those are known.
+        model: The identified model.
+        base: Base parameters that the recording determines.
+        values: (r,) values of the base parameters.
+        covariance: (r, r) covariance of the values.
+        parameters: (p,) values of all parameters with a prior or feasibility constraints, else
+            None: forces determine the base parameters only.
+        estimate: Result of the estimator, with noise and condition numbers; of all parameters if
+            these are estimated.
         method: Name of the estimator.
-        feasible: Whether every body of `parameters` can exist.
-        training: On the recording it was identified from.
-        magnitude: (r,) how large they can be on such a machine, see `determined.magnitudes`.
-        advice: What motion would tell what this one does not.
-        speeds: By direction along which there is friction, least and largest speed of the
-            training [m/s], [rad/s].
-        bandwidth: [Hz] of the low-pass.
-        slow: (n,) velocities below which rows were left out [m/s], [rad/s].
-        validation: On another one, if there was one.
+        feasible: Whether every body of `parameters` is physically feasible.
+        training: Comparison of forces on the training data.
+        magnitude: (r,) magnitudes of the base parameters, see `base_magnitudes`.
+        advice: Text that recommends a motion for the parameters that are not determined.
+        speeds: Least and largest speed of the training data by direction of friction [m/s],
+            [rad/s].
+        bandwidth: Bandwidth of the low-pass [Hz].
+        slow: (n,) standstill velocities, below which rows were omitted [m/s], [rad/s].
+        validation: Comparison of forces on held-out data, None without them.
     """
 
     model: IdentificationModel
@@ -67,7 +67,7 @@ class Identification(Result):
     validation: ForceComparison | None = None
 
     def _one_line(self) -> str:
-        """What was identified, how, and how well it predicts."""
+        """Machine, number of parameters, method, and errors."""
         kind = "feasible, " if self.feasible else ""
         fits = {"error": self.training, "validation": self.validation}
         error_texts = (
@@ -78,35 +78,30 @@ class Identification(Result):
         vague = self.marks.count("not determined")
         return (
             f"Identification of '{self.described_machine.name}': {len(self.values)} base "
-            f"parameters"
-            f"{f', {vague} not determined' if vague else ''}, "
+            f"parameters{f', {vague} not determined' if vague else ''}, "
             f"{kind}{self.method}{''.join(error_texts)}"
         )
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(r,) first parameter of each group."""
+        """First parameter (r,) of each group."""
         return tuple(self.base.names[i] for i in self.base.independent)
 
     @property
     def std(self) -> Array:
-        """(r,) standard deviations."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # below it by rounding
+        """Standard deviations (r,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # negative by rounding only
 
     def interval(self, level: float = 0.95) -> Array:
-        """(r, 2) ends of what covers the truth with this probability."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.estimate.degrees_of_freedom) * self.std
-        return np.column_stack([self.values - half, self.values + half])
+        """Confidence intervals (r, 2) of a level."""
+        return confidence_intervals(self.values, self.std, self.estimate.degrees_of_freedom, level)
 
     @cached_property
     def marks(self) -> tuple[str, ...]:
-        """(r,) what is wrong with each: "not determined", "impossible", or "".
+        """Mark of each parameter (r,): "not determined", "impossible", or "".
 
-        Not determined is what has a standard deviation above its magnitude: the recording tells
-        less than the description of the machine does. Impossible is what is beyond ten times its
-        magnitude by more than two standard deviations.
+        A parameter is not determined if its standard deviation exceeds its magnitude. It is
+        impossible if it exceeds ten times its magnitude by more than two standard deviations.
         """
         beyond = np.abs(self.values) - 2 * self.std > _IMPOSSIBLE_FACTOR * self.magnitude
         return tuple(
@@ -116,25 +111,25 @@ class Identification(Result):
 
     @cached_property
     def undetermined_directions(self) -> list[tuple[float, str]]:
-        """Directions that the recording does not determine, see `determined.weak_directions`."""
+        """Directions that the recording does not determine, see `weak_directions`."""
         return weak_directions(self.names, self.covariance, self.magnitude)
 
     @property
     def remedy(self) -> str:
-        """What would determine more; a motion last, as this one may be the best there is."""
+        """Text of measures that would determine more parameters."""
         if self.parameters is not None:
             return f"leave such terms out, or {self.advice}"
         return f"give a prior, ask for feasible bodies, or {self.advice}"
 
     @property
     def warning(self) -> str:
-        """One line on the parameters not determined or impossible, "" where none is."""
+        """Warning about parameters that are not determined or impossible, else ""."""
         vague, wrong = (
             [name for name, mark in zip(self.names, self.marks, strict=True) if mark == kind]
             for kind in ("not determined", "impossible")
         )
         parts = []
-        if vague:  # combinations of such as are determined each the table names without a warning
+        if vague:  # weak combinations of determined parameters are in the table only
             weakest = (
                 self.undetermined_directions[0][1] if self.undetermined_directions else vague[0]
             )
@@ -145,26 +140,25 @@ class Identification(Result):
         if wrong:
             parts.append(
                 f"{', '.join(wrong[:_MAX_SHOWN])} {'is' if len(wrong) == 1 else 'are'} beyond "
-                f"what "
-                f"such a machine can have: look at units, signs and zeros of the recording"
+                "what such a machine can have: look at units, signs and zeros of the recording"
             )
         return "; ".join(parts)
 
     @cached_property
     def nominal(self) -> Array:
-        """(r,) what the machine's description says."""
+        """Base parameters (r,) by the description of the machine."""
         return self.base.values(self.model.nominal)
 
     def predict(
         self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, step: float | None = None
     ) -> Array:
-        """Forces of a motion by the identified parameters.
+        """Predict the forces of a motion with the identified parameters.
 
         Args:
             q_a: (N, n) [m], [rad].
             v_a: (N, n).
             a_a: (N, n).
-            step: From one sample to the next [s], for terms that remember time.
+            step: Step of the samples [s], for terms that depend on time.
 
         Returns:
             (N, n) [N], [N m].
@@ -175,16 +169,16 @@ class Identification(Result):
 
     @property
     def described_machine(self) -> Machine:
-        """The machine as it was described; as identified it is what `write_identified` writes."""
+        """The described machine; `write_identified` writes the identified one."""
         return self.model.machine
 
     def to_text(self) -> str:
-        """Tables of the fit and of the parameters."""
+        """Tables of the errors and of the parameters."""
         lines = [
             f"{self.described_machine.name}: {self.base.rank} base parameters of "
-            f"{len(self.base.names)}, "
-            f"{self.method}{', feasible' if self.feasible else ''}; condition number "
-            f"{self.estimate.condition:.3g}, columns scaled {self.estimate.scaled_condition:.3g}",
+            f"{len(self.base.names)}, {self.method}{', feasible' if self.feasible else ''}; "
+            f"condition number {self.estimate.condition:.3g}, columns scaled "
+            f"{self.estimate.scaled_condition:.3g}",
             "",
         ]
         for title, fit in (("training", self.training), ("validation", self.validation)):
@@ -227,10 +221,10 @@ class Identification(Result):
         return "\n".join(lines) + "\n"
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the base parameters: value, deviation, 95 % interval, description, mark, group.
+        """Write the base parameters as CSV: value, std, 95 % interval, description, mark, group.
 
         Raises:
-            OutputError: It cannot be written there.
+            OutputError: The file cannot be written.
         """
         columns = [self.values, self.std, *self.interval().T, self.nominal]
         with replace_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:

@@ -1,6 +1,5 @@
-"""From a recording to parameters."""
+"""Identification of base parameters from recordings."""
 
-import fnmatch
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,37 +9,36 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
 from crane.common.progress import progress_reporter
-from crane.common.samples import Array, as_number, as_sample
+from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.identification.estimation.estimators import (
-    Estimate,
-    Prior,
-    condition_numbers,
-    huber,
-    least_squares,
-    weighted_least_squares,
+from crane.identification.estimation.estimators import huber, least_squares, weighted_least_squares
+from crane.identification.estimation.regression_problem import Prior, condition_numbers
+from crane.identification.mechanics.base_parameters import BaseParameters
+from crane.identification.mechanics.equation_setup import (
+    RecordingOrMotion,
+    as_list,
+    build_equations,
+    multi_pass_progress,
+    prepare_motions,
+    speed_ranges,
 )
-from crane.identification.mechanics.base_parameters import BaseParameters, base_parameters
 from crane.identification.mechanics.feasible_estimate import feasible_estimate
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
-from crane.identification.mechanics.force_checks import (
+from crane.identification.mechanics.force_comparison import (
     check_forces,
     check_shared_samples,
     warn_delays,
     warn_validation,
 )
 from crane.identification.mechanics.force_delays import force_delays
-from crane.identification.mechanics.free_joint_equations import iterate_estimate
-from crane.identification.mechanics.friction_laws import FrictionTerm
 from crane.identification.mechanics.identifiability import (
     base_magnitudes,
     motion_advice,
     parameter_magnitudes,
 )
-from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.identification_model import IdentificationModel, TermChanges
 from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.inertial_terms import body_names
-from crane.identification.mechanics.model_term import ModelTerm
+from crane.identification.mechanics.model_term import ModelTerm, body_names
 from crane.identification.mechanics.priors import (
     check_identifiable,
     check_prior,
@@ -53,31 +51,11 @@ from crane.identification.mechanics.regression_equations import (
     RegressionEquations,
     is_long_enough,
 )
-from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.mechanics.term_selection import TermChanges
 from crane.identification.signals.signal_processing import Motion
-from crane.identification.signals.spectrum import spectral_edge_frequency
 from crane.machine import Machine
-from crane.recordings.recording import Recording
 
-RecordingOrMotion = Recording | Motion
 METHODS = {"ols": least_squares, "wls": weighted_least_squares, "huber": huber}
-_SLOW_SPEED_SHARE = 0.02  # of a joint's largest velocity, below which its rows are left out
-_DEFAULT_STICTION_SPEED = {
-    "rad": 1e-2,
-    "m": 1e-3,
-}  # [rad/s], [m/s] where stiction ends that nobody described
-_SMOOTHING_FACTOR = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
-_MAX_SLOW_SHARE = 0.5  # of a joint's largest velocity, above which rows count always
-_PASSBAND_SHARE = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
-_MIN_BANDWIDTH_FACTOR = (
-    3.0  # times the frequency below which 99 % of the velocities are, the filter's least
-)
-_POWER_SHARE = 0.99
-_MAX_BANDWIDTH_FACTOR = 40.0  # times the frequency below which 99 % of the accelerations are
-_MIN_COMPARED_ROWS = 50  # rows from which on forces are compared with the model's
-_SPEED_SAMPLES = 500  # at which the speeds of joints are looked at
-_PASS_SHARE = 0.3  # of what is left to do that one pass over a recording is taken for
+_MIN_COMPARED_ROWS = 50  # least number of rows for a comparison of forces with the model
 
 
 @with_single_threaded_blas
@@ -95,44 +73,43 @@ def identify(
     trust: bool = False,
     progress: Progress | None = None,
 ) -> Identification:
-    """Base parameters of a machine from recorded strokes and forces.
+    """Identify the base parameters of a machine from recorded strokes and forces.
 
-    tau_A + gamma^T f = W(q_A, v_A, a_A) beta on both sides of a zero-phase low-pass, thinned;
-    rows of a joint near standstill left out. What the machine file says under `identification`
-    (terms, prior, bandwidth, slow) counts, with what is given here beside it, or in its place.
+    Both sides of tau_A + gamma^T f = W(q_A, v_A, a_A) beta pass a zero-phase low-pass and are
+    decimated; rows of a joint near standstill are omitted. The settings of the machine file under
+    `identification` (terms, prior, bandwidth, slow) are used; arguments add to them or replace
+    them.
 
     Args:
         machine: The machine, whose geometry is taken as known.
-        recording: What to learn from, one or several; a `Motion` if velocities and accelerations
-            are known.
-        validation: What to be judged by, not learned from, likewise; told where it is too short
-            for the low-pass or stands still.
-        method: "ols", "wls" (rows of each joint by its noise) or "huber" (robust).
-        prior: What is known before, about which the estimate is regularised: by name, such as
-            {"bodies": "10 %", "q1.viscous": "200 +- 50"}, see `priors.stated`; the share to which
-            all of the description holds; or means and standard deviations (p,) of all
-            parameters. All parameters come out then, not only the base parameters.
-        feasible: Whether the bodies have to be able to exist and friction must not be negative;
-            all parameters come out.
-        terms: Of the model; or by name what changes of the usual ones, such as
-            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `terms.select_terms`.
-        bandwidth: [Hz] of the low-pass; if not given, far above the frequencies of the motion,
-            but no higher than the motion is known where noise asked for smoothing, as of a coarse
-            potentiometer.
-        slow: Velocities below which rows are left out, (n,) or by joint or pattern: a few times
-            that over which friction at rest fades. If not given, 4 times the description's
-            smoothing and Stribeck velocity, of friction that sticks with neither 0.01 rad/s and
-            1 mm/s, or 2 % of a joint's largest.
-        trust: Whether a recording that is most likely wrong is taken nevertheless: why it is so
-            is told as a warning, and outliers are left in.
+        recording: Training data, one or several recordings; a `Motion` if velocities and
+            accelerations are known.
+        validation: Held-out data, likewise; a warning is given if it is too short for the low-pass
+            or has no motion.
+        method: "ols", "wls" (rows of each joint weighted by its noise) or "huber" (robust).
+        prior: Prior that regularizes the estimate: by name, such as {"bodies": "10 %",
+            "q1.viscous": "200 +- 50"}, see `prior_from_names`; a relative standard deviation of
+            the whole description; or means and standard deviations (p,) of all parameters. With a
+            prior all parameters are estimated, not only the base parameters.
+        feasible: Whether to constrain bodies to be physically feasible and friction to be
+            nonnegative; all parameters are estimated then.
+        terms: Terms of the model; or changes of the default terms by name, such as
+            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `select_terms`.
+        bandwidth: Bandwidth of the low-pass [Hz]; default far above the frequencies of the motion,
+            but at most the passband of the smoothing of noisy coordinates.
+        slow: Standstill velocities below which rows are omitted, (n,) or by joint or pattern.
+            Default 4 times the smoothing or Stribeck velocity of the description (0.01 rad/s and 1
+            mm/s for stiction without them), or 2 % of a joint's largest velocity.
+        trust: Whether to accept a recording that is probably wrong: reasons become warnings, and
+            outliers are not removed.
         progress: Takes the finished share.
 
     Returns:
-        Parameters, their confidence, and how well they predict both recordings.
+        Parameters with covariance, and prediction errors on training and held-out data.
 
     Raises:
-        InputError: Arguments that do not fit, or no CVXPY for feasible bodies.
-        RecordingError: A recording that cannot serve, and why; one that determines nothing.
+        InputError: Arguments are not valid, or CVXPY is missing for feasible bodies.
+        RecordingError: A recording is not suitable, or does not determine any parameter.
     """
     progress = progress_reporter(progress)
     if method not in METHODS:
@@ -141,9 +118,9 @@ def identify(
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     if feasible:
-        load_convex_solver()  # before all the work
+        load_convex_solver()  # fail early
     final_progress, progress = progress, multi_pass_progress(progress)
-    check_shared_samples(_as_list(recording), _as_list(validation), trust)
+    check_shared_samples(as_list(recording), as_list(validation), trust)
     motions = prepare_motions(machine, recording, trust, progress)
     equations, identifiable = build_equations(model, motions, bandwidth, slow, progress)
     if model.bodies:
@@ -154,7 +131,6 @@ def identify(
         model, identifiable, columns.triangular_factors(equations.y, equations.groups)
     )
     known_prior = _build_prior(model, prior, equations.base, parameter_sizes, feasible)
-    parameters = None
     estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
     if known_prior is None:
         _check_mass_scale(machine, equations)
@@ -163,22 +139,9 @@ def identify(
         check_identifiable(
             model.names, np.vstack(list(equations.triangular_factors[:, :, :-1] @ T)), known_prior
         )
-
-    def estimate_at(values: Array) -> tuple[Estimate, Array]:
-        nonlocal equations
-        equations = equations.at_values(values) if machine.free else equations
-        found = METHODS[method](
-            equations.projected_regressor(T),
-            equations.y,
-            equations.groups,
-            equations.samples,
-            estimator_prior,
-        )
-        return found, T @ found.values
-
     start = equations.base.values(model.nominal)
-    estimate = iterate_estimate(estimate_at, start) if machine.free else estimate_at(start)[0]
-    values, covariance = estimate.values, estimate.covariance
+    equations, estimate = equations.estimate(T, METHODS[method], estimator_prior, start)
+    values, covariance, parameters = estimate.values, estimate.covariance, None
     if feasible:
         estimate = feasible_estimate(
             model, identifiable, equations, selection, estimate, known_prior
@@ -191,7 +154,7 @@ def identify(
         parameters = estimate.values
         values = identifiable.values(parameters)
         covariance = identifiable.grouping @ estimate.covariance @ identifiable.grouping.T
-    # what is known of all parameters predicts another motion better than what this one tells
+    # an estimate of all parameters predicts other motions better
     predicting_values = (
         selection @ values if parameters is None else equations.base.values(parameters)
     )
@@ -202,7 +165,7 @@ def identify(
         equations.slow,
         motion_advice(machine, motions),
     )
-    speeds = _speed_ranges(model, motions, slow_speeds)
+    speeds = speed_ranges(model, motions, slow_speeds)
     del equations, motions
     if validation is not None:
         validation_motions = prepare_motions(machine, validation, trust, progress, "validation")
@@ -210,37 +173,22 @@ def identify(
             motion for motion in validation_motions if is_long_enough(motion, bandwidth)
         ]
         if long_motions:
-            validation_equations = RegressionEquations(
+            held_out = RegressionEquations(
                 model, base, long_motions, bandwidth, slow_speeds, progress
             )
-            validation_comparison = (
-                validation_equations.compare(predicting_values)
-                if validation_equations.is_moving.any()
-                else None
-            )
+            if held_out.is_moving.any():
+                validation_comparison = held_out.compare(predicting_values)
         if validation_comparison is None or len(long_motions) < len(validation_motions):
             _warn_short_validations(validation_motions, long_motions, bandwidth)
         if validation_comparison is not None:
             warn_validation(training, validation_comparison)
     if final_progress is not None:
         final_progress(1.0)
+    magnitudes = base_magnitudes(identifiable, parameter_sizes)
     identification = Identification(
-        model,
-        identifiable,
-        values,
-        covariance,
-        parameters,
-        estimate,
-        method,
-        feasible,
-        training,
-        base_magnitudes(identifiable, parameter_sizes),
-        advice,
-        speeds,
-        bandwidth,
-        slow_speeds,
-        validation_comparison,
-    )
+        model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
+        magnitudes, advice, speeds, bandwidth, slow_speeds, validation_comparison,
+    )  # fmt: skip
     if all(mark == "not determined" for mark in identification.marks):
         reject_unless_trusted(identification.warning, trust)
     elif identification.warning:
@@ -249,16 +197,16 @@ def identify(
 
 
 def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
-    """See that not all forces are known to be zero.
+    """Check that the mass scale is determined: not all forces are zero.
 
     Raises:
-        RecordingError: They are.
+        RecordingError: All forces are zero.
     """
     if machine.free and not equations.y.any():
         body = body_names(machine)[-1]
         raise RecordingError(
-            "nothing drives what moves in this recording: it tells ratios of masses, not masses; "
-            f"say what one is known to be, as prior={{'{body}.m': '100 +- 1'}} "
+            "nothing drives what moves in this recording: it determines ratios of masses only; "
+            f"give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} "
             f"(--prior {body}.m=100+-1)"
         )
 
@@ -266,49 +214,15 @@ def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
 def _warn_short_validations(
     motions: Sequence[Motion], long_motions: Sequence[Motion], bandwidth: float
 ) -> None:
-    """Warn of validations that judge nothing."""
+    """Warn of held-out data that are not usable."""
     short_count = len(motions) - len(long_motions)
     text = (
-        f"{short_count} of {len(motions)} validations are too short for a low-pass of "
-        f"{bandwidth:g} Hz "
-        "and judge nothing"
+        f"{short_count} of {len(motions)} held-out recordings are too short for a low-pass of "
+        f"{bandwidth:g} Hz and are not used"
         if short_count
-        else "no validation moves faster than what counts as standstill, nothing is judged"
+        else "no held-out recording moves faster than standstill, none is used"
     )
     warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
-
-
-def build_equations(
-    model: IdentificationModel,
-    motions: Sequence[Motion],
-    bandwidth: float | None = None,
-    slow: Mapping[str, float] | ArrayLike | None = None,
-    progress: Progress | None = None,
-) -> tuple[RegressionEquations, BaseParameters]:
-    """Equations of motions, and what of the base parameters they tell.
-
-    Arguments and errors as for `identify`.
-    """
-    if bandwidth is None:
-        bandwidth = model.machine.estimation.bandwidth or min(map(_default_bandwidth, motions))
-    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", greater_than=0)
-    fastest = np.max([np.abs(motion.v).max(axis=0) for motion in motions], axis=0)
-    slow_speeds = _slow_speeds(model.machine, slow, fastest)
-    equations = RegressionEquations(
-        model, base_parameters(model), motions, bandwidth, slow_speeds, progress
-    )
-    if not equations.is_moving.any():
-        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
-    for joint, count in zip(model.machine.active, equations.is_moving.sum(axis=0), strict=True):
-        if count == 1:  # which tells nothing of its noise
-            raise RecordingError(
-                f"'{joint}' is in one sample only faster than what counts as standstill, move it "
-                "more, or raise its slow"
-            )
-    # of columns, the triangular factors tell what all rows tell
-    return equations, equations.base.identifiable_part(
-        np.vstack(list(equations.triangular_factors[:, :, :-1]))
-    )
 
 
 def _build_prior(
@@ -318,56 +232,16 @@ def _build_prior(
     parameter_sizes: Array,
     feasible: bool,
 ) -> Prior | None:
-    """Means and standard deviations (p,) of all parameters; None where nothing is known."""
+    """Prior means and standard deviations (p,) of all parameters; None without a prior."""
     known = dict(model.machine.estimation.prior)
     if given is not None:
         if not isinstance(given, Mapping | int | float):
             return check_prior(model, base, given, feasible)
-        given_priors = read_priors(
-            given
-        )  # after what the machine file says, also of the same name
+        given_priors = read_priors(given)  # takes precedence over the machine file
         known = {
             name: what for name, what in known.items() if name not in given_priors
         } | given_priors
     return prior_from_names(model, known, parameter_sizes) if known else None
-
-
-def prepare_motions(
-    machine: Machine,
-    recordings: RecordingOrMotion | Sequence[RecordingOrMotion],
-    trust: bool,
-    progress: Progress | None,
-    role: str = "",
-) -> list[Motion]:
-    """Recordings with velocities and accelerations; motions as they are.
-
-    Raises:
-        InputError: There are none.
-        RecordingError: One cannot serve; the message says which, if there are several.
-    """
-    sources = _as_list(recordings)
-    if not sources:
-        raise InputError("no recording is given, give at least one")
-    motions = []
-    for number, one in enumerate(sources, start=1):
-        try:
-            if not isinstance(one, Motion):
-                one = smoothed_motion(machine, one, trust=trust, progress=progress)
-        except RecordingError as error:
-            if not role and len(sources) == 1:
-                raise
-            which = f"{role or 'recording'} {number} of {len(sources)}"
-            raise RecordingError(f"{which}: {error}") from None
-        motions.append(one)
-    return motions
-
-
-def _as_list(
-    recordings: RecordingOrMotion | Sequence[RecordingOrMotion] | None,
-) -> list[RecordingOrMotion]:
-    if recordings is None:
-        return []
-    return [recordings] if isinstance(recordings, Recording | Motion) else list(recordings)
 
 
 def _check_forces(
@@ -376,7 +250,7 @@ def _check_forces(
     equations: RegressionEquations,
     trust: bool,
 ) -> None:
-    """Doubts about the forces of recordings, by what the model can say."""
+    """Check the forces of recordings against the model."""
     modelled, first = equations.compare(equations.base.values(model.nominal)).modelled, 0
     for motion, thinned in zip(motions, equations.thinned_motions(), strict=True):
         here = modelled[first : first + len(thinned.time)]
@@ -386,98 +260,3 @@ def _check_forces(
             model.machine.active, *force_delays(model, equations.base, motion, equations.slow)
         )
         first += len(here)
-
-
-def _speed_ranges(
-    model: IdentificationModel, motions: Sequence[Motion], slow: Array
-) -> dict[str, tuple[float, float]]:
-    """Least and largest speed along each direction of friction, of so many samples."""
-    directions = {
-        x.direction.name: x.direction for x in model.terms if isinstance(x, FrictionTerm)
-    }
-    fastest = dict.fromkeys(directions, 0.0)
-    for motion in motions:
-        sample_slice = slice(None, None, max(1, len(motion.time) // _SPEED_SAMPLES))
-        at = model.samples(motion.q[sample_slice], motion.v[sample_slice], motion.a[sample_slice])
-        for name, direction in directions.items():
-            speed = np.einsum("ij,ij->i", direction.jacobian(model.machine, at), at.v_a)
-            fastest[name] = max(fastest[name], float(np.abs(speed).max()))
-    lowest = dict(zip(model.machine.active, slow.tolist(), strict=True))
-    return {
-        name: (lowest.get(name, _SLOW_SPEED_SHARE * most), most) for name, most in fastest.items()
-    }
-
-
-def multi_pass_progress(progress: Progress | None) -> Progress | None:
-    """One bar for passes whose number is not known: each takes a share of what is left."""
-    if progress is None:
-        return None
-    done = 0.0
-
-    def report(share: float) -> None:
-        nonlocal done
-        now = done + _PASS_SHARE * (1 - done) * share
-        progress(now)
-        if share >= 1:
-            done = now
-
-    return report
-
-
-def _slow_speeds(
-    machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array
-) -> Array:
-    """Velocities (n,) below which rows are left out.
-
-    If not given, a share of the largest, or where the described friction comes from rest to what
-    it is in motion, which it does in reality at velocities that nobody knows better.
-    """
-    out = _SLOW_SPEED_SHARE * fastest
-    for i, joint in enumerate(machine.active):
-        law = machine.friction.get(joint)
-        if law is not None:
-            smoothing_speed = law.smoothing or (
-                _DEFAULT_STICTION_SPEED[machine.unit(joint)] if law.has_stick_slip else 0.0
-            )
-            stiction_speed = _SMOOTHING_FACTOR * (
-                max(law.stribeck, law.smoothing) if law.stiction else smoothing_speed
-            )
-            out[i] = max(out[i], min(stiction_speed, _MAX_SLOW_SHARE * fastest[i]))
-    if slow is not None and not isinstance(slow, Mapping):
-        each = np.full(out.shape, slow) if np.ndim(slow) == 0 else slow
-        each = as_sample(each, len(out), "slow", machine.active)
-        slow = dict(zip(machine.active, each.tolist(), strict=True))
-    for name, value in (*machine.estimation.slow.items(), *(slow or {}).items()):
-        joints = fnmatch.filter(machine.active, name)
-        if not joints and name not in machine.locked_joints:
-            raise InputError(f"slow is for '{name}', {suggest_names(machine.active, name)}")
-        if (limit := as_number(value, f"slow of '{name}'", "")) < 0:
-            raise InputError(f"slow of '{name}' is {limit:g}, it must not be negative")
-        out[[machine.active.index(joint) for joint in joints]] = limit
-    return out
-
-
-def _default_bandwidth(motion: Motion) -> float:
-    """[Hz] of the low-pass, far above the frequencies of the motion where it is measured well.
-
-    What is modelled lies below it; above it is noise, which has to be seen to be known. But what
-    smoothing takes from the accelerations is missing in the regressor and not in the forces, most
-    at reversals, where friction jumps: so no higher than smoothing lets through, unless that is
-    hardly above the motion.
-    """
-    step = float(motion.time[1] - motion.time[0])
-    highest = max(
-        _PASSBAND_SHARE * motion.passband,
-        _MIN_BANDWIDTH_FACTOR * _highest_frequency(motion.v, step),
-    )
-    return min(_MAX_BANDWIDTH_FACTOR * _highest_frequency(motion.a, step), highest, 0.24 / step)
-
-
-def _highest_frequency(x: Array, step: float) -> float:
-    """Frequency [Hz] below which 99 % of the power of each of the signals (N, n) is."""
-    found = [
-        spectral_edge_frequency(_POWER_SHARE, column / max(column.std(), 1e-300), step)
-        for column in x.T
-        if np.ptp(column) > 0
-    ]
-    return max(found, default=1 / (len(x) * step))

@@ -1,4 +1,4 @@
-"""Mass and centre of mass of a load from a recording of a machine that is known."""
+"""Identification of mass and centre of mass of a payload on a known machine."""
 
 import math
 from collections.abc import Sequence
@@ -12,35 +12,38 @@ from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics import Dynamics
-from crane.identification.estimation.estimators import Estimate, Prior
+from crane.identification.estimation.regression_problem import Estimate
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.force_checks import check_forces
-from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.free_joint_equations import iterate_estimate
-from crane.identification.mechanics.friction_terms import friction_term
+from crane.identification.mechanics.equation_setup import build_equations, multi_pass_progress
+from crane.identification.mechanics.force_comparison import ForceComparison, check_forces
+from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import METHODS, build_equations, multi_pass_progress
+from crane.identification.mechanics.identify import METHODS
 from crane.identification.mechanics.model_term import MotionSamples
-from crane.identification.mechanics.payload_estimate import PayloadEstimate, PayloadTerm
-from crane.identification.mechanics.recording_checks import reject_unless_trusted
-from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
-from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.mechanics.static_mass import (
+from crane.identification.mechanics.payload_estimate import (
     MIN_FRICTION_SHARE,
+    PayloadEstimate,
+    PayloadTerm,
     breakaway_force,
     low_passed_motion,
     static_cutoff,
     static_mass,
 )
+from crane.identification.mechanics.recording_checks import reject_unless_trusted
+from crane.identification.mechanics.regression_equations import (
+    Progress,
+    RegressionEquations,
+)
+from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
-_IDENTIFIABLE_TOLERANCE = 1e-6  # what of a direction may be missing from those that forces tell
-_SEGMENT_COUNT = 10  # of a recording, that are left out one by one
-_MIN_RETURN_SHARE = 0.1  # of a drive's way, that it goes back at least
-_MAX_INTERVAL_SHARE = 0.1  # of the machine's moving mass, that half of an interval may be at most
+_IDENTIFIABLE_TOLERANCE = 1e-6  # part of a direction outside of the identifiable ones
+_SEGMENT_COUNT = 10  # segments of a recording in the jackknife
+_MIN_RETURN_SHARE = 0.1  # least share of a drive's travel in the other direction
+_MAX_INTERVAL_SHARE = 0.1  # largest half width of an interval, relative to the moving mass
 _GRAVITY = 9.81  # [m/s^2]
 
 
@@ -54,34 +57,34 @@ def identify_payload(
     trust: bool = False,
     progress: Progress | None = None,
 ) -> PayloadEstimate:
-    """What a machine carries, from the forces that are not its own.
+    """Identify a payload from the forces that the machine alone does not explain.
 
-    tau_A - (M_A a_A + bias + friction) = Y_b T phi + sum_j c_j sign(v_j), with Y_b the columns of
-    the body that the frame is on, phi the load's ten parameters about the frame, T their change of
-    frame, and c_j what Coulomb friction of drive j differs from the described one: it depends on
-    load, temperature and wear, and looks like weight where a drive moves one way only. Else the
-    machine counts as known; what it is not as described shows as parts of the recording that tell
-    different loads, which widens the intervals (delete-one jackknife over ten parts).
+    The equations are tau_A - (M_A a_A + bias + friction) = Y_b T phi + sum_j c_j sign(v_j), with
+    the columns Y_b of the body that carries the frame, the ten parameters phi of the load about
+    the frame, their change of frame T, and corrections c_j of the Coulomb friction of drive j,
+    which depends on load, temperature and wear, and looks like weight if a drive moves in one
+    direction only. The machine is otherwise taken as known; its errors show as different loads in
+    parts of the recording, which widens the intervals (delete-one jackknife over ten segments).
 
-    Where that does not tell the mass, the load counts as a point at the frame's origin: one number
-    beside friction, by its weight, all low-passed at ten times the motion's frequency.
-    Friction of a drive that moved one way only is known there to what the machine describes, or a
-    hundredth of the drive's force if that is more. What the forces at rest say otherwise widens
-    the interval.
+    If this does not determine the mass, the load is taken as a point at the origin of the frame:
+    one mass beside friction, with signals low-passed at ten times the frequency of the motion. The
+    friction of a drive that moved in one direction only has a prior of the described friction, at
+    least a hundredth of the drive force. A different mass by the forces at rest widens the
+    interval.
 
     Args:
-        machine: Without the load, identified.
-        recording: With the load, moving.
-        frame: What it is fixed to; the tip if not given.
-        method: As of `identify`.
-        inertia: Whether the load's inertia about the frame is estimated too, or neglected.
-        trust: As of `identify`.
-        progress: Takes the finished share.
+        machine: Identified machine without the load.
+        recording: Recording of a motion with the load.
+        frame: Frame that carries the load; default the tip.
+        method: As for `identify`.
+        inertia: Whether to estimate the inertia of the load about the frame, or neglect it.
+        trust: As for `identify`.
+        progress: Called with the finished share, 0 to 1.
 
     Raises:
-        InputError: An unknown frame or method, or one that does not move.
-        RecordingError: A recording that cannot serve, or does not tell the mass, or not even to a
-            tenth of the machine's own and to itself; or a mass that is surely negative.
+        InputError: The frame or method is unknown, or the frame does not move.
+        RecordingError: The recording is not suitable, does not determine the mass to within itself
+            and a tenth of the machine's mass, or the mass is significantly negative.
 
     Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
     """
@@ -127,20 +130,20 @@ def identify_payload(
 
 
 class _UnidentifiableMassError(RecordingError):
-    """A motion does not tell the mass."""
+    """The motion does not determine the mass."""
 
 
 @dataclass(frozen=True)
 class _PayloadCase:
-    """A recording of a machine with a load.
+    """Recording of a machine with a load.
 
     Attributes:
-        machine: Without the load.
-        frame: That carries it.
-        motion: Recorded.
-        method: Of the estimate.
+        machine: Machine without the load.
+        frame: Frame that carries the load.
+        motion: Recorded motion.
+        method: Method of the estimate.
         moving_drives: Drives that moved.
-        one_way_drives: Those that hardly moved back.
+        one_way_drives: Drives that moved in one direction only.
     """
 
     machine: Machine
@@ -151,7 +154,7 @@ class _PayloadCase:
     one_way_drives: Sequence[str]
 
     def model(self, parameter_count: int) -> IdentificationModel:
-        """The load of so many parameters, and what Coulomb friction is beyond the described."""
+        """Model of a load with a number of parameters, and of corrections of Coulomb friction."""
         machine, dynamics = self.machine, Dynamics(self.machine)
 
         def machine_forces(at: MotionSamples) -> Array:
@@ -174,13 +177,13 @@ class _PayloadCase:
     def estimate_body(
         self, parameter_count: int, trust: bool, progress: Progress | None
     ) -> PayloadEstimate:
-        """A load of 10 or 4 parameters.
+        """Estimate a load with 10 or 4 parameters.
 
         Raises:
-            _NotToldError: The motion does not tell its mass.
+            _UnidentifiableMassError: The motion does not determine the mass.
         """
         model = self.model(parameter_count)
-        # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth
+        # the weight determines the load: smoothing of accelerations does not limit the bandwidth
         motion = replace(self.motion, passband=math.inf)
         equations, base = build_equations(model, [motion], progress=progress)
         (thinned,) = equations.thinned_motions()
@@ -193,13 +196,17 @@ class _PayloadCase:
             drive_motion, equations.offset[:, drive_indices], self.moving_drives, trust=trust
         )
         columns = equations.column_selection(base)
-        equations, estimate = self._estimate(equations, columns, None)
+        equations, estimate = equations.estimate(
+            columns, METHODS[self.method], None, np.zeros(len(columns))
+        )
         combinations, directions = _identifiable_moments(base)
         if not combinations[:, 0].any():
-            raise _UnidentifiableMassError("this motion does not tell the mass, move all joints")
+            raise _UnidentifiableMassError(
+                "this motion does not determine the mass, move all joints"
+            )
         mass, *first = (combinations.T @ estimate.values).tolist()
         com = np.where(combinations[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
-        derivatives = np.eye(4)  # derivatives of mass and com by mass and first moments
+        derivatives = np.eye(4)  # of mass and com by mass and first moments
         derivatives[1:] /= mass
         derivatives[1:, 0] = -np.nan_to_num(com) / mass
         derivatives = derivatives @ combinations.T
@@ -218,7 +225,7 @@ class _PayloadCase:
         )
 
     def estimate_point_mass(self, progress: Progress | None) -> PayloadEstimate | None:
-        """A mass at the frame's origin; None where its weight loads no drive that moved."""
+        """Estimate a mass at the frame's origin; None if its weight loads no moving drive."""
         motion, model = low_passed_motion(self.motion), self.model(1)
         if not self._weight_loads_drive(motion):
             return None
@@ -236,7 +243,9 @@ class _PayloadCase:
             band = max(breakaway_force(self.machine, joint), least)
             std.append(band if joint in self.one_way_drives else math.inf)
         prior = np.zeros(len(std)), np.array(std)
-        equations, parameters = self._estimate(equations, columns, prior)
+        equations, parameters = equations.estimate(
+            columns, METHODS[self.method], prior, np.zeros(len(columns))
+        )
         derivatives = np.zeros((4, len(std)))
         derivatives[0, 0] = 1.0
         covariance, freedom = _widen_covariance(
@@ -260,35 +269,12 @@ class _PayloadCase:
             self.estimate_static_mass(corrections, np.zeros(3)),
             self._force_comparison(equations, columns @ parameters.values),
         )
-        if estimate.static_mass is not None:  # two answers are as uncertain as they are apart
+        if estimate.static_mass is not None:  # the difference of both estimates is an uncertainty
             covariance[0, 0] += (estimate.static_mass[0] - estimate.mass) ** 2
         return estimate
 
-    def _estimate(
-        self, equations: RegressionEquations, columns: Array, prior: Prior | None
-    ) -> tuple[RegressionEquations, Estimate]:
-        """What rows tell, and they as they tell it."""
-
-        def estimate_at(values: Array) -> tuple[Estimate, Array]:
-            nonlocal equations
-            equations = equations.at_values(values) if self.machine.free else equations
-            found = METHODS[self.method](
-                equations.projected_regressor(columns),
-                equations.y,
-                equations.groups,
-                equations.samples,
-                prior,
-            )
-            return found, columns @ found.values
-
-        zeros = np.zeros(len(columns))
-        found = (
-            iterate_estimate(estimate_at, zeros) if self.machine.free else estimate_at(zeros)[0]
-        )
-        return equations, found
-
     def _weight_loads_drive(self, motion: Motion) -> bool:
-        """Whether the weight of a point loads a drive that moves."""
+        """Whether the weight of a point mass loads a moving drive."""
         load, q = (
             PayloadTerm(self.machine, self.frame, 1),
             motion.q[:: max(1, len(motion.q) // 100)],
@@ -313,7 +299,7 @@ class _PayloadCase:
         )
 
     def is_uncertain(self, estimate: PayloadEstimate) -> bool:
-        """Whether an interval is wider than the mass, and than a share of the machine's own."""
+        """Whether the interval exceeds the mass and a share of the machine's mass."""
         low, high = estimate.interval()[0].tolist()
         machine_mass = sum(inertia.mass for inertia in list(self.machine.model.inertias)[1:])
         return not high - low <= 2 * max(abs(estimate.mass), _MAX_INTERVAL_SHARE * machine_mass)
@@ -333,7 +319,7 @@ def _widen_covariance(
     derivatives: Array,
     prior_root: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Covariance (4, 4) by noise, or by what leaving parts out changes, and its freedom (4,)."""
+    """Covariance (4, 4), widened by the jackknife, and its degrees of freedom (4,)."""
     covariance = derivatives @ estimate.covariance @ derivatives.T
     jackknife_variances = np.diag(
         derivatives
@@ -347,10 +333,10 @@ def _widen_covariance(
 
 
 def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
-    """Doubt a mass whose whole interval is negative: something else is wrong.
+    """Reject a mass whose whole interval is negative.
 
     Raises:
-        RecordingError: It is not trusted.
+        RecordingError: The recording is not trusted.
     """
     low, high = estimate.interval()[0].tolist()
     if high < 0:
@@ -371,17 +357,16 @@ def _raise_unidentifiable(
     if estimate is None:
         raise RecordingError(reason)
     low, high = estimate.interval()[0].tolist()
-    text = f"this recording does not tell the mass ({low:.3g} to {high:.3g} kg): "
+    text = f"this recording does not determine the mass ({low:.3g} to {high:.3g} kg): "
     if one_way_drives:
         names = ", ".join(f"'{joint}'" for joint in one_way_drives)
         text += f"{names} moved one way only, where friction looks like weight, record both ways"
     else:
-        text += "its parts tell different loads, identify the machine without a load first"
+        text += "its parts give different loads, identify the machine without a load first"
     if static_mass is not None:
         text += (
             f"; with its centre at '{estimate.frame}' the forces at rest hold "
-            f"{static_mass[0]:.4g} +- "
-            f"{static_mass[1]:.2g} kg, by the described friction"
+            f"{static_mass[0]:.4g} +- {static_mass[1]:.2g} kg, by the described friction"
         )
     raise RecordingError(text)
 
@@ -389,9 +374,9 @@ def _raise_unidentifiable(
 def _jackknife_covariance(
     equations: RegressionEquations, columns: Array, noise: Array, prior_root: Array | None
 ) -> Array:
-    """Covariance (s, s) of parameters by what leaving out each part of the recording changes.
+    """Delete-one jackknife covariance (s, s) of the parameters over segments.
 
-    Rows of a prior about zero (k, s) belong to all parts.
+    Rows (k, s) of a prior about zero belong to all segments.
     """
     size = columns.shape[1]
     prior_rows = np.zeros((0, size)) if prior_root is None else prior_root
@@ -410,16 +395,16 @@ def _jackknife_covariance(
 
 
 def _moves_one_way(v: Array) -> bool:
-    """Whether a drive of velocity (N,) goes hardly any way back."""
+    """Whether a drive with the velocity (N,) moves in one direction only."""
     travel = np.maximum(v, 0).sum(), np.maximum(-v, 0).sum()
     return bool(min(travel) < _MIN_RETURN_SHARE * max(travel))
 
 
 def _identifiable_moments(base: BaseParameters) -> tuple[Array, Array]:
-    """Mass and first moments as combinations (r, 4) of base parameters, zero where not told.
+    """Mass and first moments as combinations (r, 4) of base parameters, zero if unidentifiable.
 
-    And the directions (k, 3) of first moments that are told. A combination w of parameters is
-    told if it is one of the rows of K, so at right angles to all that K does not see.
+    Also returns the identifiable directions (k, 3) of first moments. A combination of parameters
+    is identifiable if it is in the row space of K, orthogonal to the null space of K.
     """
     K = base.grouping
     share = np.array(np.linalg.lstsq(K.T, np.eye(K.shape[1])[:, :4], rcond=None)[0])

@@ -1,6 +1,6 @@
-"""A load on a frame, and what was found of it."""
+"""A payload on a frame: model term, estimate, and mass from the forces at rest."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,20 +9,33 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.units import format_table
 from crane.dynamics import Dynamics
+from crane.identification.estimation.regression_problem import confidence_intervals
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.inertial_terms import BODY_PARAMETERS, inertial_regressor
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.force_delays import motion_frequency
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_term import (
+    BODY_PARAMETERS,
+    MotionSamples,
+    inertial_regressor,
+)
+from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
 from crane.machine import Machine
+
+_REST_SPEED_SHARE = 0.05  # of a joint's largest velocity, below which it is at rest
+_MIN_REST_DURATION = 0.25  # [s], least duration of rest
+MIN_FRICTION_SHARE = 0.01  # least uncertainty at rest by friction and sensors, per drive force
+_CUTOFF_FACTOR = 10.0  # cutoff of static forces, times the frequency of the motion
+_MIN_PERIODS = 5.0  # periods of the cutoff in a recording
 
 
 class PayloadTerm:
-    """A rigid body on a frame: its ten parameters about the frame's origin.
+    """Term of a rigid body on a frame: its ten parameters about the origin of the frame.
 
     Args:
         machine: The machine.
-        frame: A link of it, which moves.
-        parameter_count: How many of the ten: 4 without inertia, 1 for a point at the origin.
+        frame: Name of a moving link.
+        parameter_count: Number of the parameters: 10, 4 without inertia, 1 for a point mass.
     """
 
     def __init__(self, machine: Machine, frame: str, parameter_count: int = 10):
@@ -30,7 +43,7 @@ class PayloadTerm:
         if model_frame.parentJoint == 0:
             raise InputError(f"frame '{frame}' does not move, choose another")
         first = 10 * (model_frame.parentJoint - 1)
-        A = model_frame.placement.homogeneous  # P about the joint is A P A^T
+        A = model_frame.placement.homogeneous  # the pseudo-inertia about the joint is A P A^T
         self._frame_transform = body_parameters(A @ pseudo_inertia(np.eye(10)) @ A.T)[
             :parameter_count
         ].T
@@ -49,23 +62,23 @@ class PayloadTerm:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PayloadEstimate(OneLineRepr):
-    """A load on a frame.
+    """Estimated payload on a frame.
 
     Attributes:
-        frame: A link of the machine.
-        mass: [kg].
-        com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not tell.
-            All nan where it was taken to be at the frame's origin, as nothing tells it.
-        covariance: (4, 4) of mass and com, to first order; nan as `com`. The larger of what the
-            noise makes and of what leaving out a tenth of the recording changes (jackknife).
-        degrees_of_freedom: (4,) degrees of freedom behind each.
-        directions: (k, 3) orthonormal directions of the frame along which the motion tells where
-            the centre of mass is.
-        friction_corrections: By drive, Coulomb friction that the machine's own lacks [N], [N m],
-            of those that moved both ways.
-        static_mass: Mass that the forces at rest tell with that centre of mass, and by how much
-            friction may be in it [kg]; None where nothing rests, or the centre is not told.
-        fit: What of the forces is not the machine's, and what the load explains.
+        frame: Name of the link.
+        mass: Mass [kg].
+        com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not
+            determine, all nan if the load was taken as a point at the origin.
+        covariance: (4, 4) covariance of mass and com to first order, the larger of that by noise
+            and that by the jackknife; nan as for `com`.
+        degrees_of_freedom: (4,) degrees of freedom of each variance.
+        directions: (k, 3) orthonormal directions of the frame in which the motion determines the
+            centre of mass.
+        friction_corrections: Corrections of Coulomb friction [N], [N m] by drive that moved in
+            both directions.
+        static_mass: Mass by the forces at rest for this centre of mass, and its uncertainty by
+            friction [kg]; None without rest.
+        fit: Forces beyond those of the machine, measured and by the load.
     """
 
     frame: str
@@ -85,22 +98,17 @@ class PayloadEstimate(OneLineRepr):
 
     @property
     def std_com(self) -> Array:
-        """(3,) standard deviations of the centre of mass [m]."""
+        """Standard deviations (3,) of the centre of mass [m]."""
         return np.sqrt(np.diag(self.covariance)[1:])
 
     def interval(self, level: float = 0.95) -> Array:
-        """(4, 2) ends of what covers mass and centre of mass with this probability each."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * np.sqrt(
-            np.diag(self.covariance)
-        )
-        values = np.append(self.mass, self.com)
-        return np.column_stack([values - half, values + half])
+        """Confidence intervals (4, 2) of mass and centre of mass."""
+        values, std = np.append(self.mass, self.com), np.sqrt(np.diag(self.covariance))
+        return confidence_intervals(values, std, self.degrees_of_freedom, level)
 
     @property
     def warning(self) -> str:
-        """Why the mass should not be believed, "" where nothing is against it."""
+        """Warning if the forces at rest contradict the mass, else ""."""
         low, high = self.interval()[0].tolist()
         if self.static_mass is None:
             return ""
@@ -113,7 +121,7 @@ class PayloadEstimate(OneLineRepr):
         )
 
     def to_text(self) -> str:
-        """A table of mass and centre of mass."""
+        """Table of mass and centre of mass."""
         rows = [["", "value", "std", "95 % interval", ""]]
         values, names = np.append(self.mass, self.com), ("mass", "com x", "com y", "com z")
         units = ("kg", "m", "m", "m")
@@ -121,7 +129,7 @@ class PayloadEstimate(OneLineRepr):
         table = zip(names, units, values, std, self.interval(), strict=True)
         for name, unit, value, deviation, (low, high) in table:
             if np.isnan(value):
-                rows.append([name, "-", "", "not told by this motion", ""])
+                rows.append([name, "-", "", "not determined by this motion", ""])
                 continue
             interval_text = f"{low:.5g} to {high:.5g} {unit}"
             rows.append([name, f"{value:.5g}", f"{deviation:.2g}", interval_text, ""])
@@ -140,3 +148,67 @@ class PayloadEstimate(OneLineRepr):
             f"load's share"
         )
         return "\n".join(lines) + "\n"
+
+
+def low_passed_motion(motion: Motion) -> Motion:
+    """Motion with velocities and accelerations filtered at `static_cutoff`."""
+    cutoff, step = static_cutoff(motion), float(motion.time[1] - motion.time[0])
+    if 4 * cutoff >= 1 / step:
+        return motion
+    v, a = (low_pass(motion.time, x, cutoff) for x in (motion.v, motion.a))
+    return replace(motion, v=v, a=a)
+
+
+def static_cutoff(motion: Motion) -> float:
+    """Cutoff [Hz] below which forces are weights and friction."""
+    step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
+    wanted = max(_CUTOFF_FACTOR * motion_frequency(motion.q, step), _MIN_PERIODS / duration)
+    return min(wanted, 0.24 / step)
+
+
+def static_mass(
+    machine: Machine,
+    load: PayloadTerm,
+    motion: Motion,
+    friction_corrections: dict[str, float],
+    com: Array,
+) -> tuple[float, float] | None:
+    """Mass by the forces at rest and its uncertainty by friction; None without rest.
+
+    Each drive is weighted by its friction, described and corrected, as a standard deviation.
+    """
+    step = float(motion.time[1] - motion.time[0])
+    v = low_passed_motion(motion).v
+    is_resting = ~is_moving(v, _REST_SPEED_SHARE * np.abs(v).max(axis=0)).any(axis=1)
+    edges = np.flatnonzero(np.diff(is_resting.astype(np.int8), prepend=0, append=0))
+    runs = [
+        (i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _MIN_REST_DURATION
+    ]
+    if not runs:
+        return None
+    q = np.array([motion.q[i:j].mean(axis=0) for i, j in runs])
+    tau = np.array([motion.tau[i:j].mean(axis=0) for i, j in runs])
+    zero = np.zeros_like(q)
+    tau = tau - Dynamics(machine).inverse(q, zero, zero)
+    at = IdentificationModel(machine, [load]).samples(q, zero, zero)
+    unit_forces = load.columns(at)[:, :, :4] @ np.append(1.0, com)
+    friction_forces = np.array([breakaway_force(machine, joint) for joint in machine.active])
+    friction_forces += [abs(friction_corrections.get(joint, 0.0)) for joint in machine.active]
+    friction_forces = np.maximum(
+        friction_forces, MIN_FRICTION_SHARE * np.sqrt(np.mean(motion.tau**2, axis=0))
+    )
+    information = ((unit_forces / friction_forces) ** 2).sum()
+    if not information > 0:
+        return None
+    mass = float((unit_forces * tau / friction_forces**2).sum() / information)
+    # drives that disagree by more than their friction widen the uncertainty
+    misfit = float((((tau - unit_forces * mass) / friction_forces) ** 2).sum()) / max(
+        unit_forces.size - 1, 1
+    )
+    return mass, float(np.sqrt(max(misfit, 1.0) * len(runs) / information))
+
+
+def breakaway_force(machine: Machine, joint: str) -> float:
+    """Largest friction of a joint at rest [N], [N m]."""
+    law = machine.friction.get(joint)
+    return 0.0 if law is None else law.coulomb + law.stiction + abs(law.coulomb_offset)

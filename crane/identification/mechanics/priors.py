@@ -1,4 +1,4 @@
-"""What is known of parameters before: by name, or as numbers for all of them."""
+"""Priors of parameters: by name, or as means and standard deviations of all parameters."""
 
 import fnmatch
 from collections.abc import Mapping, Sequence
@@ -11,20 +11,20 @@ from crane.common.errors import InputError
 from crane.common.errors import suggest_names as known_names
 from crane.common.samples import Array, as_number, as_sample
 from crane.description.estimation_settings import ParameterPrior
-from crane.identification.estimation.estimators import Prior
+from crane.identification.estimation.regression_problem import Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 
-_RANK_TOLERANCE = 1e-10  # relative size of a pivot below which columns say the same
+_RANK_TOLERANCE = 1e-10  # relative size of a pivot of dependent columns
 _MAX_LISTED = 8
-_RELATIVE_STD_RANGE = 1e-7, 1e6  # above and up to which a relative standard deviation lies
+_RELATIVE_STD_RANGE = 1e-7, 1e6  # range of a relative standard deviation
 
 
 def read_priors(given: float | Mapping[str, object]) -> dict[str, ParameterPrior]:
-    """What is known by name: a share alone is one of everything.
+    """Parse priors by name; a single relative standard deviation is that of all parameters.
 
     Raises:
-        InputError: It is none that can be estimated with.
+        InputError: A prior is not valid.
     """
     if isinstance(given, Mapping):
         return {
@@ -38,22 +38,21 @@ def read_priors(given: float | Mapping[str, object]) -> dict[str, ParameterPrior
 def prior_from_names(
     model: IdentificationModel, priors: Mapping[str, ParameterPrior], parameter_sizes: Array
 ) -> Prior:
-    """Means (p,) and standard deviations (p,) of parameters of which something is known by name.
+    """Means (p,) and standard deviations (p,) of parameters from priors by name.
 
-    A name is that of a parameter, of a body for its mass and all moments, "bodies" for all, or a
-    pattern; "*" is everything, and the last that speaks of a parameter counts. Of a body only a
-    share r is known: r m, r m l, r m l^2. A share of another parameter is one of its described
-    value, of friction that is described as zero of what the same joint's friction of that kind is
-    described as. What nothing is said of, and shares of what is described by no number, are within
-    the sizes that such a machine can have.
+    A name is that of a parameter, of a body for its mass and all moments, "bodies" for all bodies,
+    or a pattern; "*" matches everything, and the last match takes precedence. The prior of a body
+    is a relative standard deviation r: r m, r m l, r m l^2. That of another parameter refers to
+    its described value, or, if that is zero, to the described friction of the same joint and kind.
+    Parameters without a prior or a described value have their magnitudes as standard deviations.
 
     Args:
         model: The model.
-        priors: By name.
-        parameter_sizes: See `determined.parameter_magnitudes` (p,).
+        priors: Priors by name.
+        parameter_sizes: Magnitudes (p,), see `parameter_magnitudes`.
 
     Raises:
-        InputError: A name that nothing has, or a body that more is said of than a share.
+        InputError: A name is unknown, or the prior of a body is not relative.
     """
     mean, std = model.nominal.copy(), np.where(parameter_sizes > 0, parameter_sizes, 1.0)
     count = 10 * len(model.bodies)
@@ -91,7 +90,7 @@ def prior_from_names(
 
 
 def _described_friction(model: IdentificationModel, i: int) -> float:
-    """The largest described friction of the same joint and kind as that of a parameter."""
+    """Described friction of the same joint and kind as the offset of a parameter, else 0."""
     where, _, kind = model.names[i].rpartition(".")
     base_kind = kind.removesuffix("_offset")
     law = model.machine.friction.get(where)
@@ -99,23 +98,23 @@ def _described_friction(model: IdentificationModel, i: int) -> float:
 
 
 def _matching_names(names: Sequence[str], pattern: str) -> list[str]:
-    """The name itself, or those that a pattern is about."""
+    """The name itself, or the names that match a pattern."""
     return [pattern] if pattern in names else fnmatch.filter(names, pattern)
 
 
 def check_prior(
     model: IdentificationModel, base: BaseParameters, prior: Any, feasible: bool
 ) -> Prior:
-    """Means (p,) and standard deviations (p,) of all parameters of a model.
+    """Check means (p,) and standard deviations (p,) of all parameters of a model.
 
     Args:
         model: The model.
-        base: Its base parameters.
-        prior: What was given.
-        feasible: Whether its bodies have to be able to exist.
+        base: Base parameters of the model.
+        prior: The given prior.
+        feasible: Whether bodies are constrained to be feasible.
 
     Raises:
-        InputError: It is no pair of numbers for each parameter, or a deviation is not above zero.
+        InputError: It is no pair of arrays (p,), or a standard deviation is not positive.
     """
     count = len(model.names)
     if not isinstance(prior, Sequence | np.ndarray) or len(prior) != 2:
@@ -127,8 +126,8 @@ def check_prior(
     if given[0] == given[1] == (len(base.independent),) != (count,):
         raise InputError(
             f"the prior is about the {given[0][0]} base parameters, give means and standard "
-            f"deviations of all {count} parameters of the model (Model(machine).names), infinite "
-            "ones for those it says nothing of"
+            f"deviations of all {count} parameters of the model "
+            "(IdentificationModel(machine).names), infinite ones for those without a prior"
         )
     mean = as_sample(prior[0], count, "the prior's means", model.names)
     std = np.asarray(prior[1], dtype=np.float64)
@@ -137,7 +136,7 @@ def check_prior(
         i = int(std.argmin())
         raise InputError(
             f"the prior's deviation of '{model.names[i]}' is {std[i]:g}, give one above 0, "
-            "infinite where it says nothing"
+            "infinite without a prior"
         )
     for i, body in enumerate(model.bodies if feasible else ()):
         if not mean[10 * i] > 0:
@@ -149,15 +148,15 @@ def check_prior(
 
 
 def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
-    """Raise for parameters that neither a prior nor a motion tells apart.
+    """Check that a prior and a motion together determine all parameters.
 
     Args:
-        names: Of all parameters (p,).
+        names: Names of all parameters (p,).
         W: Regressor (m, p).
         prior: Means and standard deviations (p,).
 
     Raises:
-        InputError: There are some; a prior of bodies says nothing of friction, say.
+        InputError: Parameters without a finite prior are not identifiable.
     """
     unknown_columns = np.flatnonzero(np.isinf(prior[1]))
     if not len(unknown_columns):
@@ -170,7 +169,7 @@ def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
     rank = int((pivot > _RANK_TOLERANCE * max(pivot[0], 1e-300)).sum())
     if rank == len(unknown_columns):
         return
-    # the null space, in which those that depend on each other have shares
+    # the null space shows the dependent parameters
     square = triangle[:rank, :rank]
     rest = (
         np.linalg.solve(square, triangle[:rank, rank:])
@@ -183,7 +182,7 @@ def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
         len(undetermined) > _MAX_LISTED
     )
     raise InputError(
-        f"the prior says nothing of {listed}, and this motion does not tell them apart: move the "
-        "joints both ways and at several speeds, give prior=(means, deviations) with finite ones "
-        "for them, or leave the prior out, which tells of them together"
+        f"there is no finite prior of {listed}, and this motion does not determine them "
+        "separately: move the joints both ways and at several speeds, give prior=(means, "
+        "deviations) with finite ones for them, or omit the prior to estimate base parameters"
     )

@@ -1,4 +1,4 @@
-"""Recordings that would mislead an identification, and why."""
+"""Checks of recordings before an identification: units, delays, outliers, hum."""
 
 import math
 import warnings
@@ -8,7 +8,6 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, RecordingError
 from crane.common.samples import Array
-from crane.identification.signals.outliers import outlier_mask, replace_outliers
 from crane.identification.signals.signal_processing import (
     central_differences,
     check_gaps,
@@ -16,20 +15,25 @@ from crane.identification.signals.signal_processing import (
     resample_evenly,
     sampling_step,
 )
-from crane.identification.signals.spectral_lines import strongest_spectral_line
+from crane.identification.signals.signal_quality import (
+    outlier_mask,
+    replace_outliers,
+    strongest_spectral_line,
+)
 
 _MIN_SAMPLES = 50  # samples
-_COMPARISON_CUTOFF = 10.0  # [Hz] up to which recorded velocities and positions are compared
+_COMPARISON_CUTOFF = 10.0  # [Hz] of the comparison of velocities and positions
 _CORRELATION_TOLERANCE = 0.01  # of a correlation
-_MAX_DELAY = 1.0  # [s] longest delay that is looked for
-_MAX_OUTLIER_SHARE = 0.05  # share of a column's samples above which it is refused
-_COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}  # units that are taken for SI
+_MAX_DELAY = 1.0  # [s] longest delay of the search
+_MAX_OUTLIER_SHARE = 0.05  # of the samples of a column, above which it is rejected
+# units that are confused with SI units
+_COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}
 
 
 def signal_delay(time: Array, one: Array, other: Array) -> float:
-    """By how many seconds the second signal (N,) comes after the first, at most 1 s.
+    """Delay [s] of the second signal (N,) with respect to the first, at most 1 s.
 
-    Where the correlation of what overlaps has its maximum, refined by a parabola.
+    It is the maximum of the correlation of the overlapping parts, refined by a parabola.
     """
     from scipy.signal import correlate
 
@@ -41,10 +45,10 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
     low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
     energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
     correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
-    # of equal ones, as of periodic signals, the shortest
+    # the shortest of equal maxima, as for periodic signals
     best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
     at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
-    if correlation[at - 1 : at + 2].argmax() != 1:  # on the slope of the shortest
+    if correlation[at - 1 : at + 2].argmax() != 1:  # not at a local maximum
         direction = 1 if correlation[at + 1] > correlation[at] else -1
         while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
             at += direction
@@ -55,7 +59,7 @@ def signal_delay(time: Array, one: Array, other: Array) -> float:
 
 
 def reject_unless_trusted(text: str, trust: bool) -> None:
-    """Refuse a recording that is most likely wrong, or only tell why, where it is trusted.
+    """Reject a recording that is probably wrong, or warn if it is trusted.
 
     Raises:
         RecordingError: It is not trusted.
@@ -66,10 +70,10 @@ def reject_unless_trusted(text: str, trust: bool) -> None:
 
 
 def check_samples(time: Array) -> None:
-    """Refuse a recording of too few samples, or with gaps between its instants (N,).
+    """Reject a recording with too few samples, or with gaps between its instants (N,).
 
     Raises:
-        RecordingError: The message says when.
+        RecordingError: There are too few samples, or a gap.
     """
     if len(time) < _MIN_SAMPLES:
         raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
@@ -79,12 +83,13 @@ def check_samples(time: Array) -> None:
 def remove_outliers(
     time: Array, names: Sequence[str], columns: Array, trust: bool = False
 ) -> Array:
-    """Columns (N, k) without samples that stand out: lines between their neighbours instead.
+    """Replace outliers in columns (N, k) by linear interpolation.
 
-    Before any filter, which would smear them. Columns of a trusted recording stay as they are.
+    Outliers are removed before filters, which would smear them. Columns of a trusted recording are
+    not changed.
 
     Raises:
-        RecordingError: A column has too many of them.
+        RecordingError: A column has too many outliers.
     """
     messages = []
     for name, column in () if trust else zip(names, columns.T, strict=True):
@@ -105,7 +110,7 @@ def remove_outliers(
 
 
 def warn_hum(time: Array, columns: Mapping[str, Array], min_frequency: float) -> None:
-    """Warn of lines in the spectra of columns (N,), above a frequency [Hz] where nothing moves."""
+    """Warn of spectral lines in columns (N,) above a frequency [Hz] without motion."""
     step, messages = float(np.median(np.diff(time))), []
     for name, column in columns.items():
         if (
@@ -131,7 +136,7 @@ def check_recording(
     free: Sequence[str] = (),
     trust: bool = False,
 ) -> None:
-    """Refuse a recording that cannot serve an identification.
+    """Reject a recording that is not suitable for an identification.
 
     Args:
         time: Instants (N,) [s].
@@ -139,17 +144,17 @@ def check_recording(
         tau: Generalized forces (N, n).
         joints: Names (n,).
         units: "rad" or "m" of each coordinate.
-        v: Recorded velocities (N, n), compared with those of q.
-        limits: Lowest and highest coordinate (n, 2).
-        longest_delay: [s] between recorded velocity and q; a filter in the sensor makes some.
-        free: Those of the joints whose force is known to be zero.
-        trust: Whether to tell only what is most likely wrong, and refuse what cannot be used.
+        v: Recorded velocities (N, n), compared with the derivatives of q.
+        limits: Lower and upper limits (n, 2).
+        longest_delay: Largest delay [s] between recorded velocity and q, for filters of sensors.
+        free: Names of free joints.
+        trust: Whether to warn only of what is probably wrong.
 
     Raises:
-        RecordingError: No motion, wrong units, or columns that do not belong together; the
+        RecordingError: There is no motion, units are wrong, or columns are inconsistent; the
             message names the column.
     """
-    # Of noise alone, steps between samples have twice its variance.
+    # steps between samples of pure noise have twice its variance
     if all(np.ptp(x) == 0 or np.var(np.diff(x)) >= np.var(x) for x in q.T):
         raise RecordingError("no joint moves, record a motion")
     for i, joint in enumerate(joints):
@@ -184,13 +189,13 @@ def _check_range(x: Array, limits: Array, joint: str, unit: str, trust: bool) ->
 def _check_velocity(
     time: Array, x: Array, v: Array, joint: str, unit: str, longest_delay: float, trust: bool
 ) -> None:
-    """Compare a velocity with the derivative of its coordinate, both up to 10 Hz."""
+    """Compare a velocity with the derivative of its coordinate below 10 Hz."""
     time, columns = resample_evenly(time, np.column_stack([x, v]))
     step = sampling_step(time)
     if 0.4 / step > _COMPARISON_CUTOFF:
         columns = low_pass(time, columns, _COMPARISON_CUTOFF)
     derivative, v = central_differences(time, columns[:, 0]), columns[:, 1]
-    # what is less than a micrometre in the sampled time is noise or rounding, not motion
+    # less than a micrometre is noise or rounding, not motion
     if np.std(columns[:, 0]) < 1e-6:
         return
     ratio = math.sqrt(np.mean(v**2) / np.mean(derivative**2))
@@ -220,6 +225,6 @@ def _check_velocity(
 
 
 def delay_message(name: str, delay: float, reference: str) -> str:
-    """What to say of a column that comes so many seconds after another."""
+    """Message about the delay [s] of a column with respect to another."""
     side = "behind" if delay > 0 else "ahead of"
     return f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock"

@@ -1,4 +1,4 @@
-"""y = W beta along a motion, filtered and thinned, in blocks that fit into memory."""
+"""Regression equations y = W beta of motions, filtered and decimated, in blocks."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -9,10 +9,10 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
+from crane.identification.estimation.regression_problem import Estimate, Prior
 from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.free_joint_equations import free_joint_rows
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_term import MotionSamples
 from crane.identification.signals.signal_processing import (
@@ -22,24 +22,27 @@ from crane.identification.signals.signal_processing import (
     is_moving,
 )
 
-_MIN_PERIODS = 5.0  # periods of the filter's cutoff in a recording
-_BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor that are computed at once
-_CACHE_BYTES = (
-    3 << 27
-)  # bytes of filtered blocks that are held; others are computed again when needed
-
+_MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
+_BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor per block
+# bytes of cached filtered blocks; others are computed again
+_CACHE_BYTES = 3 << 27
 Progress = Callable[[float], None]
+_MAX_ITERATIONS = 31
+_CONVERGENCE_TOLERANCE = 1e-2  # of a standard deviation
+_ROUNDING_TOLERANCE = 1e-9  # of the largest value
+RegressorFunction = Callable[[MotionSamples], tuple[Array, Array]]
+"""Function samples -> W (N, n, r) and known forces (N, n)."""
 
 
 class _FilteredMotion:
-    """One of the motions, through the low-pass.
+    """Low-pass and decimation of one motion.
 
     Attributes:
         motion: The motion.
-        step: Of its samples [s].
-        thinning: One of so many samples is left.
-        filter_reach: Samples that the filter sees to each side, a multiple of the thinning.
-        is_moving: (M, n) which of the rows that are left count.
+        step: Step of its samples [s].
+        thinning: Decimation factor.
+        filter_reach: Reach of the filter to each side in samples, a multiple of the factor.
+        is_moving: (M, n) mask of the decimated rows that are used.
     """
 
     def __init__(self, motion: Motion, bandwidth: float, slow: Array):
@@ -57,7 +60,7 @@ class _FilteredMotion:
             self.thinning = max(1, int(0.25 / (self.step * bandwidth)))
             kernel_reach = len(filter_kernel(self.step, bandwidth)) // 2
         self.filter_reach = -(-kernel_reach // self.thinning) * self.thinning
-        # near standstill friction is none of its shapes, and in no row that the filter mixes it in
+        # friction laws are not valid near standstill, nor in rows within the reach of the filter
         is_resting = ~is_moving(motion.v, slow)
         is_near_rest = maximum_filter1d(
             is_resting.view(np.uint8), 2 * kernel_reach + 1, axis=0, mode="constant"
@@ -65,20 +68,19 @@ class _FilteredMotion:
         self.is_moving = is_near_rest[:: self.thinning] == 0
 
     def __len__(self) -> int:
-        """How many instants are left."""
+        """Number of decimated instants."""
         return len(self.is_moving)
 
 
 @dataclasses.dataclass
 class _EquationBlock:
-    """Rows that are computed at once.
+    """Block of rows that are computed together.
 
     Attributes:
-        filtered_motion: Whose.
-        rows: Which of the part's.
-        instants: Which of all.
-        term_states: What terms that depend on the past keep, before the first sample that it
-            needs.
+        filtered_motion: Motion of the block.
+        rows: Rows within the motion.
+        instants: Rows among all instants.
+        term_states: States of terms with memory before the first sample of the block.
     """
 
     filtered_motion: _FilteredMotion
@@ -88,30 +90,29 @@ class _EquationBlock:
 
 
 class RegressionEquations:
-    """tau_A + gamma^T f = W(q_A, v_A, a_A) beta of motions, both sides through one low-pass.
+    """Regression equations of motions: tau_A + gamma^T f = W(q_A, v_A, a_A) beta after a low-pass.
 
-    The regressor of a long recording is larger than memory. It is computed, filtered and thinned
-    block by block, each with as many samples before and after as the filter's kernel has,
-    so that the blocks are those of the whole.
+    The regressor of a long recording may exceed the memory. It is computed, filtered and decimated
+    in blocks, each with the samples before and after it that the kernel of the filter needs.
 
     Args:
         model: The model.
-        base: Its base parameters; W has their columns.
+        base: Base parameters, whose columns W has.
         motions: The motions, one after the other.
-        bandwidth: [Hz] of the low-pass.
-        slow: (n,) velocities below which rows do not count.
-        progress: Takes the finished share of each pass over the motions.
-        values: (r,) at which rows of free joints are taken, see `undriven`; as they are without.
+        bandwidth: Bandwidth of the low-pass [Hz].
+        slow: (n,) standstill velocities, below which rows are omitted.
+        progress: Called with the finished share of each pass over the motions.
+        values: (r,) parameters at which rows of free joints are evaluated, see `free_joint_rows`.
 
     Attributes:
-        time: (M,) instants that are left [s]; those of a motion after another follow it.
-        forces: (M, n) measured, filtered.
-        offset: (M, n) of these what no parameter changes; known when all blocks have been read.
-        is_moving: (M, n) which rows count.
+        time: (M,) decimated instants of all motions, one after the other [s].
+        forces: (M, n) measured, filtered forces.
+        offset: (M, n) known forces, available when all blocks have been read.
+        is_moving: (M, n) mask of the rows that are used.
         base, bandwidth, slow: See above.
 
     Raises:
-        InputError: The bandwidth leaves nothing, or something is not finite.
+        InputError: The bandwidth is too low, or values are not finite.
     """
 
     def __init__(
@@ -145,12 +146,12 @@ class RegressionEquations:
         self._block_cache: dict[int, Array] = {}
 
     def at_values(self, values: Array) -> "RegressionEquations":
-        """The same with rows of free joints taken at values (r,), see `undriven`."""
+        """Equations with rows of free joints at parameters (r,), see `free_joint_rows`."""
         same = self._model, self.base, self._motions, self.bandwidth, self.slow, self._progress
         return RegressionEquations(*same, values)
 
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
-        """Which of the instants, and W there (L, n, r)."""
+        """Slices of instants, and blocks of W (L, n, r)."""
         numbers = range(len(self._blocks))
         for done, number in enumerate(reversed(numbers) if backwards else numbers):
             W = self._block_cache.get(number)
@@ -166,7 +167,7 @@ class RegressionEquations:
             yield self._blocks[number].instants, W
 
     def _compute_block(self, number: int) -> Array:
-        """W (L, n, r) of a block, filtered; its forces and offset are written down on the way."""
+        """Filtered W (L, n, r) of a block; also stores its forces and offset."""
         block = self._blocks[number]
         part, rows, thinning = block.filtered_motion, block.rows, block.filtered_motion.thinning
         start = max(0, rows.start * thinning - part.filter_reach)
@@ -180,13 +181,13 @@ class RegressionEquations:
         return np.ascontiguousarray(both[here, :, :-1])
 
     def _unfiltered_block(self, number: int, start: int, stop: int) -> Array:
-        """[W, offset] (stop - start, n, r + 1), little by little."""
+        """Matrix [W, offset] (stop - start, n, r + 1), computed in parts."""
         part, next_blocks = (
             self._blocks[number].filtered_motion,
             self._blocks[number + 1 : number + 2],
         )
         motion = part.motion
-        first = None  # sample at which the next block's filter begins
+        first = None  # first sample of the filter of the next block
         if next_blocks and next_blocks[0].filtered_motion is part:
             first = max(0, next_blocks[0].rows.start * part.thinning - part.filter_reach)
         size = _BLOCK_BYTES // (8 * len(self._model.names) * motion.q.shape[1])
@@ -204,7 +205,7 @@ class RegressionEquations:
         return both
 
     def _regressor_and_forces(self, samples: MotionSamples) -> tuple[Array, Array]:
-        """W (N, n, r) and known forces (N, n)."""
+        """Regressor W (N, n, r) and known forces (N, n)."""
         model = self._model
 
         def sides(at: MotionSamples) -> tuple[Array, Array]:
@@ -217,7 +218,7 @@ class RegressionEquations:
         )
 
     def thinned_motions(self) -> list[Motion]:
-        """The motions at the instants that are left, with the filtered forces."""
+        """The motions at the decimated instants, with filtered forces."""
         forces = np.split(
             self.forces, np.cumsum([len(part) for part in self._filtered_motions[:-1]])
         )
@@ -228,48 +229,48 @@ class RegressionEquations:
         return out
 
     def modelled_forces(self, values: Array) -> Array:
-        """W values (M, n) for columns of parameters (r,), or (r, k) at once: (M, n, k)."""
+        """Products of W with parameters (r,): (M, n), or with (r, k): (M, n, k)."""
         out = np.empty((*self.is_moving.shape, *values.shape[1:]))
         for span, W in self.blocks():
             out[span] = W @ values
         return out
 
     def compare(self, values: Array) -> ForceComparison:
-        """Measured and modelled forces, for values (r,)."""
+        """Measured and modelled forces for parameters (r,)."""
         modelled = self.modelled_forces(values) + self.offset
         joints = self._model.machine.active
         return ForceComparison(self.time, self.forces, modelled, self.is_moving, joints)
 
     @cached_property
     def _row_indices(self) -> tuple[np.ndarray, np.ndarray]:
-        """Instant and joint of the rows that count, by time."""
+        """Instants and joints of the used rows, by time."""
         instant, joint = np.nonzero(self.is_moving)
         return instant.astype(np.int32), joint.astype(np.int8)
 
     @property
     def samples(self) -> np.ndarray:
-        """(m,) instant of each row that counts."""
+        """Instants (m,) of the used rows."""
         return self._row_indices[0]
 
     @cached_property
     def groups(self) -> np.ndarray:
-        """(m,) joint of each row that counts, 0, 1, ... without those that have none."""
+        """Groups (m,) of the used rows: joints 0, 1, ... without those that have no rows."""
         there = self.is_moving.any(axis=0)
         return (np.cumsum(there) - 1).astype(np.int8)[self._row_indices[1]]
 
     @cached_property
     def y(self) -> Array:
-        """(m,) forces of the rows that count, less what no parameter changes."""
+        """Forces (m,) of the used rows minus known forces."""
         _ = self.triangular_factors
         return (self.forces - self.offset)[self.is_moving]
 
     @cached_property
     def triangular_factors(self) -> Array:
-        """(g, r + 1, r + 1) triangular factors of [W y] of each joint's rows that count."""
+        """Triangular factors (g, r + 1, r + 1) of [W y] of the used rows of each joint."""
         return self.segment_factors(1)[0]
 
     def segment_factors(self, count: int) -> Array:
-        """The same of so many equal parts of the time, one after the other (count, g, k, k)."""
+        """Triangular factors (count, g, k, k) of equal segments of the time."""
         joints = np.flatnonzero(self.is_moving.any(axis=0))
         out = np.zeros((count, len(joints), self.base.rank + 1, self.base.rank + 1))
         part = np.arange(len(self.time)) * count // len(self.time)
@@ -281,22 +282,49 @@ class RegressionEquations:
                     update_triangular_factor(R, np.column_stack([W[mask, joint], y[mask, joint]]))
         return out
 
+    def estimate(
+        self, T: Array, estimator: Callable[..., Estimate], prior: Prior | None, start: Array
+    ) -> tuple["RegressionEquations", Estimate]:
+        """Estimate theta of the parameters T theta, (r, p).
+
+        With free joints the estimate is iterated until their rows are evaluated at its own values.
+
+        Args:
+            T: (r, p) combinations of the columns.
+            estimator: One of `estimators`.
+            prior: Prior of theta, None without one.
+            start: (r,) parameters at which rows of free joints are evaluated first.
+
+        Returns:
+            The equations of the last iteration, and the estimate.
+        """
+        equations, values, previous = self, start, None
+        has_free_joints = bool(self._model.machine.free)
+        for _ in range(_MAX_ITERATIONS):
+            equations = equations.at_values(values) if has_free_joints else equations
+            W = equations.projected_regressor(T)
+            found = estimator(W, equations.y, equations.groups, equations.samples, prior)
+            if not has_free_joints or previous is not None and _is_converged(found, previous):
+                break
+            values, previous = T @ found.values, found.values
+        return equations, found
+
     def column_selection(self, base: BaseParameters) -> Array:
-        """(r, s) that picks the columns of a narrower base."""
+        """Selection matrix (r, s) of the columns of a subset of the base parameters."""
         return np.eye(self.base.rank)[:, np.searchsorted(self.base.independent, base.independent)]
 
     def projected_regressor(self, T: Array) -> "ProjectedRegressor":
-        """W T, the rows that count, for T (r, p)."""
+        """Regressor W T of the used rows for T (r, p)."""
         return ProjectedRegressor(self, T)
 
 
 def is_long_enough(motion: Motion, bandwidth: float) -> bool:
-    """Whether a low-pass [Hz] leaves anything of a motion."""
+    """Whether a motion is long enough for a low-pass [Hz]."""
     return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
 
 
 def _concatenate_times(times: Sequence[Array]) -> Array:
-    """Instants of motions, each after the one before."""
+    """Instants of motions, shifted to follow each other."""
     out = [times[0]]
     for time in times[1:]:
         out.append(out[-1][-1] + (time - time[0]) + (time[1] - time[0]))
@@ -304,10 +332,10 @@ def _concatenate_times(times: Sequence[Array]) -> Array:
 
 
 class ProjectedRegressor:
-    """Rows of equations that count, their columns combined: a `regressor.Regressor`.
+    """Regressor of the used rows with combined columns: a `regressor.Regressor`.
 
     Args:
-        equations: Whose W (., r).
+        equations: Equations with the regressor W (., r).
         T: (r, p).
 
     Attributes:
@@ -332,3 +360,61 @@ class ProjectedRegressor:
         T = np.zeros((len(self._T) + 1, size + 1))
         T[:-1, :-1], T[-1, -1] = self._T, 1.0
         return np.array([triangular_factor(R @ T) for R in self._equations.triangular_factors])
+
+
+def free_joint_rows(
+    regressor_function: RegressorFunction,
+    samples: MotionSamples,
+    free_joints: np.ndarray,
+    values: Array,
+) -> tuple[Array, Array]:
+    """W (N, n, r) and known forces (N, n) with rows of free joints at parameters b.
+
+    The force of a free joint is known to be zero, and noise is in its motion. The equation 0 = W
+    beta + known determines ratios of parameters only, and least squares would be biased by the
+    noise of the measured accelerations in W. With the accelerations a_f(b) of the free joints f by
+    the model (hybrid dynamics, see `Dynamics.hybrid`) the error is
+
+        e = -(W(a) b + known(a))_f = M_ff(b) (a_f(b) - a_f).
+
+    Gauss-Newton steps with the weights M_ff give rows at the accelerations of the model, without
+    measured noise:
+
+        W_f(a(b)) beta = e + W_f(a(b)) b.
+
+    They do not determine the scale of b, which driven joints, known forces or a prior determine.
+
+    Args:
+        regressor_function: Regressor function of the model.
+        samples: Samples of the motion.
+        free_joints: (f,) indices of the free joints.
+        values: (r,) parameters b.
+    """
+    term_states = dict(samples.term_states)  # states of terms with memory
+    W, known = regressor_function(samples)
+    residual = (W @ values + known)[:, free_joints]
+
+    def free_rows_at(a_a: Array) -> tuple[Array, Array]:
+        W, known = regressor_function(
+            dataclasses.replace(samples, a_a=a_a, term_states=dict(term_states))
+        )
+        return W[:, free_joints], (W @ values + known)[:, free_joints]
+
+    columns = [
+        free_rows_at(samples.a_a + np.eye(samples.a_a.shape[1])[i])[1] - residual
+        for i in free_joints.tolist()
+    ]
+    a_a = samples.a_a.copy()
+    a_a[:, free_joints] -= np.linalg.solve(np.stack(columns, axis=2), residual[:, :, None])[
+        :, :, 0
+    ]
+    W[:, free_joints], _ = free_rows_at(a_a)
+    known[:, free_joints] = residual - W[:, free_joints] @ values
+    return W, known
+
+
+def _is_converged(estimate: Estimate, previous: Array) -> bool:
+    """Whether an estimate differs from previous values (p,) by a small part of its std."""
+    tolerance = _CONVERGENCE_TOLERANCE * estimate.std
+    step = np.abs(estimate.values - previous)
+    return bool((step <= tolerance + _ROUNDING_TOLERANCE * np.abs(previous).max()).all())

@@ -1,4 +1,4 @@
-"""From a recording to a motion: what is wrong with it is told, derivatives are found."""
+"""Motions from recordings: checked samples, derivatives, and recorded loads."""
 
 import math
 import warnings
@@ -7,8 +7,9 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, RecordingError, suggest_names
 from crane.common.samples import Array
+from crane.description.external_forces import WRENCH_COMPONENTS
+from crane.dynamics import Dynamics
 from crane.identification.mechanics.force_delays import motion_frequency
-from crane.identification.mechanics.recorded_loads import recorded_load_forces
 from crane.identification.mechanics.recording_checks import (
     check_recording,
     check_samples,
@@ -17,26 +18,23 @@ from crane.identification.mechanics.recording_checks import (
     warn_hum,
 )
 from crane.identification.mechanics.regression_equations import Progress
-from crane.identification.signals.outliers import outlier_mask, replace_outliers
 from crane.identification.signals.signal_processing import (
     Derivatives,
     Motion,
     differentiate,
     resample_evenly,
 )
+from crane.identification.signals.signal_quality import outlier_mask, replace_outliers
 from crane.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
-from crane.recordings.recording import (
-    FORCE_SUFFIX,
-    VELOCITY_SUFFIX,
-    VELOCITY_UNITS,
-    Recording,
-    time_derivative,
-)
+from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
+from crane.recordings.recording_columns import time_derivative
 
-_MOTION_FACTOR = 3.0  # standard deviations of a joint's velocity, above which it moves
-_MAX_SPEED_FACTOR = 30.0  # times its limit, at which no joint moves
-_HUM_FACTOR = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
+_MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
+# times the velocity limit of a joint, above which a recording is rejected
+_MAX_SPEED_FACTOR = 30.0
+_HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
+_LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
 
 
 def smoothed_motion(
@@ -47,22 +45,21 @@ def smoothed_motion(
     trust: bool = False,
     progress: Progress | None = None,
 ) -> Motion:
-    """Velocities and accelerations of a recording, which is checked first.
+    """Motion of a recording, with checks, velocities and accelerations.
 
-    Outliers are bridged by lines between their neighbours, before anything is filtered. Forces
-    are those of the joints and of recorded loads together.
+    Outliers are replaced by linear interpolation before filtering. Forces are the sum of joint
+    forces and recorded loads.
 
     Args:
-        machine: What was recorded.
-        recording: With all active joints of the machine.
-        derivatives: "kalman" or "lowpass", see `signals.differentiate`.
-        cutoff: [Hz] of "lowpass".
-        trust: Whether what is most likely wrong with the recording is only told, and outliers
-            are left in.
-        progress: Takes the finished share.
+        machine: The recorded machine.
+        recording: Recording with all active joints of the machine.
+        derivatives: Method "kalman" or "lowpass", see `differentiate`.
+        cutoff: Cutoff of "lowpass" [Hz].
+        trust: Whether to warn only of what is probably wrong, and keep outliers.
+        progress: Called with the finished share, 0 to 1.
 
     Raises:
-        RecordingError: What is recorded cannot serve; the message names column and time.
+        RecordingError: The recording is not suitable; the message names column and time.
     """
     original, recording = recording, _select_active_joints(machine, recording)
     locked_columns = {
@@ -90,12 +87,12 @@ def smoothed_motion(
 
 
 def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
-    """Of a recording what belongs to the machine's active joints, in their order.
+    """Select the active joints of a machine from a recording, in their order.
 
-    Free joints may be among the channels: their force is known to be zero.
+    Free joints may be among the channels; their forces are zero.
 
     Raises:
-        RecordingError: One is missing, or in another unit, or a free one has a force.
+        RecordingError: A joint is missing or has another unit, or a free joint has a force.
     """
     recorded_columns, units = recording.columns(), recording.units | recording.channel_units
     available = {*recording.joints, *(x for x in machine.free if x in recorded_columns)}
@@ -104,9 +101,8 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
         listed = ", ".join(f"'{joint}'" for joint in missing)
         held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
         raise RecordingError(
-            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}; "
-            f"lock what was "
-            f"held ({held})"
+            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}; lock "
+            f"what was held ({held})"
         )
     for joint in machine.active:
         if units[joint] != machine.unit(joint):
@@ -130,10 +126,10 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
 
 
 def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
-    """Refuse coordinates and forces (N, 2 n), and velocities (N, n) as recorded, by `check`."""
+    """Check coordinates and forces (N, 2 n) and recorded velocities (N, n)."""
     q, tau = np.split(columns, 2, axis=1)
     recorded = None
-    if np.any(v):  # only compared; where none were recorded, derivatives of outliers
+    if np.any(v):  # for comparison only, without outliers
         recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in v.T])
     limits = np.column_stack([machine.lower, machine.upper])
     bounded = limits if np.isfinite(limits).all() else None
@@ -143,7 +139,7 @@ def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trus
 
 
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
-    """Doubt velocities (N, n) that the machine's joints are far from having."""
+    """Reject velocities (N, n) far above the velocity limits."""
     limits = machine.model.velocityLimit[machine.closure.active]
     for joint, speed, limit in zip(
         machine.active, np.sqrt(np.mean(v**2, axis=0)), limits, strict=True
@@ -158,14 +154,14 @@ def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
 
 
 def _lowest_passband(found: Derivatives) -> float:
-    """Least of the frequencies [Hz] of which half is left, of the joints that move."""
+    """Lowest passband [Hz] of the moving joints."""
     if found.passband is None:
         return math.inf
     return float(found.passband[_is_moving(found)].min(initial=math.inf))
 
 
 def _is_moving(found: Derivatives) -> np.ndarray:
-    """Which joints (n,) move by more than what is uncertain of their velocities."""
+    """Mask (n,) of joints that move by more than the uncertainty of their velocities."""
     if found.std_v is None:
         return np.ones(found.v.shape[1], dtype=bool)
     uncertain = np.sqrt(np.mean(found.std_v**2, axis=0))
@@ -173,11 +169,66 @@ def _is_moving(found: Derivatives) -> np.ndarray:
 
 
 def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
-    """Warn of joints that tremble, but do not move: friction at rest makes any force."""
+    """Warn of joints that have noise, but no motion: static friction makes any force."""
     for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
         text = (
-            f"'{joint}' stands still but for noise: its forces tell nothing, move it, or lock it "
-            f"({joint}={place:.4g})"
+            f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
+            f"lock it ({joint}={place:.4g})"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:
+    """Forces of recorded loads at the active joints, so that W beta = tau + forces.
+
+    Columns `load_NAME_force_x` to `load_NAME_moment_z` are a wrench in the world frame at the
+    frame of the machine's load NAME, or at the link NAME; missing components are zero.
+
+    Args:
+        machine: The recorded machine.
+        recording: Recording of N samples.
+        q_a: (N, n) [m], [rad].
+        trust: See `smoothed_motion`.
+
+    Returns:
+        (N, n) [N], [N m].
+
+    Raises:
+        RecordingError: A load acts on an unknown link, or a load of the machine is not recorded.
+    """
+    frames = {force.name: force.frame for force in machine.external_forces}
+    wrenches: dict[str, Array] = {}
+    for column, values in recording.channels.items():
+        part = next(
+            (x for x in WRENCH_COMPONENTS if column == f"{_LOAD_PREFIX}{_load_name(column)}_{x}"),
+            None,
+        )
+        if part is None:
+            continue
+        name, unit = _load_name(column), recording.channel_units[column]
+        if unit != _PART_UNITS[part[:-2]]:
+            raise RecordingError(
+                f"'{column}' is recorded in {unit}, give {_PART_UNITS[part[:-2]]}"
+            )
+        if name not in frames and name not in machine.tree.links:
+            links = suggest_names(machine.tree.links, name)
+            raise RecordingError(f"'{column}' acts on no link of '{machine.name}', {links}")
+        rows = wrenches.setdefault(name, np.zeros((len(values), len(WRENCH_COMPONENTS))))
+        rows[:, WRENCH_COMPONENTS.index(part)] = values
+    for name in frames:
+        if name not in wrenches:
+            reject_unless_trusted(
+                f"'{machine.name}' has the load '{name}', and no column contains it: add "
+                f"{_LOAD_PREFIX}{name}_force_x and so on, or take a machine without it",
+                trust,
+            )
+    dynamics, total = Dynamics(machine), np.zeros_like(q_a)
+    for name, rows in wrenches.items():
+        total += dynamics.project_wrenches(q_a, {frames.get(name, name): rows})
+    return total
+
+
+def _load_name(column: str) -> str:
+    """Name of the load of a column."""
+    return column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)[0]

@@ -1,4 +1,4 @@
-"""An identified machine as files: its URDFs and its machine file with other numbers."""
+"""Writing of identified machines: machine file and URDF files with identified parameters."""
 
 import dataclasses
 import shutil
@@ -23,57 +23,59 @@ from crane.formats.machine_file.machine_writer import friction_data
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.coupled_motors import joint_combinations, motor_chain
-from crane.identification.mechanics.friction_laws import (
-    FrictionLawFit,
-    FrictionTerm,
-    friction_laws,
-)
+from crane.identification.mechanics.force_terms import FrictionTerm
 from crane.identification.mechanics.identification_result import Identification
-from crane.identification.mechanics.inertial_terms import BODY_PARAMETERS
-from crane.identification.mechanics.locked_body_division import divide_locked_bodies
-from crane.identification.mechanics.urdf_inertials import replace_inertials
+from crane.identification.mechanics.identified_description import (
+    FrictionLawFit,
+    divide_locked_bodies,
+    friction_laws,
+    joint_combinations,
+    motor_chain,
+    replace_inertials,
+)
+from crane.identification.mechanics.model_term import BODY_PARAMETERS
 from crane.machine import Machine
 
-_FORCE_TOLERANCE = 1e-9  # of the largest force, by which the written machine may differ
+_FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
 _FRICTION_PARAMETERS = tuple(item.name for item in dataclasses.fields(Friction))
 
 
 def write_identified(identification: Identification, folder: str | Path) -> Path:
-    """Write the identified machine: a machine file with a URDF per sub-chain beside it.
+    """Write an identified machine as a machine file with a URDF file per sub-chain.
 
-    `crane.load` gives it from there, with what was locked as all else:
+    `crane.load` reads it, with unlocked joints unless they are locked again:
     `crane.load(crane.write_identified(identification, "identified"),
-    lock=identification.described.locks)`.
+    lock=identification.described_machine.locked_joints)`.
 
-    Each body's parameters stand in the link that its joint moves, and the inertials of links
-    fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified
-    ones, other passive forces the machine's. Friction that a machine file has no law for is
-    written as the nearest law at steady speeds, with a warning that says how near. A motor
-    that turns with several joints becomes a rotor that a coupling turns. What locked joints
-    made one body is divided among its links as they are described. Everything else is as in
-    the files that the machine was read from; what they draw is found where it is. The written
-    files are loaded, and compared where the machine was locked, before they are put in place.
+    The parameters of a body are written to the link that its joint moves; inertials of links fixed
+    to it are removed. Friction, rotor inertias and gas pressures are the identified ones, other
+    passive forces those of the machine. Friction without a law in machine files is written as the
+    nearest law at steady speeds, with a warning about the difference. A motor that turns several
+    joints becomes a rotor with a coupling. Bodies of locked joints are divided among their links
+    by the descriptions. Everything else is copied from the files of the machine; meshes are
+    referred to by their paths. The written files are loaded and compared with the identification
+    before they replace existing ones.
 
     Args:
-        identification: With all parameters, so of a prior or of a feasible estimate.
-        folder: Created where there is none; files of the same names are replaced.
+        identification: Identification of all parameters, with a prior or feasibility constraints.
+        folder: Target folder; it is created if necessary, and files of the same names are
+            replaced.
 
     Returns:
         The machine file.
 
     Raises:
-        InputError: The identified machine cannot be, forces alone determined no more than base
-            parameters, the machine comes from another format or is not as its files describe
-            it, or a machine file cannot hold the model's terms.
-        OutputError: The folder cannot be written, or holds what the machine was read from.
+        InputError: The identified machine is not valid, only base parameters are known, the
+            machine has another format or parameter changes, or a machine file cannot represent the
+            terms of the model.
+        OutputError: The folder cannot be written, or contains the files of the machine.
     """
     machine, parameters = identification.described_machine, identification.parameters
     check_rewritable(machine)
     if parameters is None or not identification.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
+        warnings.simplefilter("ignore", CraneWarning)  # reported when the machine was loaded
         spec = read_machine_spec(machine.path)
         unlocked_machine = load(machine.path) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
@@ -118,10 +120,10 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
 
 
 def check_rewritable(machine: Machine) -> None:
-    """See that the files of a machine can be written again with other numbers in them.
+    """Check that the files of a machine can be written with other parameters.
 
     Raises:
-        InputError: They cannot.
+        InputError: The format is not supported, or the machine has parameter changes.
     """
     urdf = machine.path.suffix.lower() == ".urdf"
     if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
@@ -133,13 +135,13 @@ def check_rewritable(machine: Machine) -> None:
         )
     if machine.parameter_changes:
         raise InputError(
-            f"'{machine.name}' was loaded with changed numbers, identify it as its files "
+            f"'{machine.name}' was loaded with parameter changes, identify it as its files "
             "describe it"
         )
 
 
 def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
-    """The first of the bodies that cannot exist, and why."""
+    """Text about the first infeasible body, None if all are feasible."""
     for link, body in bodies.items():
         if body[0] < 0:
             return f"link '{link}' has the negative mass {body[0]:.4g} kg"
@@ -150,7 +152,7 @@ def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
 
 
 def _file_names(spec: MachineSpec) -> dict[str, str]:
-    """File of each chain: the name it has, with a number where two are alike."""
+    """File name of each chain; a number distinguishes equal names."""
     taken: dict[str, str] = {}
     for number, chain in enumerate(_written_chains(spec)):
         name = chain.urdf.name
@@ -159,7 +161,7 @@ def _file_names(spec: MachineSpec) -> dict[str, str]:
 
 
 def _written_chains(spec: MachineSpec) -> tuple[Chain, ...]:
-    """The chains, and the payload that the machine file names."""
+    """The chains, with that of the payload of the machine file."""
     return spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
 
 
@@ -183,7 +185,7 @@ def _machine_file_content(
     origin_text: str,
     law_fits: Mapping[str, FrictionLawFit],
 ) -> tuple[str, dict[str, str]]:
-    """The machine file, and the URDFs of motors that turn with several joints, by name."""
+    """Content of the machine file, and of URDF files of motors that turn several joints."""
     machine = result.described_machine
     data: dict[str, Any]
     if machine.path.suffix.lower() == ".urdf":
@@ -216,7 +218,7 @@ def _machine_file_content(
     moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
 
     def elements_of(kind: str) -> list[Any]:
-        """The machine's elements of a kind, and those that its locks took."""
+        """Elements of a kind, including those that locked joints removed."""
         kept = getattr(moving, kind)
         return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
 
@@ -238,7 +240,7 @@ def _machine_file_content(
 
 
 def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[KeyPath, str]:
-    """How well friction and rotor inertias are known that the recording tells by themselves."""
+    """Comments on the uncertainty of friction and rotor inertias that are base parameters."""
     found: dict[KeyPath, str] = {}
     half = 0.5 * np.diff(result.interval(), axis=1)[:, 0]
     for i, (name, group) in enumerate(zip(result.names, result.base.groups, strict=True)):
@@ -256,7 +258,7 @@ def _uncertainty_notes(result: Identification, data: Mapping[str, Any]) -> dict[
 
 
 def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
-    """Identified parameters of a kind by what they are of."""
+    """Identified parameters of a kind by element."""
     assert result.parameters is not None
     named = zip(result.model.names, result.parameters.tolist(), strict=True)
     return {
@@ -265,7 +267,7 @@ def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
 
 
 def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, float]:
-    """Rotor inertia by joint, the described one where none was identified."""
+    """Rotor inertias by joint, identified or described."""
     described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
     found = described | _parameters_of_kind(result, "rotor_inertia")
     for joint, value in found.items():
@@ -277,7 +279,7 @@ def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, floa
 def _friction_data(
     result: Identification, spec: MachineSpec, law_fits: Mapping[str, FrictionLawFit]
 ) -> dict[str, dict[str, Any]]:
-    """Friction by joint; one that the model gives none has none, whatever its files say."""
+    """Friction by joint; joints without friction in the model have none."""
     machine = result.described_machine
     friction = {
         joint: friction_data(law)
@@ -293,7 +295,7 @@ def _friction_data(
 
 
 def _warn_inexact_friction(machine: Machine, law_fits: Mapping[str, FrictionLawFit]) -> None:
-    """Warn of friction that is not written as it was identified."""
+    """Warn of friction that is replaced by the nearest law."""
     deviations = {
         name: each.max_deviation for name, each in law_fits.items() if each.max_deviation
     }
@@ -301,16 +303,15 @@ def _warn_inexact_friction(machine: Machine, law_fits: Mapping[str, FrictionLawF
         worst = max(deviations, key=lambda name: deviations[name])
         unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
         text = (
-            f"a machine file has no place for all of the friction of {', '.join(deviations)}: the "
-            f"nearest law at steady speeds is written, off by at most {deviations[worst]:.3g} "
-            f"{unit} "
-            f"({worst})"
+            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
+            "the nearest law at steady speeds is written, off by at most "
+            f"{deviations[worst]:.3g} {unit} ({worst})"
         )
         warnings.warn(text, CraneWarning, stacklevel=4)
 
 
 def _non_default_fields(element: Any, **changed: Any) -> dict[str, Any]:
-    """What of a dataclass is not as by default."""
+    """Fields of a dataclass that differ from their defaults."""
     values = {
         field.name: changed.get(field.name, getattr(element, field.name))
         for field in dataclasses.fields(element)
@@ -323,23 +324,23 @@ def _non_default_fields(element: Any, **changed: Any) -> dict[str, Any]:
 def _check_written_machine(
     result: Identification, bodies: Mapping[str, Array], file: Path, exact: bool
 ) -> None:
-    """Load what was written and compare its forces with those of the parameters.
+    """Load the written machine and compare its forces with those of the identification.
 
     Args:
-        result: See above.
+        result: The identification.
         bodies: Parameters (10,) by link.
         file: The machine file.
-        exact: Whether friction is the identified one; where it is not, all else is compared.
+        exact: Whether friction is exact; otherwise it is excluded from the comparison.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
             written = load(file, lock=dict(result.described_machine.locked_joints))
     except CraneError as error:
-        # a body is no slip in a file, which is not there yet: not to be corrected by hand
+        # an infeasible body is no error of the file that a user could correct
         body = None if result.feasible else _infeasible_body(bodies)
         why = f"{body}, give feasible=True" if body else error
-        raise InputError(f"the identified machine cannot be: {why}") from None
+        raise InputError(f"the identified machine is not valid: {why}") from None
     model, parameters = result.model, result.parameters
     assert parameters is not None
     at = random_samples(model, 20)

@@ -1,1 +1,1 @@
-"""What a recording tells of motion and force: filters, derivatives, outliers, hum."""
+"""Signal processing of recordings: filters, derivatives, outliers, spectral lines."""

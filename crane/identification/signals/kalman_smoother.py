@@ -1,4 +1,4 @@
-"""Position, velocity and acceleration of a noisy signal: the Kalman smoother."""
+"""Kalman smoother: position, velocity and acceleration of a noisy coordinate."""
 
 import math
 
@@ -6,33 +6,32 @@ import numpy as np
 
 from crane.common.samples import Array, solve_linear
 
-_SEARCH_BOUNDS = (8.0, 10.0)  # of h N and h in the search for the smoother's noise ratio
-_BLOCK_SAMPLES = 1 << 16  # samples whose complex modes are held
+_SEARCH_BOUNDS = (8.0, 10.0)  # of h N and of h in the search for the noise ratio
+_BLOCK_SAMPLES = 1 << 16  # samples per block of complex modes
 
 
 def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
     """Rauch-Tung-Striebel smoother of the constant-jerk model with an unknown initial state.
 
-    The state x = (p, p', p'', p''') follows p'''' = white noise of intensity s, measured is
-    y_k = p_k + noise of standard deviation sigma. Time in units of 1/w, w^8 = s / (sigma^2 dt),
-    and p in units of sigma leave one number, h = w dt:
+    The state x = (p, p', p'', p''') follows p'''' = white noise of intensity s; the measurement is
+    y_k = p_k + noise of standard deviation sigma. With time in units of 1/w, w^8 = s / (sigma^2
+    dt), and p in units of sigma, one parameter remains, h = w dt:
 
         z_k+1 = F z_k + noise,   F = exp(h N),   Q = h integral_0^h e^(Nt) b b^T e^(N^T t) dt
 
-    Far from the ends this is the zero-phase filter 1 / (1 + (omega/w)^8), and the smoothing
-    spline of degree seven: h / (2 pi dt) is the frequency in Hz at which half of a movement
-    passes.
+    Far from the ends this is the zero-phase filter 1 / (1 + (omega/w)^8), and the smoothing spline
+    of degree seven: h / (2 pi dt) is the frequency in Hz at which half of the amplitude passes.
 
-    Were z_0 distributed as N(mu, P) with the stationary covariance P of the predictions, all
-    gains were constant. Its innovations are e(mu) = e(0) - U mu, U_k = H Phi^k. As the integral
-    of p(y | mu) over mu is that of p(y | z_0) over z_0, taking mu as an unknown constant gives
-    the filter with unknown z_0 exactly: mu is the least-squares solution of U mu = e(0), the
-    likelihood with sigma at its maximum is
+    If z_0 had the distribution N(mu, P) with the stationary covariance P of the predictions, all
+    gains would be constant. The innovations are e(mu) = e(0) - U mu, U_k = H Phi^k. As the
+    integral of p(y | mu) over mu equals that of p(y | z_0) over z_0, mu as an unknown constant
+    gives the filter for unknown z_0 exactly: mu is the least-squares solution of U mu = e(0), and
+    the likelihood with sigma at its maximum is
 
         -2 log L = (N - 4) log |e(mu)|^2 + log det U^T U - 12 log h
 
-    (the last term turns mu to physical units; minimised over h), and the smoothed covariance is
-    the one for known mu plus G_k cov(mu) G_k^T, G_k the smoothed answer to mu.
+    (the last term converts mu to physical units), minimized over h. The smoothed covariance is
+    that for known mu plus G_k cov(mu) G_k^T with the smoothed response G_k to mu.
 
     Args:
         y: Measured coordinate (N,).
@@ -40,7 +39,7 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
 
     Returns:
         Position, velocity and acceleration (N, 3), their standard deviations (N, 3), sigma, and
-        the frequency at which half passes [Hz].
+        the frequency at which half of the amplitude passes [Hz].
 
     Source: Rauch, Tung, Striebel 1965; de Jong 1991 (unknown initial states).
     """
@@ -64,15 +63,15 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
     F, P, K = _stationary_filter(h)
     update = np.eye(4)
     update[:, 0] -= K
-    filtered = _linear_recursion(F @ update, F @ K[:, None], y[:-1, None], mu)  # predicted, so far
+    filtered = _linear_recursion(F @ update, F @ K[:, None], y[:-1, None], mu)  # predictions first
     innovations = y - filtered[:, 0]
     for column, gain in zip(filtered.T, K, strict=True):
         column += gain * innovations
     C = solve_linear(P, F @ update @ P).T  # P_filtered F^T P^-1
     states = _backward_recursion(C, F, filtered)[:, :3]
-    del filtered, innovations  # an hour at 1 kHz is some 100 MB here
+    del filtered, innovations  # saves some 100 MB for an hour at 1 kHz
 
-    # Away from the ends the covariance is stationary; there, add what the end and mu do.
+    # The covariance is stationary in the interior; the end and mu change it near the ends.
     end = update @ P
     interior = _solve_stein(C, end - C @ P @ C.T)
     reach = _decay_length(np.linalg.eigvals(C), len(y))
@@ -96,8 +95,8 @@ def kalman_smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
 def _stationary_filter(h: float) -> tuple[Array, Array, Array]:
     """F, stationary covariance of the predictions P (4, 4), and filter gain K (4,).
 
-    P = F P (1 + H^T H P)^-1 F^T + Q by doubling, from which on it takes 2^i steps at once (Chu,
-    Fan, Lin, Wang 2004). The general solver of scipy takes as long as all the rest.
+    P = F P (1 + H^T H P)^-1 F^T + Q is solved by doubling (Chu, Fan, Lin, Wang 2004). The general
+    solver of scipy takes as long as the rest of the smoother.
     """
     i, j = np.indices((4, 4))
     factorial = np.array([1.0, 1.0, 2.0, 6.0])
@@ -115,9 +114,9 @@ def _stationary_filter(h: float) -> tuple[Array, Array, Array]:
 
 
 def likelihood(y: Array, h: float) -> tuple[float, Array, Array, float]:
-    """-2 log L, mu (4,), cov(mu) / sigma^2 (4, 4) and sigma^2, as derived at `_smooth`.
+    """-2 log L, mu (4,), cov(mu) / sigma^2 (4, 4) and sigma^2, see `kalman_smooth`.
 
-    From y to e(0) the filter is (1 - 1/z)^4 / det(1 - Phi/z).
+    The filter from y to e(0) is (1 - 1/z)^4 / det(1 - Phi/z).
     """
     from scipy.signal import sosfilt, zpk2sos
 
@@ -142,23 +141,23 @@ def likelihood(y: Array, h: float) -> tuple[float, Array, Array, float]:
 
 
 def _decay_length(values: np.ndarray, count: int) -> int:
-    """Samples, at most `count`, until modes of these eigenvalues have decayed by e^-40."""
+    """Samples, at most `count`, after which modes of these eigenvalues have decayed by e^-40."""
     return min(count, math.ceil(-40 / math.log(np.abs(values).max())))
 
 
 def _eigenvalue_powers(values: np.ndarray, k: np.ndarray) -> Array:
-    """values^k (N, n) for powers k (N,)."""
+    """Powers values^k (N, n) for k (N,)."""
     return np.exp(k[:, None] * np.log(values.astype(complex)))
 
 
 def _matrix_powers(A: Array, count: int) -> Array:
-    """A^0, ..., A^(count - 1), (count, n, n)."""
+    """Powers A^0, ..., A^(count - 1) as (count, n, n)."""
     values, V = np.linalg.eig(A)
     return np.real((V * _eigenvalue_powers(values, np.arange(count))[:, None]) @ np.linalg.inv(V))
 
 
 def _linear_recursion(A: Array, B: Array, u: Array, start: Array) -> Array:
-    """x_0 = start, x_k+1 = A x_k + B u_k as (N + 1, n) from u (N, m), mode by mode."""
+    """Solution (N + 1, n) of x_k+1 = A x_k + B u_k, x_0 = start, for u (N, m), mode by mode."""
     from scipy.signal import lfilter
 
     values, V = np.linalg.eig(A)
@@ -175,7 +174,7 @@ def _linear_recursion(A: Array, B: Array, u: Array, start: Array) -> Array:
 
 
 def _backward_recursion(C: Array, F: Array, filtered: Array) -> Array:
-    """x_k = filtered_k + C (x_k+1 - F filtered_k), from the last sample to the first."""
+    """Backward recursion x_k = filtered_k + C (x_k+1 - F filtered_k)."""
     return _linear_recursion(C, np.eye(4) - C @ F, filtered[-2::-1], filtered[-1])[::-1]
 
 

@@ -1,4 +1,4 @@
-"""From recorded samples to velocities, accelerations and thinned equations."""
+"""Derivatives, filters, resampling and decimation of recorded signals."""
 
 import math
 from collections.abc import Callable
@@ -17,15 +17,14 @@ _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
 _MAX_JITTER = 0.01  # steps
 _STEP_TOLERANCE = 1e-3  # steps, by which one may differ from the others
-_WINDOW_COEFFICIENTS = np.array(
-    [0.35875, 0.48829, 0.14128, 0.01168]
-)  # Blackman and Harris, about its middle
+# Blackman and Harris, about its middle
+_WINDOW_COEFFICIENTS = np.array([0.35875, 0.48829, 0.14128, 0.01168])
 _WINDOW_LENGTH = 1.3332  # over 1 / cutoff
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motion(OneLineRepr):
-    """What an identification starts from: N samples of n active joints.
+    """Motion and forces of n active joints at N samples.
 
     Attributes:
         time: Instants (N,) [s].
@@ -33,8 +32,8 @@ class Motion(OneLineRepr):
         v: Velocities (N, n) [rad/s or m/s].
         a: Accelerations (N, n) [rad/s2 or m/s2].
         tau: Generalized forces (N, n) [N m or N].
-        passband: Frequency [Hz] above which what the joints did is lost in smoothing, so that v
-            and a hold less than half of it; infinite where nothing was smoothed.
+        passband: Frequency [Hz] at which smoothing passes half of the motion; infinite without
+            smoothing.
     """
 
     time: Array
@@ -53,10 +52,10 @@ class Derivatives(OneLineRepr):
         q: Coordinates [rad or m].
         v: Velocities [rad/s or m/s].
         a: Accelerations [rad/s2 or m/s2].
-        std_v: Standard deviation of the velocities, None where the method knows none.
-        std_a: Standard deviation of the accelerations, likewise.
-        noise: Estimated standard deviation (n,) of the measured coordinates, likewise.
-        passband: Frequencies (n,) of which half is left [Hz]; infinite of a joint at rest.
+        std_v: Standard deviations of the velocities, None if the method gives none.
+        std_a: Standard deviations of the accelerations, None likewise.
+        noise: Estimated standard deviations (n,) of the measured coordinates, None likewise.
+        passband: Frequencies (n,) at which half passes [Hz]; infinite for a joint at rest.
     """
 
     q: Array
@@ -80,13 +79,13 @@ def differentiate(
     Args:
         time: Equidistant instants (N,) [s].
         q: Measured coordinates (N, n) [rad or m].
-        method: "kalman" smooths each joint, see `smoother.smooth`; "lowpass" takes central
-            differences, twice for the acceleration, of what `low_pass` lets through.
+        method: "kalman" smooths each joint, see `kalman_smooth`; "lowpass" takes central
+            differences, twice for the acceleration, of coordinates filtered by `low_pass`.
         cutoff: [Hz] of "lowpass".
-        progress: Takes the finished share of "kalman".
+        progress: Called with the finished share of "kalman".
 
     Raises:
-        InputError: An unknown method, or a cutoff too much or too little.
+        InputError: The method is unknown, or the cutoff is missing or superfluous.
         RecordingError: Samples are not equidistant, or too few.
     """
     step = sampling_step(time)
@@ -115,7 +114,7 @@ def sampling_step(time: Array) -> float:
     """Step [s] of equidistant instants (N,).
 
     Raises:
-        RecordingError: They are not equidistant, or fewer than 50.
+        RecordingError: The instants are not equidistant, or fewer than 50.
     """
     if len(time) < _MIN_SAMPLES:
         raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
@@ -131,12 +130,12 @@ def sampling_step(time: Array) -> float:
 
 
 def resample(time: Array, columns: Array, step: float) -> tuple[Array, Array]:
-    """Instants every `step` [s] and the columns (N, ...) there, by a cubic spline.
+    """Resample columns (N, ...) at instants every `step` [s] by a cubic spline.
 
-    The step should not exceed the recorded one: nothing is filtered out before.
+    The step should not exceed the recorded one, as there is no anti-aliasing filter.
 
     Raises:
-        RecordingError: Between two samples lie more than five times the usual.
+        RecordingError: There is a gap of more than five median steps.
     """
     from scipy.interpolate import CubicSpline
 
@@ -148,7 +147,7 @@ def resample(time: Array, columns: Array, step: float) -> tuple[Array, Array]:
 
 
 def resample_evenly(time: Array, columns: Array) -> tuple[Array, Array]:
-    """Equidistant instants and the columns (N, ...) there: resampled if they are not already."""
+    """Resample columns (N, ...) at equidistant instants, if they are not equidistant already."""
     steps = np.diff(time)
     step = float(np.median(steps))
     if np.abs(steps - step).max() <= _STEP_TOLERANCE * step:
@@ -157,10 +156,10 @@ def resample_evenly(time: Array, columns: Array) -> tuple[Array, Array]:
 
 
 def check_gaps(time: Array) -> None:
-    """Refuse instants (N,) with a gap of several usual steps.
+    """Reject instants (N,) with a gap of several median steps.
 
     Raises:
-        RecordingError: There is one; the message says when.
+        RecordingError: There is a gap; the message gives its time.
     """
     steps = np.diff(time)
     usual = float(np.median(steps))
@@ -189,12 +188,12 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
 
 
 def filter_kernel(step: float, cutoff: float) -> Array:
-    """Weights (2 n + 1,) of a low-pass that sees nothing beyond n samples, for `filter_rows`.
+    """Weights (2 n + 1,) of the finite low-pass of `filter_rows`.
 
         w(t) = sum_k c_k cos(2 pi k t / T), |t| < T / 2,   T = 1.3332 / cutoff
 
-    The 4-term window of Blackman and Harris as an impulse response. Its gain is 1/2 at the cutoff
-    and below 3e-5 from three times the cutoff on; no weight is negative.
+    The impulse response is the 4-term window of Blackman and Harris. Its gain is 1/2 at the cutoff
+    and below 3e-5 above three times the cutoff; no weight is negative.
 
     Source: Harris 1978, On the use of windows for harmonic analysis, Proc. IEEE 66(1).
     """
@@ -206,25 +205,25 @@ def filter_kernel(step: float, cutoff: float) -> Array:
 
 
 def central_differences(time: Array, x: Array) -> Array:
-    """(x_k+1 - x_k-1) / (2 dt) of x (N, ...), at the ends one-sided of second order."""
+    """Central differences (x_k+1 - x_k-1) / (2 dt) of x (N, ...); one-sided at the ends."""
     return np.gradient(x, sampling_step(time), axis=0, edge_order=2)
 
 
 def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array, Array]:
-    """Mean over the whole periods of a recording; an incomplete last one is left out.
+    """Mean over the complete periods of a recording.
 
     Args:
         time: Equidistant instants (N,) [s].
         x: Columns (N, ...).
-        period: [s], a multiple of the step.
+        period: Period [s], a multiple of the step.
 
     Returns:
         Instants (M,) of the first period, mean (M, ...), and its standard error (M, ...), the
-        scatter between the K periods over sqrt(K).
+        standard deviation between the K periods over sqrt(K).
 
     Raises:
-        RecordingError: Fewer than two periods, or no multiple of the step.
-        InputError: The period is no number above zero.
+        RecordingError: There are fewer than two periods, or the period is no multiple of the step.
+        InputError: The period is not positive.
     """
     step, period = sampling_step(time), as_number(period, "the period", "s", greater_than=0)
     count = round(period / step)
@@ -246,29 +245,28 @@ def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array,
 def filter_rows(
     regressor: Array, forces: Array, step: float, cutoff: float, decimation: int
 ) -> tuple[Array, Array]:
-    """Both sides of forces = regressor parameters through one filter, then every n-th sample.
+    """Filter and decimate both sides of forces = regressor parameters.
 
-    The filter is `filter_kernel`: linear, so the parameters stay what they are, and of finite
-    length, so that rows which cannot be explained, as near standstill, spoil those within it and
-    no others. A recursive filter's ringing carries the jump of friction at a reversal, which no
-    smoothed velocity tells to the millisecond, into every row. At the ends the weights that
-    remain are scaled to a sum of one.
+    The filter is `filter_kernel`. It is linear, so the parameters do not change, and of finite
+    length, so that rows that the model cannot explain, such as those near standstill, affect only
+    rows within the kernel. A recursive filter would spread the jump of friction at a reversal over
+    all rows. At the ends the remaining weights are scaled to a sum of one.
 
-    The cutoff may be at most a quarter of the new sampling frequency; what decimation folds to
-    below the cutoff then comes from above three times the cutoff.
+    The cutoff may be at most a quarter of the new sampling frequency; aliases below the cutoff
+    then come from above three times the cutoff.
 
     Args:
         regressor: (N, n, p).
         forces: (N, n).
         step: [s].
         cutoff: [Hz].
-        decimation: One of so many samples is kept, the first of all among them.
+        decimation: Decimation factor; the first sample is kept.
 
     Returns:
         Regressor (M, n, p) and forces (M, n).
 
     Raises:
-        InputError: Something is not finite, or the cutoff too high.
+        InputError: Values are not finite, or the cutoff is too high.
     """
     for name, array in (("regressor", regressor), ("forces", forces)):
         if not np.isfinite(array).all():
@@ -280,7 +278,7 @@ def filter_rows(
             f"cutoff is {cutoff:g} Hz, give at most {highest:g} Hz for every {decimation}th sample"
         )
     weights = filter_kernel(step, cutoff)
-    thinned = np.stack(  # joint by joint, to hold no second whole regressor
+    thinned = np.stack(  # joint by joint, to save memory
         [_weighted_means(regressor[:, i], weights, decimation) for i in range(forces.shape[1])],
         axis=1,
     )
@@ -288,11 +286,11 @@ def filter_rows(
 
 
 def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
-    """Means of x (N, ...) about every n-th sample, with these weights."""
+    """Weighted means of x (N, ...) about every n-th sample."""
     from scipy.signal import upfirdn
 
     reach, count = len(weights) // 2, len(x)
-    lead = -reach % decimation  # so that the kept samples of the convolution begin at the first
+    lead = -reach % decimation  # aligns the decimated convolution with the first sample
     kept_samples = slice((reach + lead) // decimation, None)
 
     def convolved(x: Array) -> Array:
@@ -305,8 +303,8 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
 
 
 def is_moving(v: Array, threshold: ArrayLike) -> np.ndarray:
-    """Where |v| (N, n) exceeds the threshold, one for all or (n,): a mask (N, n).
+    """Mask (N, n) of |v| (N, n) above a threshold, one for all or (n,).
 
-    Near zero velocity friction is none of the functions that are identified.
+    Near zero velocity the friction laws of the model are not valid.
     """
     return np.abs(v) > np.asarray(threshold)

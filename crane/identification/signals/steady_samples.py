@@ -1,4 +1,4 @@
-"""Where a motion is steady."""
+"""Steady samples of signals, and means over periods of signals that ring."""
 
 from dataclasses import dataclass
 
@@ -8,34 +8,34 @@ from crane.common.errors import InputError, RecordingError
 from crane.common.samples import Array, as_number
 from crane.identification.signals.signal_processing import low_pass, sampling_step
 
-_MAX_CHANGE = 0.02  # of a signal's range, by which it may change
-_PERIODS = 3  # that tell a ringing
-_UNTOLD = 0.5  # share of the squares about a line that one frequency may leave
+_MAX_CHANGE = 0.02  # largest change relative to the range of a signal
+_MIN_PERIODS = 3  # least number of periods of a ringing
+_MAX_RESIDUAL_SHARE = 0.5  # largest share of the squares that a sinusoid leaves
 
 
 def steady_samples(
     time: Array, settle: float, *signals: Array, share: float = _MAX_CHANGE, relative: bool = False
 ) -> np.ndarray:
-    """Samples before which signals hardly changed.
+    """Mask of samples before which signals were steady.
 
-    Each signal, low-passed at 4 / settle Hz, moved by less than a share of its range during the
-    last `settle` seconds.
+    Each signal, low-passed at 4 / settle Hz, changed by less than a share of its range in the last
+    `settle` seconds.
 
     Args:
         time: Equidistant instants (N,) [s].
-        settle: [s].
-        signals: Each (N,).
-        share: Of the range, by which each may change.
-        relative: Whether the share is of the signal at that sample instead.
+        settle: Duration [s].
+        signals: Signals (N,).
+        share: Largest change relative to the range.
+        relative: Whether the share refers to the signal at the sample instead.
 
     Returns:
         Mask (N,), false during the first `settle` seconds.
 
     Raises:
-        InputError: settle is not above two steps.
+        InputError: `settle` is not above two steps.
         RecordingError: No sample is steady.
     """
-    is_steady = _hardly_moved(time, settle, *signals, share=share, relative=relative)
+    is_steady = _steady_mask(time, settle, *signals, share=share, relative=relative)
     if not is_steady.any():
         raise RecordingError(
             f"no sample is steady for {settle:g} s, record slower ramps or longer steps"
@@ -43,7 +43,7 @@ def steady_samples(
     return is_steady
 
 
-def _hardly_moved(
+def _steady_mask(
     time: Array, settle: float, *signals: Array, share: float = _MAX_CHANGE, relative: bool = False
 ) -> np.ndarray:
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -69,14 +69,14 @@ def _hardly_moved(
 
 @dataclass(frozen=True)
 class SteadyMeans:
-    """Steady samples of a signal and its answer, by means over periods where the answer rings.
+    """Steady samples of a signal and its response, with means over periods of a ringing response.
 
     Attributes:
         kept: Mask (N,) of the steady samples.
-        signal: (N,) the signal, or its means over the last period.
-        answer: (N,) the answer likewise.
-        frequency: Lowest and highest of the ringing [Hz], None where nothing rings.
-        amplitude: The largest of the ringing, in the unit of the answer.
+        signal: (N,) the signal, or its mean over the last period.
+        answer: (N,) the response likewise.
+        frequency: Lowest and highest frequency of the ringing [Hz], None without ringing.
+        amplitude: Largest amplitude of the ringing, in the unit of the response.
     """
 
     kept: np.ndarray
@@ -87,23 +87,23 @@ class SteadyMeans:
 
 
 def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> SteadyMeans:
-    """Where a signal and what answers to it are steady, or ring about a steady mean.
+    """Steady samples of a signal and its response, which may ring about a steady mean.
 
-    Samples that `steady_samples` takes stay as they are. Others count where both have steady means
-    over one period of the ringing, which is sought in each stretch with a steady signal.
+    Samples of `steady_samples` are not changed. Others are used if both have steady means over one
+    period of the ringing, which is determined in each segment with a steady signal.
 
     Args:
         time: Equidistant instants (N,) [s].
         settle: As for `steady_samples`.
-        signal: (N,) what is held.
-        answer: (N,).
+        signal: (N,) signal.
+        answer: (N,) response.
 
     Raises:
-        InputError: settle is not above two steps.
+        InputError: `settle` is not above two steps.
         RecordingError: No sample is steady.
     """
-    plain = _hardly_moved(time, settle, signal, answer)
-    held = _hardly_moved(time, settle, signal)
+    plain = _steady_mask(time, settle, signal, answer)
+    held = _steady_mask(time, settle, signal)
     step = sampling_step(time)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
     means, found = plain.copy(), []
@@ -114,10 +114,10 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
         period, amplitude = _ringing(time[start:end], answer[start:end], settle)
         if not period or end - start <= round((period + settle) / step):
             continue
-        part = _means(time[start:end], pairs[:, start:end], period)
-        whole = pairs.copy()  # so that shares are those of the whole range
+        part = _period_means(time[start:end], pairs[:, start:end], period)
+        whole = pairs.copy()  # keeps the range of the whole signal
         whole[:, start:end] = part
-        new = _hardly_moved(time, settle, *whole)[start:end] & ~plain[start:end]
+        new = _steady_mask(time, settle, *whole)[start:end] & ~plain[start:end]
         new[: round((period + settle) / step)] = False
         if new.any():
             means[start:end] |= new
@@ -133,31 +133,31 @@ def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> St
 
 
 def _ringing(time: Array, x: Array, settle: float) -> tuple[float, float]:
-    """Period [s] and amplitude of what a stretch does about a straight line, zeros for nothing."""
+    """Period [s] and amplitude of a ringing about a straight line, zeros without ringing."""
     length = float(time[-1] - time[0])
-    if length < max(_PERIODS * settle, 16 * float(time[1] - time[0])):
+    if length < max(_MIN_PERIODS * settle, 16 * float(time[1] - time[0])):
         return 0.0, 0.0
-    late = time >= time[0] + 0.25 * length  # what the step before it set off is over
-    t, x = time[late], x[late]
+    is_settled = time >= time[0] + 0.25 * length  # transients of the preceding step have decayed
+    t, x = time[is_settled], x[is_settled]
     rest = x - np.polynomial.Polynomial.fit(t, x, 1)(t)
-    bare = rest * np.hanning(len(rest))
-    size = 16 * len(bare)  # a line between bins is found to a few thousandths
-    power = np.abs(np.fft.rfft(bare, size)) ** 2
+    windowed = rest * np.hanning(len(rest))
+    size = 16 * len(windowed)  # zero padding resolves frequencies to a few thousandths
+    power = np.abs(np.fft.rfft(windowed, size)) ** 2
     at = np.fft.rfftfreq(size, t[1] - t[0])
-    power[(at * (t[-1] - t[0]) < _PERIODS) | (at > 4 / settle)] = 0
+    power[(at * (t[-1] - t[0]) < _MIN_PERIODS) | (at > 4 / settle)] = 0
     frequency = float(at[power.argmax()])
     if not power.any():
         return 0.0, 0.0
     angle = 2 * np.pi * frequency * t
     rows = np.column_stack([np.cos(angle), np.sin(angle)])
-    both = np.linalg.lstsq(rows, rest, rcond=None)[0]
-    if np.sum((rest - rows @ both) ** 2) > _UNTOLD * np.sum(rest**2):
+    coefficients = np.linalg.lstsq(rows, rest, rcond=None)[0]
+    if np.sum((rest - rows @ coefficients) ** 2) > _MAX_RESIDUAL_SHARE * np.sum(rest**2):
         return 0.0, 0.0
-    return 1 / frequency, float(np.hypot(*both))
+    return 1 / frequency, float(np.hypot(*coefficients))
 
 
-def _means(time: Array, rows: Array, period: float) -> Array:
-    """Means (m, N) over the period before each sample, at first over what there is of it."""
+def _period_means(time: Array, rows: Array, period: float) -> Array:
+    """Means (m, N) over the period before each sample, or over its available part."""
     steps = np.diff(time) * 0.5 * (rows[:, 1:] + rows[:, :-1])
     whole = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)], axis=1)
     since = np.maximum(time - period, time[0])

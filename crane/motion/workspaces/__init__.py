@@ -1,4 +1,4 @@
-"""Where the strokes of a machine take its tip, and where they cannot."""
+"""Workspaces: reachable positions of the tip, singular curves and extremes."""
 
 from crane.motion.workspaces.workspace_mapping import workspace
 from crane.motion.workspaces.workspace_result import SingularCurve, Workspace, WorkspaceExtreme

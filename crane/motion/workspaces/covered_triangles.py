@@ -1,23 +1,21 @@
-"""What patches cover in the section."""
+"""Triangles of the section that the patches of a workspace cover."""
 
 import numpy as np
 
 from crane.common.samples import Array
 from crane.motion.workspaces.singular_curves import MAX_CURVE_STROKES, GridEdge, cell_edges
-from crane.motion.workspaces.workspace_kinematics import WorkspaceKinematics
 from crane.motion.workspaces.workspace_patch import (
     GridNode,
     WorkspacePatch,
     last_closed_configuration,
 )
+from crane.motion.workspaces.workspace_section import WorkspaceKinematics
 
-_MAX_SIDE_STEPS = 4.0  # side of a cell that is fine, in shares of the extent per step of the grid
-_MAX_SUBDIVISIONS, _REDUCED_SUBDIVISIONS = (
-    6,
-    2,
-)  # of a cell that is not, and where the patch is one of many that are drawn
+_MAX_SIDE_STEPS = 4.0  # longest side of a fine cell, per extent and step of the grid
+# of a coarse cell; in one of many random patches
+_MAX_SUBDIVISIONS, _REDUCED_SUBDIVISIONS = 6, 2
 
-CellCorner = tuple[Array, Array]  # posture (nq,), place (2,)
+CellCorner = tuple[Array, Array]  # configuration (nq,), section position (2,)
 
 
 def covered_triangles(
@@ -26,16 +24,16 @@ def covered_triangles(
     positions: Array,
     branch_edges: dict[GridEdge, Array],
 ) -> Array:
-    """Triangles (N, 3, 2) that a patch covers: its cells, cut where the branch ends.
+    """Triangles (N, 3, 2) that a patch covers: its cells, cut at the ends of the branch.
 
-    Cells that become long are divided: beside a posture where the passive joints may turn freely,
-    a short way of the strokes turns them by much. What stays long is left out.
+    Long cells are subdivided: near configurations where passive joints can turn freely, small
+    strokes turn them far. Cells that remain long are omitted.
 
     Args:
         kinematics: The machine and the section.
         patch: The patch.
-        positions: (N, 2) of its closed nodes [m].
-        branch_edges: Where its branch ends, see `branch_edges`.
+        positions: (N, 2) section positions of its closed nodes [m].
+        branch_edges: Ends of the branch, see `branch_edges`.
     """
     count = min(len(axis) for axis in patch.axes)
     if count < 2 or not patch.is_closed.any():
@@ -114,7 +112,7 @@ def _subdivide_cell(
 def _closed_polygon(
     patch: WorkspacePatch, corners: Array, edge_positions: dict[GridEdge, Array], cell: GridNode
 ) -> list[Array]:
-    """Places (2,) around the closed part of a cell: closed corners, and ends of the branch."""
+    """Section positions (2,) around the closed part of a cell: corners and ends of the branch."""
     i, j = cell
     polygon = []
     nodes = ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
@@ -129,7 +127,7 @@ def _closed_polygon(
 def _boundary_cell_triangles(
     patch: WorkspacePatch, corners: Array, edge_positions: dict[GridEdge, Array], max_side: float
 ) -> Array:
-    """Fans of triangles (N, 3, 2) over the closed parts of cells with open corners."""
+    """Triangle fans (N, 3, 2) over the closed parts of cells with open corners."""
     out = []
     cells = {
         (i - di, j - dj)

@@ -7,18 +7,18 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.motion.workspaces.workspace_kinematics import WorkspaceKinematics
 from crane.motion.workspaces.workspace_patch import (
     GridNode,
     WorkspacePatch,
     last_closed_configuration,
 )
 from crane.motion.workspaces.workspace_result import SingularCurve
+from crane.motion.workspaces.workspace_section import WorkspaceKinematics
 
-MAX_CURVE_STROKES = 3  # strokes for which there are curves
-_MAX_GAP_SHARE = 0.1  # share of the section's extent that two neighbours on a curve are not apart
+MAX_CURVE_STROKES = 3  # strokes up to which curves are computed
+_MAX_GAP_SHARE = 0.1  # distance of two neighbours on a curve, per extent of the section
 
-GridEdge = tuple[int, int, int]  # node, and whether it goes on along the first or the second axis
+GridEdge = tuple[int, int, int]  # node (i, j), and the axis of the edge
 
 
 def singular_curves(
@@ -27,12 +27,12 @@ def singular_curves(
     edges_by_patch: list[dict[GridEdge, Array]],
     limits: tuple[Array, Array],
 ) -> list[SingularCurve]:
-    """Singular curves on patches that are faces of the box, or all of it; up to three strokes.
+    """Singular curves on patches that are faces of the box of strokes, for up to three strokes.
 
     Args:
         kinematics: The machine and the section.
         patches: The patches.
-        edges_by_patch: Where the branch ends in each of them, see `branch_edges`.
+        edges_by_patch: Ends of the branch in each of them, see `branch_edges`.
         limits: Limits (n,) of the active coordinates.
     """
     if len(kinematics.strokes) > MAX_CURVE_STROKES:
@@ -49,7 +49,7 @@ def singular_curves(
 def patch_curves(
     kinematics: WorkspaceKinematics, patch: WorkspacePatch, branch_edges: dict[GridEdge, Array]
 ) -> list[SingularCurve]:
-    """Where the branch ends ("branch"), and where both strokes move the tip one way ("tip")."""
+    """Singular curves of a patch: ends of the branch ("branch"), and of the tip ("tip")."""
     if not patch.is_closed.any():
         return []
     lines = join_polylines(patch, branch_edges)
@@ -61,7 +61,7 @@ def patch_curves(
 
 
 def branch_edges(machine: Machine, patch: WorkspacePatch) -> dict[GridEdge, Array]:
-    """Postures (nq,) where the branch ends, by edges of the grid."""
+    """Configurations (nq,) at the ends of the branch, by edges of the grid."""
 
     def branch_end(one: GridNode, two: GridNode) -> Array | None:
         if patch.is_closed[one] == patch.is_closed[two]:
@@ -77,7 +77,7 @@ def branch_edges(machine: Machine, patch: WorkspacePatch) -> dict[GridEdge, Arra
 def _tip_singular_edges(
     kinematics: WorkspaceKinematics, patch: WorkspacePatch
 ) -> dict[GridEdge, Array]:
-    """Postures (nq,) where the determinant of d(u, w) by the strokes changes its sign."""
+    """Configurations (nq,) at sign changes of the determinant of d(u, w) by the strokes."""
     active = kinematics.machine.closure.active
     values = np.zeros(patch.is_closed.shape)
     values[patch.is_closed] = kinematics.tip_determinant(
@@ -95,7 +95,7 @@ def _tip_singular_edges(
             [patch.configurations[one], patch.configurations[two]],
             [values[one], values[two]],
         )
-        for k in range(60):  # halving and false position by turns
+        for k in range(60):  # bisection and false position in turn
             start_strokes, end_strokes = (q[active] for q in configurations)
             share = 0.5 if k % 2 else np.clip(signs[0] / (signs[0] - signs[1]), 0.01, 0.99)
             midpoint, is_closed = last_closed_configuration(
@@ -110,7 +110,7 @@ def _tip_singular_edges(
                 return None if kinematics.is_on_axis(midpoint) else midpoint
             side = int((value >= 0) != (signs[0] >= 0))
             configurations[side], signs[side] = midpoint, value
-        return None  # a jump: where a distance from an axis turns back
+        return None  # a jump, where the distance from an axis reverses
 
     return _find_crossings(patch, sign_change)
 
@@ -118,7 +118,7 @@ def _tip_singular_edges(
 def _find_crossings(
     patch: WorkspacePatch, crossing: Callable[[GridNode, GridNode], Array | None]
 ) -> dict[GridEdge, Array]:
-    """What crosses the edges of the grid."""
+    """Crossings by edges of the grid."""
     a, b = patch.is_closed.shape
     crossings: dict[GridEdge, Array] = {}
     for i, j, side in itertools.product(range(a), range(b), (0, 1)):
@@ -133,12 +133,12 @@ def _find_crossings(
 
 
 def cell_edges(i: int, j: int) -> list[GridEdge]:
-    """The edges of a cell, after its corners (i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)."""
+    """Edges of a cell, from its corners (i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)."""
     return [(i, j, 0), (i + 1, j, 1), (i, j + 1, 0), (i, j, 1)]
 
 
 def join_polylines(patch: WorkspacePatch, points: dict[GridEdge, Array]) -> list[Array]:
-    """Points (nq,) on edges joined within cells, then end to end, to lines (k, nq)."""
+    """Polylines (k, nq) of points (nq,) on edges, joined within cells."""
     a, b = patch.is_closed.shape
     links: dict[GridEdge, list[GridEdge]] = {key: [] for key in points}
     for i, j in itertools.product(range(a - 1), range(b - 1)):
@@ -163,7 +163,7 @@ def join_polylines(patch: WorkspacePatch, points: dict[GridEdge, Array]) -> list
 
 
 def _split_curve(kind: str, kinematics: WorkspaceKinematics, q: Array) -> list[SingularCurve]:
-    """A line of postures (k, nq), cut where the tip jumps: past a posture that turns it freely."""
+    """Curves of a polyline of configurations (k, nq), cut where the tip jumps."""
     tips = kinematics.tip_positions(q)
     section_positions = kinematics.section.coordinates(tips)
     distances = np.linalg.norm(np.diff(section_positions, axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""How far a workspace reaches."""
+"""Extreme positions of a workspace by constrained optimization on the assembly branch."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -9,22 +9,20 @@ from scipy.optimize import minimize
 
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.motion.workspaces.workspace_kinematics import WorkspaceKinematics
 from crane.motion.workspaces.workspace_patch import last_closed_configuration
 from crane.motion.workspaces.workspace_result import SingularCurve, WorkspaceExtreme
+from crane.motion.workspaces.workspace_section import WorkspaceKinematics
 
 Objective = Callable[[Array], tuple[float, Array]]
-ObjectiveConstraint = tuple[str, Objective]  # "eq": the goal is 0, "ineq": it is at least 0
+ObjectiveConstraint = tuple[str, Objective]  # "eq": value = 0, "ineq": value >= 0
 
-# in rad and shares of the machine's size
-_DIFFERENCE_STEP = 1e-6  # of the differences that give the slope of a determinant
-_CLOSURE_TOLERANCE = 1e-9  # residual of the loops up to which an extreme is one
-_CONSTRAINT_TOLERANCE = 1e-9  # of a demand that is met
-_CONTINUATION_POINTS, _NEWTON_ITERATIONS = (
-    8,
-    6,
-)  # points of the way to a singular posture, steps of Newton's method
-_MAX_CHORD_DEVIATION = 0.3  # of the length of that way, how far it may be from a straight one
+# in rad and relative to the characteristic length
+_DIFFERENCE_STEP = 1e-6  # step of differences of a determinant
+_CLOSURE_TOLERANCE = 1e-9  # residual of the loops at an extreme
+_CONSTRAINT_TOLERANCE = 1e-9  # of a constraint
+# points on the path to a singular configuration, Newton steps at each
+_CONTINUATION_POINTS, _NEWTON_ITERATIONS = 8, 6
+_MAX_CHORD_DEVIATION = 0.3  # distance from the chord, per length of the path
 
 
 def workspace_extremes(
@@ -34,14 +32,14 @@ def workspace_extremes(
     limits: tuple[Array, Array],
     curves: Sequence[SingularCurve],
 ) -> tuple[WorkspaceExtreme, ...]:
-    """Least and largest coordinates of a section.
+    """Least and largest coordinates of the section.
 
-    The best posture of a grid, or of a singular curve, improved by `maximize_on_branch`.
+    The best configuration of the grid or of a singular curve is improved by `maximize_on_branch`.
 
     Args:
         kinematics: The machine and the section.
-        q: (N, nq) postures.
-        section_positions: (N, 2) theirs.
+        q: (N, nq) configurations.
+        section_positions: (N, 2) their section positions [m].
         limits: Limits (n,) of the active coordinates.
         curves: Singular curves.
     """
@@ -53,9 +51,11 @@ def workspace_extremes(
     )
     for (axis, name), (sign, adjective) in itertools.product(names, signs):
 
-        def objective(posture: Array, axis: int = axis, sign: float = sign) -> tuple[float, Array]:
-            tips = kinematics.tip_positions(posture[None])
-            tree = kinematics.kinematics.tree_jacobian(posture)[None]
+        def objective(
+            configuration: Array, axis: int = axis, sign: float = sign
+        ) -> tuple[float, Array]:
+            tips = kinematics.tip_positions(configuration[None])
+            tree = kinematics.kinematics.tree_jacobian(configuration)[None]
             gradient = kinematics.section.section_jacobian(tips, tree)[0, axis]
             return -sign * float(kinematics.section.coordinates(tips)[0, axis]), -sign * gradient
 
@@ -80,27 +80,29 @@ def maximize_on_branch(
     objective: Objective,
     constraints: Sequence[ObjectiveConstraint] = (),
 ) -> tuple[float, Array]:
-    """The largest value of a goal near a posture, on its assembly branch and within the limits.
+    """Maximize an objective on the branch of a configuration within the limits.
 
-    Passive joints are unknowns beside the strokes, so that the problem is smooth where the branch
-    ends, too:
+    Passive joints are unknowns beside the strokes, so that the problem is smooth at the end of the
+    branch, too:
 
         max g(q)   with   phi(q) = 0,   d_k(q) d_k(home) >= 0,   lower <= q_A <= upper,
 
-    d_k the determinants of the blocks of J_P, one of which is zero at the end of a branch. Solved
-    by sequential quadratic programming (SLSQP); a solution counts if the branch leads there.
+    with the determinants d_k of the blocks of J_P, one of which is zero at the end of a branch. It
+    is solved by sequential quadratic programming (SLSQP); a solution is accepted if the branch
+    leads to it.
 
     Args:
         machine: The machine.
-        q: (nq,) closed posture to start from.
-        strokes: Indices of the active joints that move; the others are held.
+        q: (nq,) closed configuration to start from.
+        strokes: Indices of the active joints that are varied.
         limits: Lower and upper limits (n,) of the active coordinates.
-        objective: (nq,) -> value, and its slope (nv,) by the joints of the tree.
-        constraints: What else has to hold, likewise; lengths in shares of the machine's size.
+        objective: Function q (nq,) -> value, and its gradient (nv,).
+        constraints: Further constraints as functions like the objective, scaled to the order of
+            one.
 
     Returns:
-        The value and its posture (nq,); those of the start where nothing better is found, with
-        -inf where that does not meet the demands.
+        The value and its configuration (nq,); those of the start if nothing better is found, with
+        -inf if the start violates the constraints.
     """
     closure = machine.closure
     moving = closure.active[list(strokes)]
@@ -109,10 +111,8 @@ def maximize_on_branch(
     units = np.concatenate([stroke_lengths, closure.units[closure.passive]])
     initial_value = objective(q)[0]
     is_initially_feasible = _satisfies_constraints(constraints, q)
-    equations, independent_rows = closure.equations, closure.structure.independent_rows
-    objective_scale = max(
-        abs(initial_value), 1e-3 * closure.characteristic_length
-    )  # so that the accuracy asked for is a relative one
+    # makes the tolerance of the solver a relative one
+    objective_scale = max(abs(initial_value), 1e-3 * closure.characteristic_length)
 
     def configuration(x: Array) -> Array:
         out = q.copy()
@@ -123,21 +123,6 @@ def maximize_on_branch(
         value, slope = objective(configuration(x))
         return -value / objective_scale, -slope[free] * units / objective_scale
 
-    closure_constraint: Any = {
-        "type": "eq",
-        "fun": lambda x: equations.evaluate_scaled(configuration(x))[0][independent_rows],
-        "jac": lambda x: (
-            (equations.evaluate_scaled(configuration(x))[1][independent_rows] / closure.units)[
-                :, free
-            ]
-            * units
-        ),
-    }
-    branch_constraint: Any = {
-        "type": "ineq",
-        "fun": lambda x: _relative_determinants(machine, configuration(x)),
-        "jac": lambda x: _determinant_derivatives(machine, configuration(x), free) * units,
-    }
     other_constraints: Any = [
         {
             "type": kind,
@@ -150,25 +135,22 @@ def maximize_on_branch(
         *zip(low / stroke_lengths, (low + stroke_lengths) / stroke_lengths, strict=True),
         *[(None, None)] * len(closure.passive),
     ]
-    for scipy_constraints in (
-        ([closure_constraint], [closure_constraint, branch_constraint])
-        if len(independent_rows)
-        else ([],)
-    ):
+    # few extremes are at the end of a branch, whose derivatives are expensive
+    for loop_constraints in _loop_constraints(machine, configuration, free, units):
         result = minimize(
             cost,
             q[free] / units,
             jac=True,
             bounds=bounds,
-            constraints=[*scipy_constraints, *other_constraints],
+            constraints=[*loop_constraints, *other_constraints],
             method="SLSQP",
             options={"ftol": 1e-13, "maxiter": 200},
         )
         if (
-            len(independent_rows)
+            loop_constraints
             and (_relative_determinants(machine, configuration(result.x)) > 0).all()
         ):
-            break  # few extremes are at the end of a branch, and its slopes are dear
+            break
     target = configuration(result.x)
     target[moving] = np.clip(target[moving], low, low + stroke_lengths)
     last_configuration, is_closed = last_closed_configuration(machine, q, target[closure.active])
@@ -182,8 +164,29 @@ def maximize_on_branch(
     return (initial_value if is_initially_feasible else -np.inf), q
 
 
+def _loop_constraints(
+    machine: Machine, configuration: Callable[[Array], Array], free: Array, units: Array
+) -> list[list[Any]]:
+    """Constraints of the loops for SLSQP: closed loops alone, and with the ends of the branch."""
+    closure, rows = machine.closure, machine.closure.structure.independent_rows
+    evaluate = closure.equations.evaluate_scaled
+    if not len(rows):
+        return [[]]
+    closed_loops = {
+        "type": "eq",
+        "fun": lambda x: evaluate(configuration(x))[0][rows],
+        "jac": lambda x: (evaluate(configuration(x))[1][rows] / closure.units)[:, free] * units,
+    }
+    same_branch = {
+        "type": "ineq",
+        "fun": lambda x: _relative_determinants(machine, configuration(x)),
+        "jac": lambda x: _determinant_derivatives(machine, configuration(x), free) * units,
+    }
+    return [[closed_loops], [closed_loops, same_branch]]
+
+
 def _satisfies_constraints(constraints: Sequence[ObjectiveConstraint], q: Array) -> bool:
-    """Whether a posture meets all demands."""
+    """Whether a configuration satisfies all constraints."""
     values = [(kind, demand(q)[0]) for kind, demand in constraints]
     return all((abs(x) if kind == "eq" else -x) < _CONSTRAINT_TOLERANCE for kind, x in values)
 
@@ -191,10 +194,10 @@ def _satisfies_constraints(constraints: Sequence[ObjectiveConstraint], q: Array)
 def _is_reachable_on_branch(
     machine: Machine, q: Array, target: Array, free_columns: Array
 ) -> bool:
-    """Whether the branch leads from a posture to another, singular one.
+    """Whether the branch leads from a configuration to a singular one.
 
-    Points of the straight way are projected on phi(q) = 0 along the shortest way, all joints
-    being free: unlike the strokes alone, these determine the posture where the branch ends.
+    Points of the straight line are projected onto phi(q) = 0 by steps of least norm in all joints:
+    unlike the strokes alone, these determine the configuration at the end of the branch.
     """
     equations, rows = machine.closure.equations, machine.closure.structure.independent_rows
     units = machine.closure.units
@@ -221,7 +224,7 @@ def _is_reachable_on_branch(
 
 
 def _relative_determinants(machine: Machine, q: Array) -> Array:
-    """(blocks,) determinants of the blocks of J_P, as shares of those at home."""
+    """Determinants (blocks,) of the blocks of J_P, relative to those at home."""
     return _block_determinants(machine, q) / _block_determinants(machine, machine.home)
 
 
@@ -236,7 +239,7 @@ def _block_determinants(machine: Machine, q: Array) -> Array:
 
 
 def _determinant_derivatives(machine: Machine, q: Array, columns: Array) -> Array:
-    """(blocks, k) slopes of `_relative_determinants` by some coordinates."""
+    """Derivatives (blocks, k) of `_relative_determinants` by some coordinates."""
     out = []
     for column in columns:
         step = np.zeros(len(q))

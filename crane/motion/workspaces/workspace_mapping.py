@@ -1,7 +1,7 @@
-"""Exploring a workspace: patches over the strokes, and what is measured on them."""
+"""Computation of a workspace from patches of configurations over the strokes."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,36 +11,44 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_count, as_seed
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.workspaces.coverage_raster import CoverageRaster
 from crane.motion.workspaces.covered_triangles import covered_triangles
 from crane.motion.workspaces.singular_curves import branch_edges, patch_curves, singular_curves
 from crane.motion.workspaces.workspace_extremes import workspace_extremes
-from crane.motion.workspaces.workspace_kinematics import WorkspaceKinematics
 from crane.motion.workspaces.workspace_patch import (
     WorkspacePatch,
     fill_patch,
     last_closed_configuration,
 )
-from crane.motion.workspaces.workspace_result import StrokeMap, Workspace
-from crane.motion.workspaces.workspace_section import find_slewing_joint, workspace_section
+from crane.motion.workspaces.workspace_result import (
+    CoverageRaster,
+    SingularCurve,
+    StrokeMap,
+    Workspace,
+)
+from crane.motion.workspaces.workspace_section import (
+    WorkspaceKinematics,
+    find_slewing_joint,
+    workspace_section,
+)
 
-_MAX_SAMPLES = 1_000_000  # postures
-_MOTION_TOLERANCE = 1e-9  # slope of a tip that a joint moves, in shares of the machine's size
-_MAX_GRID_JOINTS = 3  # joints that a regular grid is made of
-_MAP_VALUES = 81  # values of each stroke of the map
+_MAX_SAMPLES = 1_000_000  # configurations
+# derivative of the tip by a joint, per characteristic length, that counts as motion
+_MOTION_TOLERANCE = 1e-9
+_MAX_GRID_JOINTS = 3  # joints of a regular grid
+_MAP_VALUES = 81  # values of each stroke of the stroke map
 _SLICE_COUNT = 9  # values of the third of three strokes
-_RANDOM_PATCH_VALUES = 16  # values of both strokes of a patch that is drawn
-_INTERIOR_SHARE = 0.5  # share of patches of many joints that do not lie on limits
+_RANDOM_PATCH_VALUES = 16  # values of both strokes of a random patch
+_INTERIOR_SHARE = 0.5  # share of random patches in the interior of the box
 
 
 class _PlannedPatch(NamedTuple):
-    """A patch to be filled; see `WorkspacePatch`.
+    """Specification of a patch; see `WorkspacePatch`.
 
     Attributes:
         stroke_pair: Indices of both strokes.
-        held_coordinates: (n,) where the others are held.
-        value_count: Values of each stroke.
-        counts_for_share: Whether it counts for the share of the box that closes.
+        held_coordinates: (n,) coordinates of the others.
+        value_count: Number of values of each stroke.
+        counts_for_share: Whether it contributes to the share of the box that closes.
     """
 
     stroke_pair: tuple[int, int]
@@ -52,23 +60,23 @@ class _PlannedPatch(NamedTuple):
 def workspace(
     machine: Machine, samples: int = 10_000, frame: str | None = None, seed: int = 0
 ) -> Workspace:
-    """Map where a machine's strokes take its tip, and where its loops do not close.
+    """Compute the workspace of a frame of a machine.
 
-    The strokes are those of active joints that move loops or the tip, within their limits (half a
-    turn to both sides of home without); passive joints have no limits here. Up to three of them
-    give a regular grid; of more, patches over two of them each, the others drawn at random, half
-    of them at their limits: what such a workspace covers is within the true one. A joint that
-    slews the whole machine is held at home, see `Section`.
+    The strokes are those of active joints that move loops or the tip, within their limits (without
+    limits pi to both sides of home); limits of passive joints are neglected. Up to three strokes
+    give a regular grid. More strokes give patches over pairs of them, with the others at random
+    values, half of them at their limits: such a workspace is a part of the true one. A joint that
+    slews the whole machine is held at home, see `WorkspaceSection`.
 
     Args:
         machine: The machine.
-        samples: About how many postures.
-        frame: A link; the machine's tip if not given.
-        seed: Of what is drawn.
+        samples: Approximate number of configurations.
+        frame: Name of a link; default the tip of the machine.
+        seed: Seed of the random values.
 
     Raises:
-        InputError: Fewer than 100 samples or more than a million, an unknown frame, no tip, or a
-            frame that no driven joint moves.
+        InputError: There are fewer than 100 samples or more than a million, the frame is unknown,
+            there is no tip, or no driven joint moves the frame.
     """
     samples, seed = as_count(samples, "the number of samples", 100, _MAX_SAMPLES), as_seed(seed)
     kinematics = Kinematics(machine, frame)
@@ -90,19 +98,20 @@ def workspace(
     )
     condition, least_singular_value = workspace_kinematics.condition_measures(q, tips)
     branch_edges_by_patch = [branch_edges(machine, patch) for patch in patches]
-    covered_by_patch = [
-        covered_triangles(workspace_kinematics, patch, here, patch_edges)
-        for patch, here, patch_edges in zip(
+    patch_counts = np.cumsum([patch.is_closed.sum() for patch in patches])[:-1]
+    triangles_by_patch = [
+        covered_triangles(workspace_kinematics, patch, positions, patch_edges)
+        for patch, positions, patch_edges in zip(
             patches,
-            _split_by_patch(patches, section_positions),
+            np.split(section_positions, patch_counts),
             branch_edges_by_patch,
             strict=True,
         )
     ]
     raster = CoverageRaster(
-        np.concatenate([section_positions, *(part.reshape(-1, 2) for part in covered_by_patch)])
+        np.concatenate([section_positions, *(part.reshape(-1, 2) for part in triangles_by_patch)])
     )
-    for patch_triangles in covered_by_patch:
+    for patch_triangles in triangles_by_patch:
         raster.cover(patch_triangles)
     curves = singular_curves(workspace_kinematics, patches, branch_edges_by_patch, (lower, upper))
     closed_share = _closed_share(
@@ -113,32 +122,15 @@ def workspace(
             workspace_kinematics.scaled_tip_jacobian(q, tips, machine.closure.gamma(q))
             / workspace_kinematics.stroke_scales
         )
-        tip_displacements = (
+        displacements = (
             np.linalg.norm(tip_jacobian, axis=1).mean(axis=0) * (upper - lower)[strokes]
         )
-        first_stroke, second_stroke = sorted(
-            strokes[int(i)] for i in np.argsort(tip_displacements)[-2:]
-        )
-        axes = tuple(
-            np.linspace(lower[i], upper[i], _MAP_VALUES) for i in (first_stroke, second_stroke)
-        )
-        map_patch = fill_patch(
-            machine,
-            machine.home[machine.closure.active],
-            (first_stroke, second_stroke),
-            (axes[0], axes[1]),
-        )
-        assert map_patch is not None, "home itself closes"
+        map_patch = _map_patch(machine, strokes, displacements, lower, upper)
         map_curves = patch_curves(
             workspace_kinematics, map_patch, branch_edges(machine, map_patch)
         )
     else:
         map_patch, map_curves = patches[0], curves
-    map_values = np.full((2, *map_patch.is_closed.shape), np.nan)
-    patch_positions = map_patch.configurations[map_patch.is_closed]
-    map_values[:, map_patch.is_closed] = workspace_kinematics.condition_measures(
-        patch_positions, workspace_kinematics.tip_positions(patch_positions)
-    )
     return Workspace(
         machine=machine,
         frame=kinematics.frame,
@@ -158,14 +150,36 @@ def workspace(
         ),
         curves=tuple(curves),
         patches=tuple(patches),
-        stroke_map=StrokeMap(map_patch, map_values[0], map_values[1], tuple(map_curves)),
+        stroke_map=_stroke_map(workspace_kinematics, map_patch, map_curves),
         raster=raster,
         is_complete=len(strokes) <= _MAX_GRID_JOINTS,
     )
 
 
+def _map_patch(
+    machine: Machine, strokes: list[int], displacements: Array, lower: Array, upper: Array
+) -> WorkspacePatch:
+    """Patch over the two strokes with the largest displacements (d,) of the tip."""
+    first, second = sorted(strokes[int(i)] for i in np.argsort(displacements)[-2:])
+    axes = tuple(np.linspace(lower[i], upper[i], _MAP_VALUES) for i in (first, second))
+    home = machine.home[machine.closure.active]
+    patch = fill_patch(machine, home, (first, second), (axes[0], axes[1]))
+    assert patch is not None, "home itself closes"
+    return patch
+
+
+def _stroke_map(
+    kinematics: WorkspaceKinematics, patch: WorkspacePatch, curves: Sequence[SingularCurve]
+) -> StrokeMap:
+    """Conditions over a patch."""
+    values = np.full((2, *patch.is_closed.shape), np.nan)
+    q = patch.configurations[patch.is_closed]
+    values[:, patch.is_closed] = kinematics.condition_measures(q, kinematics.tip_positions(q))
+    return StrokeMap(patch, values[0], values[1], tuple(curves))
+
+
 def stroke_limits(machine: Machine) -> tuple[Array, Array]:
-    """Limits of the active joints; half a turn, or the joint's scale, from home without."""
+    """Limits of the active joints; without limits pi, or the characteristic length, from home."""
     home = machine.home[machine.closure.active]
     units = machine.closure.units[machine.closure.active]
     half_range = np.where(machine.coordinates.is_translation[machine.closure.active], units, np.pi)
@@ -183,7 +197,7 @@ def moving_strokes(
     held_joint: int | None,
     random: np.random.Generator,
 ) -> list[int]:
-    """Driven joints that move the frame or open loops, the slewing joint left out."""
+    """Indices of driven joints that move the frame or the loops, without the slewing joint."""
     closure = machine.closure
     configurations = [machine.home]
     for _ in range(8):
@@ -218,7 +232,7 @@ def _create_patches(
     samples: int,
     random: np.random.Generator,
 ) -> tuple[list[WorkspacePatch], list[int]]:
-    """Patches over the strokes, and which of them count for the share of the box that closes."""
+    """Patches over the strokes, and indices of those that count for the closed share."""
     home = machine.home[machine.closure.active]
     if len(strokes) == 1:
         axis = np.linspace(lower[strokes[0]], upper[strokes[0]], min(samples, 2001))
@@ -248,7 +262,7 @@ def _create_patches(
 def _sliced_patches(
     home: Array, strokes: list[int], lower: Array, upper: Array, samples: int
 ) -> Iterator[_PlannedPatch]:
-    """Every pair of three strokes, at values of the third all over its range."""
+    """Every pair of three strokes, at values of the third over its whole range."""
     count = max(5, round((samples / _SLICE_COUNT) ** 0.5))
     for pair in itertools.combinations(strokes, 2):
         (other,) = set(strokes) - set(pair)
@@ -266,7 +280,7 @@ def _random_patches(
     samples: int,
     random: np.random.Generator,
 ) -> Iterator[_PlannedPatch]:
-    """Pairs of many strokes through home, then with the others drawn: inside, or at limits."""
+    """Pairs of strokes through home, then with the others at random values or limits."""
     pairs = list(itertools.combinations(strokes, 2))
     for pair in pairs:
         yield _PlannedPatch(pair, home.copy(), _RANDOM_PATCH_VALUES, False)
@@ -280,7 +294,7 @@ def _random_patches(
 
 
 def _closed_share(patches: list[WorkspacePatch], is_sliced: bool) -> float:
-    """Share of the box that closes; nodes on its faces count half."""
+    """Share of the box of strokes that closes; nodes on its faces count half."""
     closed = total = 0.0
     for k, patch in enumerate(patches):
         is_face = is_sliced and k in (0, len(patches) - 1)
@@ -294,19 +308,14 @@ def _closed_share(patches: list[WorkspacePatch], is_sliced: bool) -> float:
 
 
 def _node_weights(count: int) -> Array:
-    """Shares (count,) of the nodes along an axis: half at both ends, one if there is one node."""
+    """Weights (count,) of the nodes along an axis: half at both ends, one for a single node."""
     weights = np.ones(count)
     if count > 1:
         weights[[0, -1]] = 0.5
     return weights
 
 
-def _split_by_patch(patches: list[WorkspacePatch], stacked: Array) -> list[Array]:
-    counts = np.cumsum([patch.is_closed.sum() for patch in patches])[:-1]
-    return np.split(stacked, counts)
-
-
 def _is_two_dimensional(positions: Array) -> bool:
-    """Whether places (N, 2) fill more than a line."""
+    """Whether positions (N, 2) span more than a line."""
     values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
     return bool(values[-1] > 1e-6 * values[0])

@@ -1,4 +1,4 @@
-"""A grid over one or two active coordinates: which postures close."""
+"""Patches of a workspace: grids of closed configurations over one or two active coordinates."""
 
 from dataclasses import dataclass
 
@@ -13,20 +13,20 @@ from crane.machine import Machine
 GridNode = tuple[int, int]
 _GRID_DIRECTIONS: tuple[GridNode, ...] = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
-_CONTINUATION_STEPS = 16  # from one posture of the grid to the next, where one step fails
-_MIN_STEP_SHARE = 2.0**-30  # share of a way to which its last closed posture is found
+_CONTINUATION_STEPS = 16  # between neighbouring nodes, if one step fails
+_MIN_STEP_SHARE = 2.0**-30  # smallest step of a continuation, relative to its path
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WorkspacePatch(OneLineRepr):
-    """Postures over two active coordinates (one, if the second axis has one value).
+    """Grid of configurations over two active coordinates (one, if the second axis has one value).
 
     Attributes:
-        stroke_pair: Indices of both among the active joints.
-        held_coordinates: (n,) where the others are held.
-        axes: Values of both, (a,) and (b,).
+        stroke_pair: Indices of both coordinates among the active ones.
+        held_coordinates: (n,) values of the other coordinates.
+        axes: Values of both coordinates, (a,) and (b,).
         is_closed: (a, b) whether the loops close, connected with home along lines of the grid.
-        configurations: (a, b, nq) postures, NaN where open.
+        configurations: (a, b, nq) configurations, NaN where the loops do not close.
     """
 
     stroke_pair: tuple[int, int]
@@ -36,7 +36,7 @@ class WorkspacePatch(OneLineRepr):
     configurations: Array
 
     def active_coordinates(self, node: GridNode) -> Array:
-        """Active coordinates (n,) of a node."""
+        """Active coordinates (n,) of a grid node."""
         q_a = self.held_coordinates.copy()
         for joint, axis, k in zip(self.stroke_pair, self.axes, node, strict=True):
             if len(axis) > 1:
@@ -45,18 +45,18 @@ class WorkspacePatch(OneLineRepr):
 
 
 def last_closed_configuration(machine: Machine, q: Array, target: Array) -> tuple[Array, bool]:
-    """Follow the branch along the straight line of q_A as far as it leads.
+    """Follow the branch along a straight line in q_A as far as it leads.
 
-    In machine code that is until an entry of gamma exceeds 1000, some 1e-5 rad or m short of the
-    end at most.
+    In machine code the continuation ends where an entry of gamma exceeds 1000, at most some 1e-5
+    rad or m before the end.
 
     Args:
         machine: The machine.
-        q: (nq,) closed posture to start from.
+        q: (nq,) closed configuration to start from.
         target: (n,) active coordinates.
 
     Returns:
-        The last closed posture (nq,), and whether it is at the target.
+        The last closed configuration (nq,), and whether it is the target.
     """
     closure = machine.closure
     start = q[closure.active]
@@ -83,7 +83,7 @@ def last_closed_configuration(machine: Machine, q: Array, target: Array) -> tupl
 
 
 def _try_closure(machine: Machine, targets: Array, initial_guess: Array, out: Array) -> bool:
-    """Close the loops at targets (1, n) into out (1, nq); whether that worked."""
+    """Close the loops at targets (1, n) into out (1, nq); returns whether they close."""
     try:
         out[0] = machine.closure.solve(targets[0], initial_guess=initial_guess)
     except ClosureError:
@@ -98,17 +98,17 @@ def fill_patch(
     axes: tuple[Array, Array],
     start: Array | None = None,
 ) -> WorkspacePatch | None:
-    """The closed postures of a patch, from the one nearest to home on.
+    """Compute the closed configurations of a patch, starting next to home.
 
     Args:
         machine: The machine.
-        held_coordinates: (n,) where the active joints are held that are not of the pair.
-        stroke_pair: Two of them, or one twice.
-        axes: Their values; an axis of one value is held at the base.
-        start: (nq,) closed posture to come from; home if not given.
+        held_coordinates: (n,) values of the active coordinates outside of the pair.
+        stroke_pair: Indices of two active coordinates, or one twice.
+        axes: Values of both; an axis with one value stays at the held coordinate.
+        start: (nq,) closed start configuration; default home.
 
     Returns:
-        None where the way from there to the patch is barred.
+        The patch, or None if the branch does not lead from the start to it.
     """
     closure, shape = machine.closure, (len(axes[0]), len(axes[1]))
     patch = WorkspacePatch(
@@ -139,7 +139,7 @@ def fill_patch(
 
 
 def _close_neighbours(machine: Machine, patch: WorkspacePatch, node: GridNode) -> list[GridNode]:
-    """Close the neighbours of a closed node; those that now are."""
+    """Close the neighbours of a closed node; returns the newly closed ones."""
     closed_nodes = []
     for neighbour in _neighbours(node, patch.is_closed.shape):
         if patch.is_closed[neighbour]:
@@ -154,7 +154,7 @@ def _close_neighbours(machine: Machine, patch: WorkspacePatch, node: GridNode) -
 
 
 def _close_rows(machine: Machine, patch: WorkspacePatch, closed_node: GridNode) -> list[GridNode]:
-    """Close rows of nodes at once, on all sides of a closed node; those that now are closed."""
+    """Close rows of nodes in all directions from a closed node; returns the newly closed ones."""
     compiled_closure, cursor = (
         machine.closure.compiled_closure,
         machine.closure.compiled_closure.new_cursor(),
@@ -179,7 +179,7 @@ def _close_rows(machine: Machine, patch: WorkspacePatch, closed_node: GridNode) 
 
 
 def _open_nodes(patch: WorkspacePatch, node: GridNode, direction: GridNode) -> list[GridNode]:
-    """The open nodes from a node on along one way, up to a closed one."""
+    """Open nodes from a node in one direction, up to a closed one."""
     (a, b), row = patch.is_closed.shape, []
     i, j = node[0] + direction[0], node[1] + direction[1]
     while 0 <= i < a and 0 <= j < b and not patch.is_closed[i, j]:
@@ -191,7 +191,7 @@ def _open_nodes(patch: WorkspacePatch, node: GridNode, direction: GridNode) -> l
 def _close_by_continuation(
     machine: Machine, patch: WorkspacePatch, node: GridNode, neighbour: GridNode
 ) -> bool:
-    """Close a node from a closed one beside it in small steps; whether that worked."""
+    """Close a node from a closed neighbour in small steps; returns whether it closes."""
     compiled_closure, q = machine.closure.compiled_closure, patch.configurations[node]
     start_strokes = q[machine.closure.active]
     targets = start_strokes + np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None] * (

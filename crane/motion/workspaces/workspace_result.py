@@ -1,34 +1,92 @@
-"""What a workspace consists of, as tables and in words."""
+"""Results of a workspace: curves, extremes, covered area, tables and text."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing
 
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.motion.workspaces.coverage_raster import CoverageRaster
 from crane.motion.workspaces.workspace_patch import WorkspacePatch
 from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.recordings.timeseries import Table, write_table
 
+_RASTER_POINTS = 800  # grid points along the longer side
 CURVE_KINDS = {
     "branch": "end of the branch: J_P is singular, the strokes lead no further",
     "tip": "singularity of the tip: strokes move it along one direction only",
 }
 
 
+class CoverageRaster:
+    """Fine grid over the section whose points are marked where a triangle covers them.
+
+    Args:
+        points: (N, 2) points whose bounding box the grid spans [m].
+
+    Attributes:
+        u: (W,) first coordinates of the grid [m].
+        w: (H,) second coordinates of the grid [m].
+        covered: (H, W) whether a grid point is covered.
+    """
+
+    def __init__(self, points: Array):
+        low, high = points.min(axis=0), points.max(axis=0)
+        self.spacing = (
+            float((high - low).max()) or 1.0
+        ) / _RASTER_POINTS  # arbitrary for a single point
+        count = np.ceil((high - low) / self.spacing).astype(int) + 3
+        self.u = low[0] + self.spacing * (np.arange(count[0]) - 0.5)
+        self.w = low[1] + self.spacing * (np.arange(count[1]) - 0.5)
+        self.covered: NDArray[np.bool_] = np.zeros((count[1], count[0]), dtype=bool)
+
+    @property
+    def area(self) -> float:
+        """Covered area [m2]."""
+        return float(self.covered.sum()) * self.spacing**2
+
+    def fill_cracks(self, width: int) -> Array:
+        """Array (H, W): 1 where covered or in a crack of at most 2 width points, else 0."""
+        padded = np.pad(self.covered, width + 1)
+        return binary_closing(padded, iterations=width)[
+            width + 1 : -width - 1, width + 1 : -width - 1
+        ].astype(np.float64)
+
+    def cover(self, triangles: Array) -> None:
+        """Mark all grid points within triangles (N, 3, 2)."""
+        start = np.array([self.u[0], self.w[0]])
+        grid_positions = (triangles - start) / self.spacing
+        low = np.maximum(np.ceil(grid_positions.min(axis=1) - 1e-9).astype(int), 0)
+        high = np.floor(grid_positions.max(axis=1) + 1e-9).astype(int) + 1
+        for corners, (x0, y0), (x1, y1) in zip(grid_positions, low, high, strict=True):
+            if x1 <= x0 or y1 <= y0:
+                continue
+            block = self.covered[y0:y1, x0:x1]
+            if block.all():
+                continue
+            x, y = np.arange(x0, x1), np.arange(y0, y1)[:, None]
+            edge_functions = []
+            for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                edge_functions.append((bx - ax) * (y - ay) - (by - ay) * (x - ax))
+            is_inside = (np.minimum.reduce(edge_functions) >= -1e-9) | (
+                np.maximum.reduce(edge_functions) <= 1e-9
+            )
+            block |= is_inside
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class SingularCurve(OneLineRepr):
-    """A singular curve; a point where one stroke is all that moves.
+    """Singular curve; for a single stroke a point.
 
     Attributes:
         kind: A key of `CURVE_KINDS`.
         q_a: (k, n) active coordinates.
         tip_positions: (k, 3) [m].
-        section_positions: (k, 2) in the section [m].
+        section_positions: (k, 2) coordinates in the section [m].
     """
 
     kind: str
@@ -39,12 +97,12 @@ class SingularCurve(OneLineRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WorkspaceExtreme(OneLineRepr):
-    """How far the section reaches in one direction.
+    """Extreme coordinate of the section.
 
     Attributes:
-        name: Such as "largest radius".
-        value: [m].
-        q_a: (n,) active coordinates there.
+        name: Name, such as "largest radius".
+        value: Coordinate [m].
+        q_a: (n,) active coordinates of the extreme.
     """
 
     name: str
@@ -54,14 +112,14 @@ class WorkspaceExtreme(OneLineRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StrokeMap(OneLineRepr):
-    """Two strokes against each other, or one: those that move the tip most, others at home.
+    """Condition over the two strokes that move the tip most, or one; others are at home.
 
     Attributes:
-        patch: Its postures.
-        condition: (a, b) of the drive, NaN where open.
+        patch: Configurations of the map.
+        condition: (a, b) condition number of gamma, NaN where the loops do not close.
         least_singular_value: (a, b) least singular value of d(u, w)/dq_A D_A by all strokes [m],
-            likewise.
-        curves: Singular curves within it; those of the tip by these two strokes alone.
+            NaN likewise.
+        curves: Singular curves in the map; those of the tip for these two strokes alone.
     """
 
     patch: WorkspacePatch
@@ -72,29 +130,29 @@ class StrokeMap(OneLineRepr):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Workspace(Result):
-    """Closed postures all over the strokes of a machine.
+    """Workspace: closed configurations over the whole range of the strokes of a machine.
 
     Attributes:
         machine: The machine.
-        frame: What moves.
-        section: The plane of `section_positions`.
-        strokes: Joints that were moved; all others are held at home.
-        lower: (n,) lower ends of the active coordinates.
-        upper: (n,) upper ends.
-        q_a: (N, n) active coordinates whose loops close.
+        frame: Name of the frame.
+        section: Plane of `section_positions`.
+        strokes: Joints that were varied; all others are at home.
+        lower: (n,) lower limits of the active coordinates.
+        upper: (n,) upper limits.
+        q_a: (N, n) active coordinates of closed configurations.
         tip_positions: (N, 3) positions of the frame [m].
-        section_positions: (N, 2) the same in the section [m].
-        condition: (N,) of the drive, see `Closure.condition_number`.
+        section_positions: (N, 2) coordinates in the section [m].
+        condition: (N,) condition number of gamma, see `Closure.condition_number`.
         least_singular_value: (N,) least singular value of d(u, w)/dq_A D_A [m].
-        closed_share: Share of the strokes' box that closes, connected with home.
-        area: Of the section [m2], 0 where it is a line.
-        extremes: How far it reaches.
+        closed_share: Share of the box of strokes in which the loops close, connected with home.
+        area: Covered area of the section [m2], 0 if it is a line.
+        extremes: Extreme coordinates of the section.
         curves: Singular curves.
-        patches: Of which the postures are made.
-        stroke_map: The two strokes that move the frame most.
-        raster: Which points of the section are covered.
-        is_complete: Whether the strokes were covered by a grid; else they were drawn, and the true
-            workspace is larger.
+        patches: Grids of the configurations.
+        stroke_map: Map over the two strokes that move the frame most.
+        raster: Covered grid points of the section.
+        is_complete: Whether a grid covers the strokes; else they were sampled at random, and the
+            true workspace is larger.
     """
 
     machine: Machine
@@ -118,24 +176,23 @@ class Workspace(Result):
     is_complete: bool
 
     def _one_line(self) -> str:
-        """What moves, with what, and how much of it closes."""
+        """Frame, strokes, and the share that closes."""
         return (
             f"Workspace of '{self.frame}' of '{self.machine.name}': {len(self.tip_positions)} "
-            f"postures "
-            f"over {', '.join(self.strokes)}, {100 * self.closed_share:.3g} % close, "
-            f"{self.area:.4g} m2"
+            f"configurations over {', '.join(self.strokes)}, {100 * self.closed_share:.3g} % "
+            f"close, {self.area:.4g} m2"
         )
 
     def __len__(self) -> int:
         return len(self.q_a)
 
     def extreme(self, name: str) -> WorkspaceExtreme:
-        """One of `extremes` by its name."""
+        """Extreme by its name."""
         return next(item for item in self.extremes if item.name == name)
 
     @property
     def slewing_joint_name(self) -> str | None:
-        """The joint that turns the section, None where there is none."""
+        """Name of the slewing joint, None if there is none."""
         return (
             None
             if self.section.slewing_joint is None
@@ -143,7 +200,7 @@ class Workspace(Result):
         )
 
     def format_strokes(self, q_a: Array) -> str:
-        """The strokes of a posture in words."""
+        """Text of the strokes of a configuration."""
         machine = self.machine
         return ", ".join(
             f"{joint} = {q_a[machine.active.index(joint)]:.4g} {machine.unit(joint)}"
@@ -151,7 +208,7 @@ class Workspace(Result):
         )
 
     def to_csv(self, path: str | Path) -> None:
-        """Write all postures: strokes, tip, place in the section, conditions.
+        """Write all configurations: strokes, tip, section coordinates, conditions.
 
         Raises:
             OutputError: The file cannot be written.
@@ -203,12 +260,14 @@ class Workspace(Result):
         write_table(path, Table(units, np.vstack([np.empty((0, len(units))), *rows]), notes))
 
     def to_markdown(self) -> str:
-        """A summary: reach, area, share of the strokes that closes, conditions."""
+        """Summary in Markdown: extremes, area, share of the strokes that closes, conditions."""
         machine, lines = self.machine, []
         slewing_joint = self.slewing_joint_name
         u, w = self.section.coordinate_names
         lines.append(f"# Workspace of {machine.name}\n")
-        lines.append(f"{len(self)} closed postures; `{self.frame}` in the section ({u}, {w}).")
+        lines.append(
+            f"{len(self)} closed configurations; `{self.frame}` in the section ({u}, {w})."
+        )
         if slewing_joint is not None:
             i = machine.active.index(slewing_joint)
             slewing_range = np.rad2deg([self.lower[i], self.upper[i]])
@@ -244,9 +303,8 @@ class Workspace(Result):
         )
         least_index = int(self.least_singular_value.argmin())
         lines.append(
-            f"| least singular value of the tip | {self.least_singular_value[least_index]:.3g} "
-            f"m per scale | "
-            f"{self.format_strokes(self.q_a[least_index])} |"
+            f"| least singular value of the tip | {self.least_singular_value[least_index]:.3g} m "
+            f"per scale | {self.format_strokes(self.q_a[least_index])} |"
         )
         lines += ["", "| stroke | reaches | of its limits |", "| --- | --- | --- |"]
         for joint in self.strokes:

@@ -1,33 +1,37 @@
-"""The plane that a workspace is drawn in."""
+"""The plane of a workspace, and the kinematics of the tip in it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.active_joint_selection import condition_number
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.machine import Machine
+from crane.motion.kinematics import Kinematics
 
-_FLATNESS_TOLERANCE = 1e-7  # share of the extent that counts as none
+_FLATNESS_TOLERANCE = 1e-7  # relative to the extent
+_AXIS_TOLERANCE = 1e-6  # distance from the axis, relative to the extent
+_DETERMINANT_TOLERANCE = 1e-9  # determinant relative to its two products that counts as zero
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WorkspaceSection(OneLineRepr):
-    """Two coordinates (u, w) of the tip.
+    """Section: two coordinates (u, w) of the tip.
 
-    Of a machine whose slewing joint stands upright on the ground: distance from the slewing axis
-    and height; the distance has a sign where the tip stays in a plane through the axis, and
-    counts forward from there. Of a tip that stays in any other plane: along two directions of the
-    plane. Of any other tip: distance from the vertical through the origin, and height.
+    For a machine with a vertical slewing joint on the ground: distance from the slewing axis, and
+    height; the distance is signed, positive forwards, if the tip moves in a plane through the
+    axis. For a tip that moves in another plane: two directions of the plane. For any other tip:
+    distance from the vertical through the origin, and height.
 
     Attributes:
-        coordinate_names: Of both coordinates.
-        first_direction: (3,) direction of u, where it is along one.
+        coordinate_names: Names of both coordinates.
+        first_direction: (3,) direction of u, zero if u is a distance.
         second_direction: (3,) direction of w.
-        origin: (3,) a point with u = w = 0 [m].
+        origin: (3,) point with u = w = 0 [m].
         is_radial: Whether u is a distance from the line through the origin along w.
-        slewing_joint: Index of the slewing joint among the active ones, None where there is none.
+        slewing_joint: Index of the slewing joint among the active ones, None if there is none.
     """
 
     coordinate_names: tuple[str, str]
@@ -38,7 +42,7 @@ class WorkspaceSection(OneLineRepr):
     slewing_joint: int | None
 
     def coordinates(self, points: Array) -> Array:
-        """(u, w) (N, 2) [m] of points (N, 3) in the world."""
+        """Coordinates (u, w) (N, 2) [m] of points (N, 3) in the world."""
         offset = points - self.origin
         height = offset @ self.second_direction
         if not self.is_radial:
@@ -47,7 +51,7 @@ class WorkspaceSection(OneLineRepr):
         return np.column_stack([np.linalg.norm(radial_offset, axis=1), height])
 
     def section_jacobian(self, points: Array, jacobian: Array) -> Array:
-        """d(u, w) (N, 2, n) of points (N, 3) whose own derivatives are (N, 3, n)."""
+        """Derivatives (N, 2, n) of (u, w) of points (N, 3) with the Jacobians (N, 3, n)."""
         offset = points - self.origin
         first_directions = np.broadcast_to(self.first_direction, points.shape)
         if self.is_radial:
@@ -61,16 +65,16 @@ class WorkspaceSection(OneLineRepr):
 
 
 def up_direction(machine: Machine) -> Array:
-    """(3,) unit vector against gravity; z where there is none."""
+    """Unit vector (3,) against gravity; z without gravity."""
     gravity = np.asarray(machine.model.gravity.linear)
     length = float(np.linalg.norm(gravity))
     return -gravity / length if length > 0 else np.array([0.0, 0.0, 1.0])
 
 
 def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array] | None:
-    """The driven joint that slews all that carries the frame, and a point on its axis.
+    """Slewing joint of a frame: its index and a point on its axis, or None.
 
-    It stands on the ground, turns about the vertical, and moves no passive joint.
+    It is a driven joint on the ground with a vertical axis, and moves no passive joint.
     """
     model, up = machine.model, up_direction(machine)
     gamma = machine.closure.gamma(machine.home)
@@ -80,7 +84,7 @@ def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array] | None
     jacobian = pin.computeJointJacobians(model, data, configuration).reshape(6, -1)
     for i, name in enumerate(machine.active):
         column = machine.column(name)
-        if not model.existJointName(name):  # one of those of a body that floats
+        if not model.existJointName(name):  # a coordinate of a floating base
             continue
         joint = model.getJointId(name)
         axis = jacobian[3:, column]
@@ -99,13 +103,13 @@ def find_slewing_joint(machine: Machine, frame: str) -> tuple[int, Array] | None
 def workspace_section(
     machine: Machine, frame: str, tip_positions: Array, home_position: Array
 ) -> WorkspaceSection:
-    """The section to draw tips (N, 3) in, all at one angle of the slewing joint, if there is one.
+    """Section of tip positions (N, 3), all at one angle of the slewing joint if there is one.
 
     Args:
         machine: The machine.
-        frame: What the tips are.
-        tip_positions: Drawn from the whole reach.
-        home_position: (3,) the tip at home.
+        frame: Name of the frame.
+        tip_positions: (N, 3) positions over the whole reach [m].
+        home_position: (3,) position at home [m].
     """
     up, slewing_joint = up_direction(machine), find_slewing_joint(machine, frame)
     offsets = tip_positions - tip_positions.mean(axis=0)
@@ -114,7 +118,7 @@ def workspace_section(
         float(extents[0]), 1e-9 * machine.closure.characteristic_length
     )
     normal = directions[2]
-    if extents[1] <= flatness_threshold:  # a line: any plane through it, upright if it can be
+    if extents[1] <= flatness_threshold:  # a line: any plane through it, vertical if possible
         normal = np.cross(directions[0], up)
         if np.linalg.norm(normal) < 1e-6:
             normal = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -154,8 +158,81 @@ def workspace_section(
 
 
 def _axis_name(direction: Array, default: str) -> str:
-    """x, y or z where a direction is one of them."""
+    """Name x, y or z of a direction along an axis, else a default."""
     for name, axis in zip("xyz", np.eye(3), strict=True):
         if direction @ axis > 1 - 1e-9:
             return name
     return default
+
+
+class WorkspaceKinematics:
+    """Tip positions, their derivatives by the strokes, and conditions, in a section.
+
+    Args:
+        machine: The machine.
+        kinematics: Kinematics of the frame.
+        section: Section of the workspace.
+        strokes: Indices of the strokes among the active joints.
+        extent: Extent of the section [m].
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        kinematics: Kinematics,
+        section: WorkspaceSection,
+        strokes: list[int],
+        extent: float,
+    ):
+        self.extent = extent
+        self.machine, self.kinematics, self.section = machine, kinematics, section
+        self.strokes = strokes
+        self._coordinate_scales = machine.closure.equations.motion_scales
+        self.stroke_scales = self._coordinate_scales[machine.closure.active][strokes]
+
+    def tip_positions(self, q: Array) -> Array:
+        """Positions (N, 3) [m] at configurations (N, nq)."""
+        return self.kinematics.positions_at_configurations(q)
+
+    def is_on_axis(self, q: Array) -> bool:
+        """Whether the first coordinate is a distance from an axis that the tip is on."""
+        u = self.section.coordinates(self.tip_positions(q[None]))[0, 0]
+        return self.section.is_radial and bool(u < _AXIS_TOLERANCE * self.extent)
+
+    def condition_measures(self, q: Array, tips: Array) -> tuple[Array, Array]:
+        """Condition numbers (N,) and least singular values (N,) at configurations (N, nq).
+
+        The least singular value is that of d(u, w)/dq_A D_A, in metres per scale of the strokes,
+        for tip positions (N, 3).
+        """
+        closure, gamma = self.machine.closure, self.machine.closure.gamma(q)
+        jacobian = self.scaled_tip_jacobian(q, tips, gamma)
+        singular_values = np.asarray(np.linalg.svd(jacobian, compute_uv=False), dtype=np.float64)
+        return condition_number(gamma, self._coordinate_scales, closure.active), singular_values[
+            :, -1
+        ]
+
+    def scaled_tip_jacobian(self, q: Array, tips: Array, gamma: Array) -> Array:
+        """Scaled Jacobian d(u, w)/dq_A D_A (N, 2, d) of the strokes [m per scale]."""
+        jacobian = (
+            np.array([self.kinematics.tree_jacobian(configuration) for configuration in q]) @ gamma
+        )
+        slopes = self.section.section_jacobian(tips, jacobian)[:, :, self.strokes]
+        return np.asarray(slopes * self.stroke_scales)
+
+    def tip_determinant(self, stroke_pair: tuple[int, int], q: Array) -> Array:
+        """Determinant (N,) [m2] of the scaled Jacobian by two strokes at q (N, nq)."""
+        jacobian = self.scaled_tip_jacobian(
+            q, self.tip_positions(q), self.machine.closure.gamma(q)
+        )
+        pair_jacobian = jacobian[:, :, [self.strokes.index(i) for i in stroke_pair]]
+        first_product, second_product = (
+            pair_jacobian[:, 0, 0] * pair_jacobian[:, 1, 1],
+            pair_jacobian[:, 0, 1] * pair_jacobian[:, 1, 0],
+        )
+        size = np.abs(first_product) + np.abs(second_product)
+        return np.where(
+            np.abs(first_product - second_product) < _DETERMINANT_TOLERANCE * size,
+            0.0,
+            first_product - second_product,
+        )

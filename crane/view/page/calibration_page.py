@@ -11,8 +11,6 @@ from crane.identification.calibration.calibration_result import (
     Calibration,
     CalibrationChannel,
     FittedParameter,
-)
-from crane.identification.calibration.residual_dependence import (
     ResidualDependence,
     residual_dependences,
 )

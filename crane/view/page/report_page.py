@@ -12,8 +12,13 @@ from typing import Any
 from crane.common.errors import RecordingError
 from crane.machine import Machine
 from crane.recordings.recording import Recording
-from crane.recordings.recording_differences import clock_shift, joint_differences
-from crane.recordings.recording_summary import label, point_channel, result_title
+from crane.recordings.recording_summary import (
+    clock_shift,
+    joint_differences,
+    label,
+    point_channel,
+    result_title,
+)
 from crane.view.page.force_markers import actuator_markers, load_markers, spring_markers
 from crane.view.page.html_document import check_page_suffix, write_page
 from crane.view.page.page_channels import ThinningGrid, plot_groups

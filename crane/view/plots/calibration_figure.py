@@ -8,8 +8,12 @@ from matplotlib.figure import Figure
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.identification.calibration.calibration_result import Calibration, CalibrationChannel
-from crane.identification.calibration.residual_dependence import ResidualDependence, group_samples
+from crane.identification.calibration.calibration_result import (
+    Calibration,
+    CalibrationChannel,
+    ResidualDependence,
+    group_samples,
+)
 from crane.recordings.recording_summary import result_title
 from crane.simulation.recording_replay import Comparison
 from crane.view.plots.figure_text import envelope, escape_label

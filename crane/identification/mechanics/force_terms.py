@@ -1,4 +1,4 @@
-"""Friction along a direction: functions of its velocity, and of what it did before."""
+"""Model terms of friction, gas springs and forces of a known shape."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -8,8 +8,10 @@ import numpy as np
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 from crane.description import Friction
+from crane.dynamics.joint_forces import JointForces
 from crane.identification.mechanics.model_term import (
     ForceDirection,
+    ModelTerm,
     MotionSamples,
     resolve_direction,
 )
@@ -18,19 +20,19 @@ from crane.machine import Machine
 ForceShape = Callable[[Array], Array]
 
 
-class VelocityFriction:
-    """Forces along one direction whose shapes over its velocity are known: friction.
+class VelocityFriction(ModelTerm):
+    """Friction term: known functions of the velocity along one direction times parameters.
 
     Args:
         machine: The machine.
-        direction: A joint's name, or a combination.
-        shapes: Velocity (N,) -> (N,) by name of the parameter.
-        nominal: Their values; zero if not given.
-        nonnegative: Names of parameters that cannot be negative.
+        direction: Name of a joint, or a combination.
+        shapes: Functions velocity (N,) -> (N,) by name of the parameter.
+        nominal: Nominal values; default zero.
+        nonnegative: Names of parameters that must not be negative.
 
     Attributes:
-        direction: See above.
-        stribeck_velocities: Velocities over which stiction fades [m/s], [rad/s].
+        direction: Direction of the friction.
+        stribeck_velocities: Stribeck velocities [m/s], [rad/s].
     """
 
     stribeck_velocities: tuple[float, ...] = ()
@@ -56,12 +58,12 @@ class VelocityFriction:
         return rows[:, :, None] * self.steady_forces(speed)[:, None, :]
 
     def steady_forces(self, v: Array) -> Array:
-        """(N, k) forces per parameter at steady speeds (N,)."""
+        """Forces (N, k) per parameter at steady speeds (N,)."""
         return np.stack([shape(v) for shape in self._shapes.values()], axis=1)
 
 
 def smoothed_sign(smoothing: float) -> ForceShape:
-    """sign(v), smoothed to tanh(v / smoothing) as in the simulation."""
+    """Function sign(v), smoothed to tanh(v / smoothing) as in the simulation."""
     if smoothing == 0:
         return np.sign
     return lambda v: np.tanh(v / smoothing)
@@ -74,17 +76,17 @@ def friction_term(
     smoothing: float | None = None,
     stribeck: Sequence[float] = (),
 ) -> VelocityFriction:
-    """Friction of equation (5) of the reduced-scale forwarder paper, and Stribeck's.
+    """Friction term of equation (5) of the reduced-scale forwarder paper, with stiction.
 
         coulomb s + coulomb_offset + viscous v + viscous_offset |v|
         + sum_i stiction_i s e^-(v / v_i)^2,    s = sign(v).
 
     Args:
-        machine: The machine, whose own friction is nominal.
-        direction: A joint's name, or a combination.
-        kinds: Which of the four.
-        smoothing: Of the sign [m/s], [rad/s]; the machine's if not given, 0 for a jump.
-        stribeck: Velocities v_i [m/s], [rad/s]; the parameters of several: stiction_1, ...
+        machine: The machine, whose friction gives the nominal values.
+        direction: Name of a joint, or a combination.
+        kinds: Names of the kinds, some of the four.
+        smoothing: Smoothing velocity of the sign [m/s], [rad/s]; default that of the machine.
+        stribeck: Stribeck velocities v_i [m/s], [rad/s]; parameters of several are stiction_1, ...
     """
     name = direction if isinstance(direction, str) else direction.name
     law = machine.friction.get(name, Friction(smoothing=0.0))
@@ -115,26 +117,22 @@ def friction_term(
 
 
 def root_friction_term(machine: Machine, direction: str | ForceDirection) -> VelocityFriction:
-    """Friction like the root of the speed, of mixed lubrication: root sign(v) sqrt |v|."""
+    """Friction term of mixed lubrication: root sign(v) sqrt |v|."""
     shape = {"root": lambda v: np.sign(v) * np.sqrt(np.abs(v))}
     return VelocityFriction(machine, direction, shape)
 
 
-class FrictionalMemory:
-    """Friction that remembers rest: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 first.
+class FrictionalMemory(ModelTerm):
+    """Frictional memory: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 at the start.
 
-    A joint that starts from rest sticks more than one that comes to rest, as the contact takes
-    time to change.
+    The friction is larger after rest than before it, as the contact changes with a lag.
 
     Args:
         machine: The machine.
-        direction: A joint's name, or a combination.
-        lag: Over which rest is forgotten [s].
-        speed: At which it is forgotten [m/s], [rad/s].
+        direction: Name of a joint, or a combination.
+        lag: Time constant [s].
+        speed: Characteristic speed [m/s], [rad/s].
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(
         self, machine: Machine, direction: str | ForceDirection, lag: float, speed: float
@@ -154,10 +152,10 @@ class FrictionalMemory:
         from scipy.signal import lfilter
 
         if samples.step is None:
-            raise InputError(f"'{self.names[0]}' remembers time, give the step of the samples")
+            raise InputError(f"'{self.names[0]}' depends on time, give the step of the samples")
         rows = self.direction.jacobian(self._machine, samples)
         v = np.einsum("ij,ij->i", rows, samples.v_a)
-        share = -np.expm1(-samples.step / self._lag)  # exact for a steady speed
+        share = -np.expm1(-samples.step / self._lag)  # exact for constant speed
         w, state = np.empty_like(v), samples.term_states.get(self, np.zeros(1))
         edges = sorted({0, *samples.starts, len(v)})
         for start, end in pairwise(edges):
@@ -167,23 +165,20 @@ class FrictionalMemory:
         return (rows * (np.sign(v) * np.exp(-w / self._speed))[:, None])[:, :, None]
 
     def steady_forces(self, v: Array) -> Array:
-        """(N, 1) force per parameter at steady speeds (N,), where w = |v|."""
+        """Force (N, 1) per parameter at steady speeds (N,), where w = |v|."""
         return (np.sign(v) * np.exp(-np.abs(v) / self._speed))[:, None]
 
 
-class PreslidingFriction:
-    """Friction that has to be wound up first: Dahl's law over the travelled distance.
+class PreslidingFriction(ModelTerm):
+    """Presliding friction: Dahl's law over the travelled distance.
 
-    F = force z, dz = (1 - sign(v) z) ds / length, z = 0 where a recording begins (Dahl, 1968).
+    F = force z, dz = (1 - sign(v) z) ds / length, z = 0 at the start of a recording (Dahl, 1968).
 
     Args:
         machine: The machine.
-        direction: A joint's name, or a combination.
-        length: Distance over which it winds up [m], [rad].
+        direction: Name of a joint, or a combination.
+        length: Characteristic distance [m], [rad].
     """
-
-    names: tuple[str, ...]
-    nonnegative: tuple[bool, ...]
 
     def __init__(self, machine: Machine, direction: str | ForceDirection, length: float):
         direction = resolve_direction(machine, direction)
@@ -206,11 +201,67 @@ class PreslidingFriction:
             if i in restarts:
                 state = 0.0
             limit = 1.0 if step > 0 else -1.0
-            state = limit + (state - limit) * np.exp(-abs(step))  # exact for a steady direction
+            state = limit + (state - limit) * np.exp(-abs(step))  # exact for a constant direction
             z[i] = state
         samples.term_states[self] = (state, travel[-1])
         return rows[:, :, None] * z[:, None, None]
 
     def steady_forces(self, v: Array) -> Array:
-        """(N, 1) force per parameter at steady speeds (N,), wound up."""
+        """Force (N, 1) per parameter at steady speeds (N,), fully developed."""
         return np.sign(v)[:, None]
+
+
+FrictionTerm = VelocityFriction | PreslidingFriction | FrictionalMemory
+
+
+class GasSpringTerm(ModelTerm):
+    """Term of a gas spring: a factor on its force with the nominal value 1.
+
+    Args:
+        machine: The machine.
+        joint: Joint of the gas spring, or its name.
+    """
+
+    def __init__(self, machine: Machine, joint: str):
+        springs = [spring for spring in machine.gas_springs if spring.joint == joint]
+        if not springs:
+            names = [spring.joint for spring in machine.gas_springs]
+            raise InputError(f"joint '{joint}' has no gas spring, {suggest_names(names, joint)}")
+        self._joint_forces = JointForces(machine.replace(gas_springs=tuple(springs)))
+        self.names, self.nominal, self.nonnegative = (f"{joint}.gas_scale",), np.ones(1), (True,)
+
+    def columns(self, samples: MotionSamples) -> Array:
+        """See `ModelTerm`."""
+        return -np.einsum("kij,ki->kj", samples.gamma, self._joint_forces.gas_forces(samples.q))[
+            :, :, None
+        ]
+
+
+class ForceElementTerm(ModelTerm):
+    """Passive force of known shape along a joint or distance times a factor.
+
+    Args:
+        machine: The machine.
+        direction: Name of a joint, active or passive, or a combination or distance.
+        shape: Function coordinate (N,) [m], [rad] -> force in the positive direction per factor.
+        name: Name of the factor.
+        nominal: Nominal value of the factor.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        direction: str | ForceDirection,
+        shape: ForceShape,
+        name: str,
+        nominal: float = 0.0,
+    ):
+        self._machine, self._shape = machine, shape
+        self._direction = resolve_direction(machine, direction)
+        self.names, self.nominal = (f"{self._direction.name}.{name}",), np.array([nominal])
+        self.nonnegative = (False,)
+
+    def columns(self, samples: MotionSamples) -> Array:
+        """See `ModelTerm`."""
+        force = self._shape(self._direction.coordinate(self._machine, samples))
+        return -(self._direction.jacobian(self._machine, samples) * force[:, None])[:, :, None]

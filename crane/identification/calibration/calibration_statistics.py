@@ -1,0 +1,303 @@
+"""Statistics of a calibration: profile likelihood, correlated directions and score tests.
+
+Profile likelihood: the simulation verifies the confidence intervals of the linearization. With H =
+J^T J + P at the minimum z, C = H^-1, and the distance d to the end of an interval, the profile is
+
+    z(d) = z + d C e_i / C_ii,    F(z(d)) - F(z) = d^2 / (2 C_ii)
+
+for a quadratic cost F. At both ends the machine is simulated, the other unknowns are corrected by
+a Gauss-Newton step with the same J, and it is simulated again: four simulations per parameter. The
+rise of F shows whether the linearization is valid. If F rises less, a point beyond the end is
+simulated, too: if F decreases there, the minimum was a local one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.common.errors import CraneError
+from crane.common.samples import Array
+from crane.identification.calibration.calibration_problem import CalibrationProblem
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt
+from crane.identification.calibration.unknowns import Unknown
+
+_LOWER_MINIMUM_SHARE = 5e-2  # relative difference of the cost of a lower minimum
+_MAX_RESTARTS = 2  # continuations from a lower minimum
+# root of the rise of the cost over that of the linearization
+_MIN_QUADRATIC_RISE, _WIDE_INTERVAL_RISE = 0.8, 0.6
+_STEEP_RISE = 3.0  # likewise, for strong nonlinearity
+_EXTRAPOLATION_FACTOR = 3.0  # half widths at which a lower minimum is searched for
+_PAIR_CORRELATION = 0.9  # correlation that links two parameters
+_MIN_INFLATION = 3.0  # variance inflation that links parameters
+_MIN_SHARED_EIGENVALUE = 1.5  # eigenvalue of a direction of several parameters
+_MIN_COMPONENT = 0.25  # relative to the largest component of a direction
+_MIN_COST_REDUCTION = 0.03  # of the cost, that is reported
+_MAX_REPORTED = 5  # results that are reported
+_MAX_STEP = 2.0  # standard deviations of a change
+_MIN_INDEPENDENT_SHARE = 1e-6  # part of a derivative that is independent of the fitted parameters
+
+
+class ProfileEnds(NamedTuple):
+    """Rise of the cost at the ends of the interval of a parameter.
+
+    Attributes:
+        lower_rise: Root of the rise at the lower end over that of the linearization: 1 if it is
+            valid, less if the interval is wider; NaN if a bound is nearer.
+        upper_rise: The same at the upper end.
+    """
+
+    lower_rise: float = np.nan
+    upper_rise: float = np.nan
+
+    @property
+    def remark(self) -> str:
+        """Text about an interval that the linearization does not describe, else ""."""
+        sides = [
+            side
+            for side, rise in (("down", self.lower_rise), ("up", self.upper_rise))
+            if rise < _WIDE_INTERVAL_RISE
+        ]
+        if sides:
+            return f"reaches farther {' and '.join(sides)}"
+        is_steep = self.lower_rise > _STEEP_RISE or self.upper_rise > _STEEP_RISE
+        return "derivatives do not hold over its interval" if is_steep else ""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationEstimate:
+    """Estimate of a calibration with covariance and intervals.
+
+    Attributes:
+        z: (p,) scaled unknowns.
+        covariance: (p, p) covariance of the unknowns.
+        interval_half_widths: (n,) half widths of the 95 % intervals of the parameters, in their
+            scales.
+        profile_ends: Profile likelihood at the ends of these intervals.
+        is_lowest_minimum: Whether no lower minimum was found.
+    """
+
+    z: Array
+    covariance: Array
+    interval_half_widths: Array
+    profile_ends: list[ProfileEnds]
+    is_lowest_minimum: bool
+
+
+def estimate_with_profiles(
+    search: LevenbergMarquardt, parameter_count: int
+) -> CalibrationEstimate:
+    """Minimize, evaluate the ends of the intervals, and continue from lower minima.
+
+    Args:
+        search: The minimization.
+        parameter_count: Number of parameters, which are the first unknowns.
+    """
+    from scipy.stats import t as student
+
+    z = search.run()
+    for last in [False] * _MAX_RESTARTS + [True]:
+        covariance, blocks = search.covariance(z)
+        factor = float(student.ppf(0.975, max(blocks - 1, 1)))
+        half_widths = factor * np.sqrt(np.maximum(np.diag(covariance)[:parameter_count], 0.0))
+        ends, lower_point = evaluate_profile_ends(search, z, half_widths)
+        if lower_point is None or last:
+            break
+        z = search.nearest_minimum(lower_point)
+    return CalibrationEstimate(z, covariance, half_widths, ends, lower_point is None)
+
+
+def evaluate_profile_ends(
+    search: LevenbergMarquardt, z: Array, half_widths: Array
+) -> tuple[list[ProfileEnds], Array | None]:
+    """Evaluate the cost at the ends of the intervals.
+
+    Args:
+        search: Minimization, linearized at z.
+        z: (p,) unknowns at the minimum.
+        half_widths: (n,) half widths of the intervals of the first n unknowns, in their scales.
+
+    Returns:
+        Profile ends of each parameter, and a point with a lower cost than the minimum, or None.
+    """
+    J = search.jacobian
+    H = J.T @ J + np.diag(search.prior**2)
+    C = np.linalg.pinv(H, rcond=1e-13, hermitian=True)
+    minimum_cost, _ = _cost_and_gradient(search, z)
+    lower_point, lowest_cost = None, minimum_cost * (1.0 - _LOWER_MINIMUM_SHARE)
+    profile_ends = []
+    for i, width in enumerate(half_widths):
+        free = (z > search.low) & (z < search.high)
+        free[i] = True
+        path = _profile_direction(H, free, i)
+        free[i] = False
+        rises = [np.nan, np.nan]
+        for k, side in enumerate((-1.0, 1.0)):
+            for times in (1.0, _EXTRAPOLATION_FACTOR):
+                point = z + side * times * width * path
+                if not width > 0 or not search.low[i] <= point[i] <= search.high[i]:
+                    break
+                point, cost = _refine_point(search, point, H, free)
+                if cost < lowest_cost:
+                    lower_point, lowest_cost = point, cost
+                if times == 1.0:
+                    expected = 0.5 * width**2 / C[i, i]
+                    rises[k] = float(np.sqrt(max(cost - minimum_cost, 0.0) / expected))
+                if not rises[k] < _MIN_QUADRATIC_RISE:
+                    break
+        profile_ends.append(ProfileEnds(*rises))
+    return profile_ends, lower_point
+
+
+def _refine_point(
+    search: LevenbergMarquardt, z: Array, H: Array, free: NDArray[np.bool_]
+) -> tuple[Array, float]:
+    """The better of a point and the point after a Gauss-Newton step, and its cost."""
+    z = np.clip(z, search.low, search.high)
+    cost, gradient = _cost_and_gradient(search, z)
+    inverse = np.linalg.pinv(H[np.ix_(free, free)], rcond=1e-13, hermitian=True)
+    refined = z.copy()
+    refined[free] -= inverse @ gradient[free]
+    refined = np.clip(refined, search.low, search.high)
+    refined_cost, _ = _cost_and_gradient(search, refined)
+    return (refined, refined_cost) if refined_cost < cost else (z, cost)
+
+
+def _cost_and_gradient(search: LevenbergMarquardt, z: Array) -> tuple[float, Array]:
+    """Half the sum of squares, infinite if the simulation fails, and its gradient by J."""
+    try:
+        residuals = search.weighted_residuals(z)
+    except CraneError:
+        return np.inf, np.zeros(len(z))
+    prior_gradient = search.prior**2 * z
+    return 0.5 * float(
+        residuals @ residuals + z @ prior_gradient
+    ), search.jacobian.T @ residuals + prior_gradient
+
+
+def _profile_direction(H: Array, free: NDArray[np.bool_], i: int) -> Array:
+    """Direction (p,) of the profile of an unknown; unknowns that are not free are constant."""
+    indices = np.flatnonzero(free)
+    inverse = np.linalg.pinv(H[np.ix_(indices, indices)], rcond=1e-13, hermitian=True)
+    k = int(np.flatnonzero(indices == i)[0])
+    direction = np.zeros(len(free))
+    direction[indices] = inverse[:, k] / inverse[k, k]
+    return direction
+
+
+def correlated_directions(
+    names: Sequence[str], correlation: Array, half_widths: Array
+) -> list[dict[str, float]]:
+    """Directions of parameters that the recordings do not determine, by name.
+
+    Args:
+        names: Names of n parameters.
+        correlation: (n, n) correlations; 0 if a variance is zero.
+        half_widths: (n,) half widths of their intervals.
+    """
+    if len(correlation) < 2:
+        return []
+    found = []
+    for group in filter(None, _correlated_groups(correlation)):
+        sizes, directions = np.linalg.eigh(correlation[np.ix_(group, group)])
+        v = directions[:, -1]
+        v = v * np.sign(v[0]) / np.abs(v).max()
+        parts = {names[i]: float(x * half_widths[i]) for i, x in zip(group, v, strict=True)
+                 if abs(x) > _MIN_COMPONENT}  # fmt: skip
+        if sizes[-1] > _MIN_SHARED_EIGENVALUE and len(parts) > 1:
+            found.append(parts)
+    return found
+
+
+def _correlated_groups(correlation: Array) -> list[list[int]]:
+    """Groups of linked parameters, each in at most one group."""
+    from scipy.sparse.csgraph import connected_components
+
+    count, labels = connected_components(np.abs(correlation) > _PAIR_CORRELATION)
+    groups = [np.flatnonzero(labels == label).tolist() for label in range(count)]
+    inverse = np.linalg.pinv(correlation, rcond=1e-12, hermitian=True)
+    inflated = np.sqrt(np.maximum(np.diag(inverse), 0.0)) > _MIN_INFLATION
+    singles = [group[0] for group in groups if len(group) == 1 and inflated[group[0]]]
+    return [*(group for group in groups if len(group) > 1), singles]
+
+
+@dataclass(frozen=True)
+class ScoreTestResult:
+    """Score test of one parameter that is not fitted.
+
+    Attributes:
+        name: Name of the parameter.
+        value: Its estimate to first order.
+        cost_reduction: Reduction of the weighted sum of squares, relative to it.
+    """
+
+    name: str
+    value: float
+    cost_reduction: float
+
+
+def score_tests(
+    search: LevenbergMarquardt, candidates: Sequence[Unknown], z: Array
+) -> list[ScoreTestResult]:
+    """Score tests of parameters that are not fitted, at the minimum z (p,) of a search."""
+    problem = search.problem
+    if not candidates:
+        return []
+    extended_problem = CalibrationProblem(
+        problem.machine, [*problem.unknowns, *candidates], problem.cases
+    )
+    extended_problem.smooth, extended_problem.slopes = problem.smooth, problem.slopes
+    count, candidate_count = len(problem.unknowns), len(candidates)
+    unknowns = np.concatenate([z[:count], np.zeros(candidate_count), z[count:]])
+    rows = []
+    for case, extended_case in zip(problem.cases, extended_problem.cases, strict=True):
+        if not case.train_mask.any():
+            continue
+        try:
+            _, derivatives = extended_problem.linearize(extended_case, unknowns, set(range(count)))
+        except CraneError:  # the tests are optional
+            return []
+        weighted = (derivatives * search.channel_weights(case)[:, :, None])[case.train_mask]
+        columns = weighted[:, :, count : count + candidate_count]
+        rows.append(columns.reshape(-1, candidate_count))
+    return score_test(candidates, search.jacobian, np.vstack(rows), search.residual, search.prior)
+
+
+def score_test(
+    candidates: Sequence[Unknown],
+    jacobian: Array,
+    candidate_jacobian: Array,
+    residual: Array,
+    prior: Array,
+) -> list[ScoreTestResult]:
+    """Score tests of parameters that are not fitted, in descending order of cost reduction.
+
+    Args:
+        candidates: The parameters, with their standard deviations as scales.
+        jacobian: (M, p) weighted derivatives by the fitted unknowns.
+        candidate_jacobian: (M, k) weighted derivatives by the candidates.
+        residual: (M,) weighted residuals.
+        prior: (p,) one over the standard deviations of the fitted unknowns.
+    """
+    inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(prior**2), hermitian=True)
+    independent_columns = candidate_jacobian - jacobian @ (
+        inverse @ (jacobian.T @ candidate_jacobian)
+    )
+    gradients, sizes = independent_columns.T @ residual, np.sum(independent_columns**2, axis=0)
+    found = []
+    for candidate, gradient, size, squared_norm in zip(
+        candidates, gradients, sizes, np.sum(candidate_jacobian**2, axis=0), strict=True
+    ):
+        if not size > _MIN_INDEPENDENT_SHARE * squared_norm:
+            continue
+        # within the bounds, and within some standard deviations
+        step = np.clip(-gradient / size, (candidate.low - candidate.start) / candidate.scale,
+                       (candidate.high - candidate.start) / candidate.scale)  # fmt: skip
+        step = np.clip(step, -_MAX_STEP, _MAX_STEP)
+        gain = -(2.0 * step * gradient + step**2 * size) / max(float(residual @ residual), 1e-300)
+        value = candidate.start + candidate.scale * float(step)
+        found.append(ScoreTestResult(candidate.name, value, float(gain)))
+    ranked = sorted(found, key=lambda one: -one.cost_reduction)
+    return [one for one in ranked if one.cost_reduction > _MIN_COST_REDUCTION][:_MAX_REPORTED]

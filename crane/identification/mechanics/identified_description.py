@@ -1,0 +1,328 @@
+"""Description of an identified machine: friction laws, and URDF content."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.common.atomic_output import portable_file_name
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.description import Friction
+from crane.dynamics import Dynamics
+from crane.formats.visuals.mesh_files import find_mesh_file
+from crane.identification.mechanics.feasible_estimate import thicken_body
+from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
+from crane.identification.mechanics.force_terms import (
+    FrictionTerm,
+    VelocityFriction,
+)
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_term import ForceDirection, body_names
+from crane.machine import Machine
+
+SpeedRanges = Mapping[str, tuple[float, float]]
+_FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))
+_SPEED_COUNT = 100  # speeds of a comparison of laws, in each direction
+_MAX_STRIBECK_SHARE = 0.3  # largest Stribeck velocity, relative to the largest speed
+_STRIBECK_GRID_SIZE = 30  # Stribeck velocities of the search
+_FLATNESS_TOLERANCE = 1e-6  # smallest eigenvalue of the scaled pseudo-inertia of a flat body
+# fmt: skip
+_INERTIA_INDICES = {
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
+_URDF_TEMPLATE = """<?xml version="1.0"?>
+<!-- The rotor of the motor that turns with {words}: its angle is theirs on the joints' side. -->
+<robot name="{name}">
+  <link name="{name}_stator"/>
+  <joint name="{name}" type="continuous">
+    <parent link="{name}_stator"/>
+    <child link="{name}_rotor"/>
+    <axis xyz="0 0 1"/>
+  </joint>
+  <link name="{name}_rotor">
+    <inertial>
+      <mass value="1e-6"/>
+      <inertia ixx="1e-12" ixy="0" ixz="0" iyy="1e-12" iyz="0" izz="1e-12"/>
+    </inertial>
+  </link>
+</robot>
+"""
+
+
+@dataclass(frozen=True)
+class FrictionLawFit:
+    """Friction law that replaces identified friction terms.
+
+    Attributes:
+        law: The friction law.
+        max_deviation: Largest difference at a steady speed [N], [N m]; 0 if the law is exact.
+    """
+
+    law: Friction
+    max_deviation: float = 0.0
+
+
+def friction_laws(
+    model: IdentificationModel, parameters: Array, speed_ranges: SpeedRanges
+) -> dict[str, FrictionLawFit]:
+    """Friction law of each direction with friction terms in the model.
+
+    Terms that a machine file does not contain (presliding, frictional memory, root of the speed,
+    several Stribeck velocities) are replaced by the law that is nearest in least squares to the
+    total friction at steady speeds in both directions.
+
+    Args:
+        model: The model.
+        parameters: All parameters (p,).
+        speed_ranges: Least and largest speed of the comparison by direction [m/s], [rad/s].
+
+    Raises:
+        InputError: Identified friction is negative.
+    """
+    values = dict(zip(model.names, parameters.tolist(), strict=True))
+    terms_by_direction: dict[str, list[FrictionTerm]] = {}
+    for term in model.terms:
+        if isinstance(term, FrictionTerm):
+            terms_by_direction.setdefault(term.direction.name, []).append(term)
+    return {
+        name: _exact_law(model, name, terms, values)
+        or _nearest_law(name, terms, values, speed_ranges[name])
+        for name, terms in terms_by_direction.items()
+    }
+
+
+def _exact_law(
+    model: IdentificationModel, name: str, terms: list[FrictionTerm], values: Mapping[str, float]
+) -> FrictionLawFit | None:
+    found = {each.removeprefix(f"{name}."): values[each] for term in terms for each in term.names}
+    if not found.keys() <= set(_FRICTION_PARAMETERS) or found.get("stiction", 0.0) < 0:
+        return None
+    # a joint without described friction is identified with an unsmoothed sign
+    law = model.machine.friction.get(name, Friction(smoothing=0.0))
+    stribeck_velocities = [
+        v for term in terms if isinstance(term, VelocityFriction) for v in term.stribeck_velocities
+    ]
+    try:
+        stribeck = stribeck_velocities[0] if stribeck_velocities else law.stribeck
+        return FrictionLawFit(Friction(smoothing=law.smoothing, stribeck=stribeck, **found))
+    except InputError as error:
+        raise InputError(f"'{name}': {error}, give feasible=True") from None
+
+
+def _nearest_law(
+    name: str,
+    terms: list[FrictionTerm],
+    values: Mapping[str, float],
+    speed_range: tuple[float, float],
+) -> FrictionLawFit:
+    from scipy.optimize import lsq_linear
+
+    low, high = speed_range
+    v = np.linspace(low, high, _SPEED_COUNT)
+    v = np.concatenate([-v[::-1], v])
+    identified_force = np.zeros_like(v)
+    for term in terms:
+        identified_force += term.steady_forces(v) @ [values[each] for each in term.names]
+    sign, best, lowest_cost = np.sign(v), Friction(), np.inf
+    first = min(max(low, high / 1e3), _MAX_STRIBECK_SHARE * high)
+    for stribeck in np.geomspace(first, _MAX_STRIBECK_SHARE * high, _STRIBECK_GRID_SIZE).tolist():
+        basis = np.column_stack(
+            [sign, np.ones_like(v), v, np.abs(v), sign * np.exp(-((v / stribeck) ** 2))]
+        )
+        bounds = np.array([0.0, -np.inf, 0.0, -np.inf, 0.0]), np.full(5, np.inf)
+        found = lsq_linear(basis, identified_force, bounds)
+        if found.cost < lowest_cost:
+            lowest_cost, max_deviation = (
+                found.cost,
+                float(np.abs(basis @ found.x - identified_force).max()),
+            )
+            coulomb, offset, viscous, viscous_offset, stiction = np.round(found.x, 12).tolist()
+            stiction_parameters = {"stiction": stiction, "stribeck": stribeck} if stiction else {}
+            best = Friction(coulomb, offset, viscous, viscous_offset, 0.0, **stiction_parameters)
+    return FrictionLawFit(best, max_deviation)
+
+
+def divide_locked_bodies(
+    machine: Machine, parameters: Array, unlocked_machine: Machine
+) -> dict[str, Array]:
+    """Divide the parameters of bodies with locked joints among their links, (10,) each.
+
+    For a body with the pseudo-inertia P (`pseudo_inertia`) that consists of links with the
+    descriptions D_k, whose sum is D, link k gets
+
+        P_k = T D_k T^T,   T = L L_D^-1,   P = L L^T,  D = L_D L_D^T,
+
+    all in the frame of the body's joint: the sum of the links is P, each link is feasible if its
+    description is, and P = D gives the descriptions. Rods and plates without thickness are
+    thickened. Links that locks fix to the ground are unchanged.
+
+    Args:
+        machine: Machine with locked joints.
+        parameters: (10 nb,) parameters of its bodies.
+        unlocked_machine: The machine without locked joints.
+
+    Raises:
+        InputError: A body is not feasible.
+    """
+    described = (
+        Dynamics(unlocked_machine)
+        .parameters[: 10 * (unlocked_machine.model.njoints - 1)]
+        .reshape(-1, 10)
+    )
+    links_by_body: dict[int, list[tuple[str, Array, Array]]] = {}
+    out = {}
+    for name, body in zip(body_names(unlocked_machine), described, strict=True):
+        frame = machine.model.frames[machine.frame(name)]
+        A = frame.placement.homogeneous  # the pseudo-inertia about the body's joint is A P A^T
+        if frame.parentJoint == 0:
+            out[name] = body
+        else:
+            P = pseudo_inertia(body if is_solid(body) else thicken_body(body))
+            links_by_body.setdefault(frame.parentJoint - 1, []).append((name, A, P))
+    for i, links in links_by_body.items():
+        body_parameters_given = parameters[10 * i : 10 * i + 10]
+        if len(links) == 1:
+            out[links[0][0]] = body_parameters_given
+            continue
+        try:
+            L = np.linalg.cholesky(pseudo_inertia(body_parameters_given))
+            D = np.linalg.cholesky(sum(A @ P @ A.T for _, A, P in links))
+        except np.linalg.LinAlgError:
+            names = ", ".join(f"'{name}'" for name, *_ in links)
+            raise InputError(
+                f"the body of the locked links {names} is not feasible, give feasible=True"
+            ) from None
+        T = L @ np.linalg.inv(D)
+        for name, A, P in links:
+            link_transform = np.linalg.inv(A) @ T @ A
+            out[name] = body_parameters(link_transform @ P @ link_transform.T)
+    return out
+
+
+def is_solid(body: Array) -> bool:
+    """Whether a body of parameters (10,) has an extent in all directions."""
+    P = pseudo_inertia(body)
+    units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+    return bool(np.linalg.eigvalsh(P / np.outer(units, units))[0] > _FLATNESS_TOLERANCE)
+
+
+def replace_inertials(
+    file: Path, bodies: Mapping[str, Array], fixed_links: set[str], origin_text: str
+) -> etree._ElementTree:
+    """Replace the inertials of a URDF, and its loops by links at their ends.
+
+    Args:
+        file: The URDF.
+        bodies: Ten parameters about the link origin, by link that a joint moves.
+        fixed_links: Links fixed to one of these, whose inertials are removed.
+        origin_text: Source of the values, for a comment.
+    """
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
+    tree = etree.parse(str(file), parser)
+    robot = tree.getroot()
+    for link in robot.iterfind("link"):
+        name = link.get("name").strip()
+        inertial = link.find("inertial")
+        if name in bodies:
+            new_inertial = _inertial_element(bodies[name])
+            if inertial is None:
+                link.insert(0, new_inertial)
+            else:
+                new_inertial.tail = inertial.tail
+                link.replace(inertial, new_inertial)
+        elif name in fixed_links and inertial is not None:
+            _remove_element(inertial)
+    for mesh in robot.iter("mesh"):
+        _resolve_mesh_path(mesh, file.parent)
+    for loop in robot.findall("loop"):
+        for end in ("predecessor", "successor"):
+            _add_loop_frame(robot, loop, end)
+        _remove_element(loop)
+    comment = etree.Comment(f" Inertials: {origin_text}. ")
+    comment.tail = robot.text or "\n"
+    robot.text = "\n  "
+    robot.insert(0, comment)
+    return tree
+
+
+def _inertial_element(body: Array) -> etree._Element:
+    """Element <inertial> of ten parameters about the link origin."""
+    inertia = pin.Inertia.FromDynamicParameters(body)
+    inertial = etree.Element("inertial")
+    xyz = " ".join(map(repr, inertia.lever.tolist()))
+    etree.SubElement(inertial, "origin", xyz=xyz, rpy="0 0 0")
+    etree.SubElement(inertial, "mass", value=repr(float(inertia.mass)))
+    tensor = {key: repr(float(inertia.inertia[at])) for key, at in _INERTIA_INDICES.items()}
+    etree.SubElement(inertial, "inertia", tensor)
+    inertial.text = inertial[0].tail = inertial[1].tail = "\n      "
+    inertial[2].tail = inertial.tail = "\n    "
+    return inertial
+
+
+def _remove_element(element: etree._Element) -> None:
+    """Remove an element, but not the text after it."""
+    element.tail, tail = None, element.tail
+    parent, previous = element.getparent(), element.getprevious()
+    parent.remove(element)
+    if previous is None:
+        parent.text = (parent.text or "") + (tail or "")
+    else:
+        previous.tail = (previous.tail or "") + (tail or "")
+
+
+def _resolve_mesh_path(mesh: etree._Element, folder: Path) -> None:
+    """Replace the path of a mesh by the absolute path, if the file exists."""
+    file = find_mesh_file(mesh.get("filename", ""), folder)
+    if file is not None:
+        mesh.set("filename", str(file.resolve()))
+
+
+def _add_loop_frame(robot: etree._Element, loop: etree._Element, end: str) -> None:
+    """Add the frame at the end of a loop as a link, as in a sub-chain."""
+    loop_end = loop.find(end)
+    name = f"{loop.get('name').strip()}_{end}"
+    etree.SubElement(robot, "link", name=name)
+    joint = etree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
+    if (origin := loop_end.find("origin")) is not None:
+        etree.SubElement(joint, "origin", dict(origin.attrib))
+    etree.SubElement(joint, "parent", link=loop_end.get("link").strip())
+    etree.SubElement(joint, "child", link=name)
+
+
+def joint_combinations(model: IdentificationModel) -> list[ForceDirection]:
+    """Directions of a model that combine several active joints."""
+    found = {
+        direction.name: direction
+        for term in model.terms
+        if (direction := getattr(term, "direction", None)) is not None and direction.factors
+    }
+    return list(found.values())
+
+
+def motor_chain(
+    direction: ForceDirection, parent: str
+) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """Rotor of a motor that turns several joints: its chain, coupling, and URDF.
+
+    Its joint has the name of the direction and carries rotor inertia and friction. Its link has a
+    mass of 1 mg, as bodies need a mass.
+    """
+    name = direction.name
+    assert direction.factors is not None
+    chain = {"name": name, "urdf": f"motor_{portable_file_name(name)}.urdf", "parent": parent}
+    coupling_factors = {name: 1.0} | {
+        joint: -factor for joint, factor in direction.factors.items()
+    }
+    text = _URDF_TEMPLATE.format(name=escape(name), words=escape(" and ".join(direction.factors)))
+    return chain, {"name": name, "joints": coupling_factors}, text

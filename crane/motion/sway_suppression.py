@@ -1,0 +1,280 @@
+"""Trajectories without residual sway: input shaping and flatness-based motions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import ClosureError, InputError, LimitError, suggest_names
+from crane.common.samples import Array, as_number
+from crane.machine import Machine
+from crane.motion.limit_violations import limit_violation_message
+from crane.motion.quintic_splines import quintic_polynomials
+from crane.motion.sway import MAX_ITERATIONS, Sway
+from crane.motion.task_trajectories import add_free_joints
+from crane.motion.trajectory import Trajectory
+
+_KNOTS_PER_SECOND = 100
+_CONVERGENCE_TOLERANCE = 1e-9  # [rad], [m] of the last correction of a flatness-based motion
+_STAGNATION_TOLERANCE = 1e-4  # likewise if it stagnates: the error of the splines
+_SMOOTHING_SHARE = 0.1  # of the duration, over which the motion of the load is smoothed
+_SPLINES_PER_SECOND = 12.0  # of the sway along a flatness-based motion
+_GAUSS_POINTS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+class _RetimedTrajectory(Trajectory):
+    """Trajectory with the same path and another duration."""
+
+    def __init__(self, reference: Trajectory, duration: float):
+        self.duration = duration
+        self._reference, self._time_scale = reference, reference.duration / duration
+
+    def position(self, time: ArrayLike) -> Array:
+        """See `Trajectory`."""
+        return self._reference.position(np.asarray(time) * self._time_scale)
+
+    def _derivative(self, order: int, time: ArrayLike) -> Array:
+        time_scale = self._time_scale
+        return time_scale**order * self._reference._derivative(
+            order, np.asarray(time) * time_scale
+        )
+
+    def bounds(self) -> tuple[Array, Array]:
+        """See `Trajectory`."""
+        return self._reference.bounds()
+
+    def extremum_times(self) -> Array:
+        """See `Trajectory`."""
+        return self._reference.extremum_times() / self._time_scale
+
+    def breaks(self) -> Array:
+        """See `Trajectory`."""
+        return self._reference.breaks() / self._time_scale
+
+
+def retime(reference: Trajectory, duration: float) -> Trajectory:
+    """Trajectory with the same path and another duration: q(t T / duration).
+
+    Args:
+        reference: Trajectory of duration T [s].
+        duration: [s].
+
+    Raises:
+        InputError: The duration is not positive.
+    """
+    return _RetimedTrajectory(reference, as_number(duration, "the duration", "s", greater_than=0))
+
+
+def _sample_motion(
+    machine: Machine, duration: float, motion: Callable[[Array], Array]
+) -> Trajectory:
+    """Quintic trajectory through samples of a motion (N,) -> (N, n) from rest to rest."""
+    count = max(12, int(np.ceil(duration * _KNOTS_PER_SECOND)) + 1)
+    time = np.linspace(0.0, duration, count)
+    return _interpolating_trajectory(time, motion(time))
+
+
+def _spline_derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
+    """Velocities and accelerations of the quintic spline from rest to rest."""
+    from scipy.interpolate import make_interp_spline  # slow to import
+
+    zero_values = np.zeros(q_a.shape[1])
+    ends: Any = [(1, zero_values), (2, zero_values)]  # the stubs of scipy do not accept this
+    spline = make_interp_spline(time, q_a, k=5, bc_type=(ends, ends))
+    return spline(time, 1), spline(time, 2)
+
+
+def _interpolating_trajectory(time: Array, q_a: Array) -> Trajectory:
+    return Trajectory(quintic_polynomials(time, q_a, *_spline_derivatives(time, q_a)))
+
+
+def _with_hanging_joints(machine: Machine, reference: Trajectory) -> Trajectory:
+    """The reference with the free joints in equilibrium at all times."""
+    sway_model = Sway(machine)
+    return _sample_motion(
+        machine,
+        reference.duration,
+        lambda time: sway_model.hanging_equilibrium(reference.position(time)),
+    )
+
+
+def _shaper_impulses(omega: float, zeta: float, robust: bool) -> tuple[Array, Array]:
+    """Delays [s] and amplitudes of a ZV or ZVD shaper."""
+    decay = np.exp(-zeta * np.pi / np.sqrt(1.0 - zeta**2))
+    half_period = np.pi / (omega * np.sqrt(1.0 - zeta**2))
+    amplitudes = np.array([1.0, 2.0 * decay, decay**2] if robust else [1.0, decay])
+    return half_period * np.arange(len(amplitudes)), amplitudes / amplitudes.sum()
+
+
+def input_shaper(machine: Machine, q_a: ArrayLike, robust: bool = False) -> tuple[Array, Array]:
+    """Input shaper for all modes of the sway (Singer and Seering).
+
+    With K = exp(-zeta pi / sqrt(1 - zeta^2)) and the damped half period h, the impulses of a mode
+    are 1, K at 0, h (ZV, zero vibration), or 1, 2 K, K^2 at 0, h, 2 h (ZVD, whose residual also
+    has a zero derivative by the frequency), divided by their sum (J. Dyn. Syst. Meas. Control 112
+    (1990) 76-82). The shapers of several modes are convolved.
+
+    Args:
+        machine: The machine, with free joints.
+        q_a: (n,) configuration of the modes [m], [rad].
+        robust: ZVD in place of ZV.
+
+    Returns:
+        Delays (j,) [s] from 0, and amplitudes (j,) whose sum is 1.
+    """
+    sway_model = Sway(machine)
+    delays, shares = np.zeros(1), np.ones(1)
+    for omega, zeta in zip(*sway_model.modes(sway_model.hanging_equilibrium(q_a)), strict=True):
+        mode_delays, mode_shares = _shaper_impulses(float(omega), float(zeta), robust)
+        delays = (delays[:, None] + mode_delays).ravel()
+        shares = (shares[:, None] * mode_shares).ravel()
+    order = np.argsort(delays)
+    return delays[order], shares[order]
+
+
+def _apply_input_shaper(machine: Machine, reference: Trajectory, robust: bool) -> Trajectory:
+    """The reference, shortened by the duration of the shaper, after the shaper."""
+    middle = reference.position(0.5 * reference.duration)
+    delays, shares = input_shaper(machine, middle, robust)
+    remaining_duration = reference.duration - delays[-1]
+    if remaining_duration <= 0:
+        raise InputError(
+            f"the shaper takes {delays[-1]:.3g} s, the motion {reference.duration:.3g} s: give it "
+            "more time"
+        )
+    shortened_reference, sway_model = retime(reference, remaining_duration), Sway(machine)
+
+    def motion(time: Array) -> Array:
+        delayed_references = [
+            size * shortened_reference.position(time - at)
+            for at, size in zip(delays, shares, strict=True)
+        ]
+        return sway_model.hanging_equilibrium(np.sum(delayed_references, axis=0))
+
+    return _sample_motion(machine, reference.duration, motion)
+
+
+def _smooth_reference(reference: Trajectory, time: Array, width: float) -> Array:
+    """Means (N, n) of a reference over a preceding width [s], weighted by a cubic B-spline."""
+    from scipy.interpolate import BSpline  # slow to import
+
+    kernel = BSpline.basis_element(np.linspace(0.0, width, 5), extrapolate=False)
+    quarter = width / 4.0
+    out: Array = np.zeros(())
+    for piece in range(4):
+        for x, weight in zip(
+            quarter * (piece + 0.5 * (_GAUSS_POINTS + 1.0)), _GAUSS_WEIGHTS, strict=True
+        ):
+            quadrature_weight = 0.5 * weight * float(kernel(x))  # of the quadrature over `quarter`
+            out = out + quadrature_weight * reference.position(time - x)
+    return out
+
+
+def _rest_to_rest_splines(time: Array) -> Array:
+    """Quintic B-splines (N, s) with zero values and derivatives at both ends."""
+    from scipy.interpolate import BSpline  # slow to import
+
+    count = max(10, int(np.ceil(_SPLINES_PER_SECOND * time[-1])))
+    knots = np.linspace(0.0, time[-1], count + 1)
+    knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, time[-1])])
+    return BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
+
+
+def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Trajectory:
+    """Motion of the drives for which the load follows the smoothed reference."""
+    duration, smoothing = reference.duration, _SMOOTHING_SHARE * reference.duration
+    shortened_reference, sway_model, driven = (
+        retime(reference, duration - smoothing),
+        Sway(machine),
+        machine.is_driven,
+    )
+    count = max(12, int(np.ceil(duration * _KNOTS_PER_SECOND)) + 1)
+    time = np.linspace(0.0, duration, count)
+    hanging_configurations = sway_model.hanging_equilibrium(
+        _smooth_reference(shortened_reference, time, smoothing)
+    )
+    pivoting_motions, splines = (
+        sway_model.pivoting_motions(hanging_configurations),
+        _rest_to_rest_splines(time),
+    )
+    free_stiffness = sway_model.stiffness(hanging_configurations)[:, :, ~driven]
+    spline_projection = splines @ np.linalg.pinv(splines)
+    theta = np.zeros((count, len(machine.free)))
+    previous_correction = np.inf
+    for _ in range(MAX_ITERATIONS):
+        q_a = hanging_configurations.copy()
+        q_a[:, driven] += np.einsum("nkf,nf->nk", pivoting_motions, theta)
+        try:
+            q_a = sway_model.hanging_equilibrium(q_a)
+            q_a[:, ~driven] += theta
+            free_joint_forces = sway_model.free_joint_forces(q_a, *_spline_derivatives(time, q_a))
+        except ClosureError:  # beyond the reach of the machine
+            break
+        correction = (
+            spline_projection
+            @ np.linalg.solve(free_stiffness, free_joint_forces[:, :, None])[:, :, 0]
+        )
+        correction_size = float(np.abs(correction).max())
+        if correction_size < _CONVERGENCE_TOLERANCE or (
+            correction_size < _STAGNATION_TOLERANCE and correction_size > 0.5 * previous_correction
+        ):
+            return _interpolating_trajectory(time, q_a)
+        if correction_size > previous_correction:
+            break
+        theta, previous_correction = theta - correction, correction_size
+    raise InputError(
+        f"no motion of {duration:.3g} s without residual sway was found, the last "
+        f"correction is {previous_correction:.2g} rad: give it more time"
+    )
+
+
+_SWAY_METHOD_FUNCTIONS: dict[str, Callable[[Machine, Trajectory], Trajectory]] = {
+    "none": _with_hanging_joints,
+    "zv": lambda machine, reference: _apply_input_shaper(machine, reference, robust=False),
+    "zvd": lambda machine, reference: _apply_input_shaper(machine, reference, robust=True),
+    "flat": _flatness_based_trajectory,
+}
+
+SWAY_METHODS = tuple(_SWAY_METHOD_FUNCTIONS)
+
+
+def suppress_sway(machine: Machine, reference: Trajectory, method: str = "flat") -> Trajectory:
+    """Trajectory from rest to rest after which a hanging load does not sway.
+
+    It has the start, the end and the duration of the reference, starts in equilibrium, and
+    contains the free joints as they swing. Methods:
+
+    - "flat": the load follows the reference, smoothed over a tenth of its duration, by the
+      differential flatness of the pendulum; for a point mass on a string p_tip = p + L (p'' - g) /
+      |p'' - g| (Fliess, Levine, Martin and Rouchon, Int. J. Control 61 (1995) 1327-1361). For
+      rigid bodies on free joints the motion is iterated: drives q_d = s + B theta with the
+      reference s and B of `Sway.pivoting_motions`, and theta corrected by -G^-1 times the forces
+      that inverse dynamics gives for the free joints, until these are zero.
+    - "zv", "zvd": the reference is shortened and passes the shaper of `input_shaper`, whose modes
+      are those in the middle of the motion.
+    - "none": the reference, with free joints in equilibrium.
+
+    "flat" neglects friction of the free joints, the shapers all but viscous friction.
+
+    Args:
+        machine: The machine, with free joints and its payload.
+        reference: Trajectory of the driven joints, from rest to rest.
+        method: "flat", "zv", "zvd" or "none".
+
+    Returns:
+        Trajectory of all active joints.
+
+    Raises:
+        InputError: The method is unknown, the machine has no free joints, or the time is too
+            short.
+        LimitError: The trajectory leaves the limits of the drives.
+    """
+    if method not in _SWAY_METHOD_FUNCTIONS:
+        raise InputError(f"method '{method}' is unknown, {suggest_names(SWAY_METHODS, method)}")
+    if not machine.free:
+        raise InputError(f"nothing sways on '{machine.name}': it has no free joints")
+    trajectory = _SWAY_METHOD_FUNCTIONS[method](machine, add_free_joints(machine, reference))
+    if text := limit_violation_message(machine, trajectory):
+        raise LimitError(f"method '{method}': {text}")
+    return trajectory

@@ -1,0 +1,121 @@
+"""Readings of ideal sensors, and derivatives of configurations by positions of pins."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.samples import Array
+from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX
+from crane.machine import Machine
+
+
+def ideal_readings(machine: Machine, q: Array, v: Array, names: Sequence[str]) -> dict[str, Array]:
+    """Readings of ideal sensors: coordinates, inclinations and their rates (N,) by name, SI units.
+
+    The inclination of a link is the elevation of its x axis, asin(x_z); its rate is (w x x)_z /
+    sqrt(1 - x_z^2).
+
+    Args:
+        machine: The machine.
+        q: (N, nv) closed configurations.
+        v: (N, nv) velocities.
+        names: Names X and X_velocity of joints, inclination_LINK and inclination_LINK_velocity.
+    """
+    found = {}
+    for name in names:
+        joint = name.removesuffix(VELOCITY_SUFFIX)
+        if joint in machine.joints:
+            found[name] = (q if joint == name else v)[:, machine.column(joint)]
+    links = {
+        name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
+        for name in names
+        if name not in found
+    }
+    inclinations = _inclinations(machine, q, v, sorted(links)) if links else {}
+    return found | {name: inclinations[name] for name in names if name not in found}
+
+
+def _inclinations(machine: Machine, q: Array, v: Array, links: list[str]) -> dict[str, Array]:
+    """Inclinations of links and their rates (N,), by name of the column."""
+    model, data = machine.model, machine.model.createData()
+    frames = [machine.frame(link) for link in links]
+    out = np.empty((2 * len(links), len(q)))
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for i, (place, rate) in enumerate(zip(q, v, strict=True)):
+        pin.forwardKinematics(model, data, machine.coordinates.configuration(place), rate)
+        for k, frame in enumerate(frames):
+            x = pin.updateFramePlacement(model, data, frame).rotation[:, 0]
+            w = pin.getFrameVelocity(model, data, frame, axes).angular
+            flat = max(float(np.hypot(x[0], x[1])), 1e-12)
+            out[2 * k, i] = np.arctan2(x[2], flat)
+            out[2 * k + 1, i] = (w[0] * x[1] - w[1] * x[0]) / flat
+    names = [INCLINATION_PREFIX + link + end for link in links for end in ("", VELOCITY_SUFFIX)]
+    return dict(zip(names, out, strict=True))
+
+
+def pin_derivatives(machine: Machine, q: Array) -> dict[str, Array]:
+    """Derivatives dq/dp (N, nv) at constant active coordinates, by the name of the parameter p.
+
+    The translational equations of a loop are phi = a . (p_2 - p_1) with an axis a of its first
+    frame. The k-th coordinate of a frame on a link with the rotation R moves the frame by R e_k,
+    so that dphi/dp = -+ a . R e_k, and J_P dq_P = -dphi gives the passive joints.
+
+    Args:
+        machine: The machine.
+        q: (N, nv) closed configurations.
+
+    Returns:
+        Derivatives by LINK.x, LINK.y, LINK.z for frames of loops that are fixed to a link and
+        carry no other link.
+    """
+    pins = _loop_pins(machine)
+    out = {f"{link}.{axis}": np.zeros_like(q) for link in pins for axis in "xyz"}
+    equations, passive = machine.closure.equations, machine.closure.passive
+    for i, configuration in enumerate(q):
+        _, jacobian = equations.evaluate_scaled(configuration)
+        constraint_derivatives = [_constraint_derivatives(machine, pins[link]) for link in pins]
+        if constraint_derivatives:
+            A, b = (
+                jacobian[:, passive],
+                -np.column_stack(constraint_derivatives) / equations.residual_units[:, None],
+            )
+            solved = (
+                np.linalg.lstsq(A, b, rcond=None)[0] * equations.coordinate_units[passive][:, None]
+            )
+            for k, name in enumerate(out):
+                out[name][i, passive] = solved[:, k]
+    return out
+
+
+def _loop_pins(machine: Machine) -> dict[str, list[tuple[int, float, str]]]:
+    """By frame: its loops, its side (-1, 1) in each of them, and the link that carries it."""
+    parent_joints = {joint.child: joint for joint in machine.tree.joints.values()}
+    moving_subtrees = machine.tree.joints_by_parent()
+    found: dict[str, list[tuple[int, float, str]]] = {}
+    for i, loop in enumerate(machine.closure.equations.loops):
+        for side, link in ((-1.0, loop.predecessor), (1.0, loop.successor)):
+            if (
+                link in parent_joints
+                and not parent_joints[link].is_movable
+                and link not in moving_subtrees
+            ):
+                found.setdefault(link, []).append((i, side, parent_joints[link].parent))
+    return found
+
+
+def _constraint_derivatives(machine: Machine, loop_sides: list[tuple[int, float, str]]) -> Array:
+    """Derivatives (m, 3) of all equations by the position of a frame, at the last evaluation."""
+    equations = machine.closure.equations
+    data = equations.data
+    out = np.zeros((len(equations.loop_of_row), 3))
+    count = len(equations.axis_of_frame1)  # rows of couplings follow
+    for i, side, parent in loop_sides:
+        joint, local = equations.frames[2 * i]
+        axes = (data.oMi[joint] * local).rotation
+        frame = machine.model.frames[machine.frame(parent)]
+        rotation = (data.oMi[frame.parentJoint] * frame.placement).rotation
+        for row in range(count):
+            if equations.loop_of_row[row] == i and equations.is_translation[row]:
+                out[row] += side * axes[:, equations.axis_of_frame1[row]] @ rotation
+    return out
