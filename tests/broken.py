@@ -9,6 +9,7 @@ import pytest
 
 import crane
 from crane.common.errors import CraneError
+from crane.formats.check import check
 
 DATA = Path(__file__).parent / "data"
 MODELS = Path(__file__).parents[1] / "models"
@@ -77,7 +78,16 @@ def copy_machine(machine: str, folder: Path) -> Path:
     return Path(shutil.copy(DATA / machine, folder))
 
 
+# Cases that are several mistakes, or one that breaks several things.
+SEVERAL_ERRORS = {
+    "infinite limit", "misspelt successor", "nothing moves", "unknown key far from all",
+    "payload without a tip", "payload with a moving joint", "control not of all",
+    "control characters in a key",
+}  # fmt: skip
+
+
 def assert_refused(broken: Broken, folder: Path) -> None:
+    """`load` refuses the machine with the message, and `check` reports it, and nothing else."""
     path = copy_machine(broken.machine, folder)
     for edit in broken.edits:
         edit.apply(folder)
@@ -87,6 +97,12 @@ def assert_refused(broken: Broken, folder: Path) -> None:
     assert message == with_line(broken.message, folder)
     assert message.isprintable()
     assert type(caught.value) is not CraneError
+    report = check(path)
+    findings = [str(finding).replace(": error: ", ": ", 1) for finding in report.findings]
+    assert any(finding.startswith(message) for finding in findings), findings
+    assert (report.status, report.summary) == (2, None)
+    if broken.machine != MINI and broken.name not in SEVERAL_ERRORS:
+        assert report.errors == 1, findings
 
 
 def with_line(message: str, folder: Path) -> str:

@@ -5,9 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import test_machine_file
-import test_mechanism
-import test_urdf
 from broken import (
     GROUND,
     LOOPED,
@@ -702,49 +699,6 @@ def test_says_all_at_once(case, tmp_path):
     lines = [str(finding) for finding in report.findings]
     assert lines == [with_line(line, tmp_path) for line in case.lines]
     assert all(line.isprintable() for line in lines)
-
-
-def refused():
-    for module in (test_urdf, test_machine_file, test_mechanism):
-        for name, cases in vars(module).items():
-            if name.isupper() and isinstance(cases, list):
-                for case in cases:
-                    yield pytest.param(case.values[0], id=f"{name.lower()}-{case.id}")
-
-
-@pytest.mark.parametrize("broken", list(refused()))
-@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
-def test_what_load_raises_is_among_the_findings(broken, tmp_path):
-    path = copy_machine(broken.machine, tmp_path)
-    for edit in broken.edits:
-        edit.apply(tmp_path)
-    with pytest.raises(crane.CraneError) as caught:
-        crane.load(path, strict=broken.strict)
-    report = check(path)
-    messages = [str(finding).replace(": error: ", ": ", 1) for finding in report.findings]
-    assert any(message.startswith(str(caught.value)) for message in messages), messages
-    assert report.status == 2
-    assert report.summary is None
-
-
-@pytest.mark.slow
-def test_says_no_more_than_load_of_single_slips(tmp_path):
-    """One slip is one finding, wherever it is: nothing that only follows from it."""
-    more = {}
-    for case in refused():
-        broken, folder = case.values[0], tmp_path / case.id
-        if broken.machine == MINI:
-            continue
-        folder.mkdir()
-        findings = checked(broken.machine, broken.edits, folder).findings
-        if sum(finding.is_error for finding in findings) > 1:
-            more[broken.name] = [str(finding) for finding in findings]
-    # which are several slips, or one that really breaks several things
-    assert more.keys() <= {
-        "infinite limit", "misspelt successor", "nothing moves", "unknown key far from all",
-        "payload without a tip", "payload with a moving joint", "control not of all",
-        "control characters in a key",
-    }, more  # fmt: skip
 
 
 @pytest.mark.parametrize("name", bundled_machines())

@@ -30,6 +30,12 @@ def machines():
     return loaded + [crane.load(DATA / name) for name in PLANAR]
 
 
+@pytest.fixture(scope="module")
+def at_home(machines):
+    """Each machine with its sketch at the home configuration."""
+    return [(machine, sketch_figure(machine)) for machine in machines]
+
+
 def drawn(figure):
     """Positions of the symbols that have names."""
     return {
@@ -102,30 +108,25 @@ def test_pins_are_where_forward_kinematics_puts_them(machines, name):
         np.testing.assert_allclose(found["tip"], plane @ tip, rtol=0, atol=1e-9)
 
 
-def test_both_frames_of_every_loop_are_drawn_at_one_place(machines):
-    for machine in machines:
-        found = drawn(sketch_figure(machine))
+def test_both_frames_of_every_loop_are_drawn_at_one_place(at_home):
+    for machine, figure in at_home:
+        found = drawn(figure)
         for loop in machine.closure.equations.loops:
             np.testing.assert_allclose(
                 found[f"loop {loop.name}"], found[f"loop {loop.name} mate"], rtol=0, atol=1e-9
             )
 
 
-def test_every_joint_and_loop_is_named_once(machines):
-    for machine in machines:
-        figure = sketch_figure(machine)
+def test_every_joint_and_loop_is_named_once(at_home):
+    for machine, figure in at_home:
         expected = [*machine.joints, *(loop.name for loop in machine.closure.equations.loops)]
         assert sorted(names(figure)) == sorted(map(format_joint_symbol, expected)), machine.name
 
 
-def test_no_words_overlap_at_home(machines):
-    for machine in machines:
-        assert overlaps(sketch_figure(machine)) == [], machine.name
-
-
-def test_no_words_lie_on_lines_at_home(machines):
-    for machine in machines:
-        assert crossed(sketch_figure(machine)) == [], machine.name
+def test_no_words_overlap_or_lie_on_lines_at_home(at_home):
+    for machine, figure in at_home:
+        assert overlaps(figure) == [], machine.name
+        assert crossed(figure) == [], machine.name
 
 
 def test_no_words_overlap_anywhere_on_the_cranes(machines):
@@ -137,9 +138,8 @@ def test_no_words_overlap_anywhere_on_the_cranes(machines):
             )
 
 
-def test_axes_are_equal_and_named_in_metres(machines):
-    for machine in machines:
-        figure = sketch_figure(machine)
+def test_axes_are_equal_and_named_in_metres(at_home):
+    for _, figure in at_home:
         (axes,) = figure.axes
         box = axes.get_position()
         width, height = figure.get_size_inches() * [box.width, box.height]
