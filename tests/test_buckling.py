@@ -16,8 +16,14 @@ from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.hydraulics.components import Cylinder, Hydraulics, Oil, Valve
 from crane.hydraulics.supply_and_engine import Supply
 
-SHAPE = {"joint": "x", "count": 1, "pin_offset": np.array([0.8, 0, 0]), "slide_axis": np.array([1.0, 0, 0]),
-         "lower_limit": 0.0, "upper_limit": 0.6}  # fmt: skip
+SHAPE = {
+    "joint": "x",
+    "count": 1,
+    "pin_offset": np.array([0.8, 0, 0]),
+    "slide_axis": np.array([1.0, 0, 0]),
+    "lower_limit": 0.0,
+    "upper_limit": 0.6,
+}
 
 
 def inertia(outer, inner=0.0):

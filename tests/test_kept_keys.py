@@ -26,7 +26,8 @@ from crane.motion.kinematics import _CompiledFrame, _CompiledPoint
 
 DATA = Path(__file__).parent / "data"
 MACHINES = ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf")
-# what formulas may read of a machine: `CompiledClosure._cache_key` has it, or follows from what it has
+# what formulas may read of a machine: `CompiledClosure._cache_key` has it, or follows from what
+# it has
 READ = {
     "equations": {
         "axis1", "axis2", "is_translation", "loop_of_row", "sign", "factors", "offsets", "loops",

@@ -9,8 +9,8 @@ others by that much: taken at their word they leave the linkage no freedom. With
 singular values below 1e-3 of the largest are digits, and are cut off: what remains has the rank of
 the linkage that was meant. As many independent equations as that rank are chosen and closed to
 rounding. They span the largest volume, so that each other row of U is a combination of theirs with
-factors of at most 1 (see `crane.closure.active_joint_selection.select_columns`): surplus equations stay
-open by no more than the sum of what the digits contradict, nowhere magnified.
+factors of at most 1 (see `crane.closure.active_joint_selection.select_columns`): surplus equations
+stay open by no more than the sum of what the digits contradict, nowhere magnified.
 
 That they are digits shows when the machine moves: over a turn, or its limits, they stay below 1e-4
 of the machine's size. What locks up opens further than that.

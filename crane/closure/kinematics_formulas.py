@@ -530,7 +530,7 @@ class VelocityKinematics:
         return [0.0] + [x[i][0] for i in range(1, len(self._kinematics.joint_axes))]
 
     def acceleration_bias(self, row: LoopEquationFormula) -> Scalar:
-        """Second derivative of phi at zero joint acceleration; see `LoopEquations.acceleration_bias`."""
+        """Second derivative of phi at zero joint acceleration, see `LoopEquations`."""
         one, two = row.bodies
         first, second = self.velocities[one], self.velocities[two]
         turned = spatial_dot(row.wrench_rate(first, second), subtract_spatial(second, first))

@@ -29,7 +29,8 @@ class ClosedConfiguration:
     Attributes:
         q: (nq,).
         q_a: (n,) its active coordinates.
-        jacobian: (m, nv) of the independent loop equations, as `LoopEquations.evaluate_scaled` has it.
+        jacobian: (m, nv) of the independent loop equations, as `LoopEquations.evaluate_scaled` has
+            it.
         passive_gamma: (m, n) passive rows of gamma.
     """
 

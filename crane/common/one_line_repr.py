@@ -10,7 +10,8 @@ def _no_html(_: Any) -> str | None:
     return None
 
 
-# What makes HTML of an object, or None where it has none: `crane.view.notebook.to_html`. The package
+# What makes HTML of an object, or None where it has none: `crane.view.notebook.to_html`. The
+# package
 # puts it here, because views stand above nothing (see CONTRIBUTING.md).
 to_html: Callable[[Any], str | None] = _no_html
 

@@ -108,8 +108,8 @@ class ComputedTorque(ControlLaw):
     tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
 
     Free joints get no force and follow no reference: what drives the others so while these swing
-    is `Dynamics.hybrid`. Where nothing is said to drive another joint (`Machine.undriven_joints`), a
-    warning names it and the force that it takes along the reference.
+    is `Dynamics.hybrid`. Where nothing is said to drive another joint (`Machine.undriven_joints`),
+    a warning names it and the force that it takes along the reference.
 
     Args:
         machine: The machine.

@@ -198,7 +198,7 @@ class ValveDrive(ControlLaw):
         return self._active_forces(circuit_values), circuit_values.state_rates
 
     def circuit_friction(self, inputs: ControllerInputs) -> list[Scalar]:
-        """Coulomb friction that is added to that of the joints `Hydraulics.circuit_friction_joints` [N], [N m]."""
+        """Coulomb friction [N], [N m] that the circuit adds to its joints."""
         friction_joints = self.circuit.hydraulics.circuit_friction_joints
         if not friction_joints:
             return []

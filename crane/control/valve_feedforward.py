@@ -35,8 +35,9 @@ class ValveFeedforward(ValvePD):
 
     theta is the sway against the reference's: what two inclinometers on the grapple tell, less
     what is planned, theta = (q_f - q_f,ref) - E (q_d - q_d,ref) with E as in `crane.motion.sway`.
-    A motion B u of the drives, B of `Sway.pivoting_motions`, makes theta'' + Omega^2 theta = u''. With
-    u'' = -2 zeta Omega theta' all modes have the damping ratio zeta more, and velocities do that:
+    A motion B u of the drives, B of `Sway.pivoting_motions`, makes theta'' + Omega^2 theta = u''.
+    With u'' = -2 zeta Omega theta' all modes have the damping ratio zeta more, and velocities do
+    that:
 
         K = -2 zeta B Omega,    Omega = Phi diag(omega) Phi^T M_ff,
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import LoadOptions, load_options
 
-CHANGES_SEPARATOR = " with "  # between a machine and the numbers of it that are changed, see `Machine.load_expression`
+# between a machine and the numbers of it that are changed, see `Machine.load_expression`
+CHANGES_SEPARATOR = " with "
 FOLDER_FILES = ("robot.yaml", "model.sdf")  # of example-parallel-robots, of Gazebo
 MACHINE_SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 

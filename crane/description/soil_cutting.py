@@ -177,11 +177,12 @@ class SoilCutting(ExternalForce):
         T = - 2 width (L - g D / sin(rho)) tau v.u / sqrt((v.u)^2 + smoothing^2) u,
         tau = c_a + (1 - sin phi) tan(delta) (q + gamma (d - D / 2)),
 
-    what the wedge before the blade resists with (`Soil.cutting_factors`; P is not below 0), what the edge
-    bears (`Soil.bearing_factors`), and what rubs on both sides of the blade where it does not cut, pressed
-    by soil at rest (Jaky 1944). R acts by g = s(v.m) s(-v.R/|R|) and B by s(-v.u), where s(x) is
-    x^2 / (x^2 + smoothing^2) of x > 0, else 0: none of the three ever drives the edge, and R and B
-    vanish as it is withdrawn. So soil carries nothing at rest: what leans on it creeps.
+    what the wedge before the blade resists with (`Soil.cutting_factors`; P is not below 0), what
+    the edge bears (`Soil.bearing_factors`), and what rubs on both sides of the blade where it does
+    not cut, pressed by soil at rest (Jaky 1944). R acts by g = s(v.m) s(-v.R/|R|) and B by
+    s(-v.u), where s(x) is x^2 / (x^2 + smoothing^2) of x > 0, else 0: none of the three ever
+    drives the edge, and R and B vanish as it is withdrawn. So soil carries nothing at rest: what
+    leans on it creeps.
 
     A blade that is flatter than `MIN_RAKE` against the surface is taken as this one, with what it
     fills; before one that is steeper than upright (or than leaves pi - delta - phi by

@@ -62,11 +62,11 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
     """Inertias, force laws and gravity in the order that `DynamicsFormulas` reads them.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
-    the geometry; per joint the 22 numbers of `JointForces.law_table`; gravity (3); per joint its rotor
-    inertia; per distance its 22 numbers, and where its two ends are on their bodies, likewise;
-    whether anything moves; what a circuit adds to the Coulomb friction of joints
-    (`JointForces.circuit_friction_columns`); mass and first moment of what stands (4); where the tip is on its
-    body, likewise, if there is one.
+    the geometry; per joint the 22 numbers of `JointForces.law_table`; gravity (3); per joint its
+    rotor inertia; per distance its 22 numbers, and where its two ends are on their bodies,
+    likewise; whether anything moves; what a circuit adds to the Coulomb friction of joints
+    (`JointForces.circuit_friction_columns`); mass and first moment of what stands (4); where the
+    tip is on its body, likewise, if there is one.
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -114,7 +114,7 @@ def circuit_friction_indices(machine: Machine, forces: JointForces) -> list[int]
 
 
 def stick_slip_mode_indices(machine: Machine, forces: JointForces) -> list[int]:
-    """Where `dynamics_constants` has what `JointForces.set_stick_slip_modes` says, joint by joint."""
+    """Indices in `dynamics_constants` of the stick-slip modes, joint by joint."""
     bodies = machine.model.nv
     first = BODY_SIZE * bodies + SLIP_INDEX
     last = (
@@ -131,7 +131,8 @@ class FormulaStructure:
         carrier_bodies: See `crane.dynamics.formulation`.
         recursion_plan: How forward dynamics goes through the machine's clusters; see
             `crane.dynamics.cluster_recursion`.
-        distance_bodies: By distance of `JointForces.frame_distances` the bodies that its ends are on.
+        distance_bodies: By distance of `JointForces.frame_distances` the bodies that its ends are
+            on.
         stick_slip_columns: Columns of the joints whose friction sticks.
         circuit_friction_columns: Columns of the joints whose Coulomb friction a circuit adds to.
         tip_body: Body of the tip, if there is one.
@@ -191,8 +192,8 @@ class DynamicsFormulas:
         q: (nb,).
         v_a: (n,).
         formula_structure: What goes where.
-        use_modes: Whether `JointForces.set_stick_slip_modes` says what joints do whose friction sticks, not
-            their velocities.
+        use_modes: Whether `JointForces.set_stick_slip_modes` says what joints do whose friction
+            sticks, not their velocities.
         drift: If it is known already.
 
     Attributes:

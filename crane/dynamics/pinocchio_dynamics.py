@@ -227,7 +227,7 @@ class PinocchioDynamics:
     def _accelerations_with_stick_slip(
         self, state: ClosedState, tau_a: Array
     ) -> tuple[Array, Array, float, Array]:
-        """Accelerations, friction of all joints, margin, modes; see `DynamicsFormulas.accelerations_with_stick_slip`."""
+        """Accelerations, friction of all joints, transition margin and stick-slip modes."""
         forces, stick_slip = self._joint_forces, list(self._joint_forces.sticking)
         slip, held, pace = forces.stick_slip_modes
         joint_friction = forces.friction_forces(state.v, use_modes=True)

@@ -439,7 +439,8 @@ def suppress_sway(machine: Machine, reference: Trajectory, method: str = "flat")
       moves so that the load follows it, as flatness of the pendulum has it: of a point mass on
       a string p_tip = p + L (p'' - g) / |p'' - g| (Fliess, Levine, Martin and Rouchon, Int. J.
       Control 61 (1995) 1327-1361). Here of rigid bodies on any free joints, by iteration: drives
-      q_d = s + B theta with s the reference and B of `Sway.pivoting_motions`, and theta corrected by
+      q_d = s + B theta with s the reference and B of `Sway.pivoting_motions`, and theta corrected
+      by
       -G^-1 times what inverse dynamics ask of the free joints, until they are asked for nothing.
     - "zv", "zvd": the reference is squeezed and sent through the shaper of `input_shaper`, whose
     modes

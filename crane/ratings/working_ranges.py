@@ -103,8 +103,8 @@ def working_range(
     """How far, deep and high a machine works, by the terms of ISO 7135 and brochures.
 
     Every number is an optimum over all strokes within their limits, with exact slopes, from
-    several postures (`crane.motion.workspaces.workspace_extremes.maximize_on_branch`); the slewing joint
-    stays at home. Without a bucket there are reach, depth and height alone.
+    several postures (`crane.motion.workspaces.workspace_extremes.maximize_on_branch`); the slewing
+    joint stays at home. Without a bucket there are reach, depth and height alone.
 
     Args:
         machine: The machine.

@@ -239,8 +239,8 @@ class MachineCodeStepper:
             code.
 
     Attributes:
-        bounds: See `CompiledClosure`; where other coordinates are better, see `Chart.chart_limits`;
-            whether joints are at rest.
+        bounds: See `CompiledClosure`; where other coordinates are better, see
+            `Chart.chart_limits`; whether joints are at rest.
         external_callback: What calls those external forces that are functions in Python, if there
             are some.
         state_layout: Parts of the state.
@@ -361,7 +361,7 @@ class MachineCodeStepper:
         return self.closure_code.geometry.constants, self._dynamics_constants, settings
 
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
-        """Outputs (.,) at a time [s] and a state, and `StickSlipAccelerations.transition_margin`."""
+        """Outputs (.,) and the transition margin at a time [s] and a state."""
         reference = reference_samples(self._chart.machine, self._control, np.array([time]))
         if self.external_callback is not None:
             callback_inputs = np.empty(self._program.formula_outputs("asked").size)

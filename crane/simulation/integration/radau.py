@@ -68,7 +68,8 @@ INTERPOLATION_WEIGHTS = np.array(
 STAGES = 3
 ComplexNumber = tuple[Scalar, Scalar]
 """A complex number."""
-_DIFFERENCE_STEP = 1e-7  # of rad, machine's size, per `Closure.characteristic_time`, by which derivatives are taken
+# of rad, machine's size, per `Closure.characteristic_time`, by which derivatives are taken
+_DIFFERENCE_STEP = 1e-7
 _MAX_NEWTON_ITERATIONS, _NEWTON_TOLERANCE = (
     8,
     1e-3,

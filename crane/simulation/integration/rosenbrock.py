@@ -63,7 +63,8 @@ _FINAL_WEIGHTS, _EMBEDDED_WEIGHTS = (
 )
 
 ROSENBROCK_TOLERANCE = 1e-8  # error of a step, per size of the state
-# accuracy that matters [rad], [machine's size], that per `Closure.characteristic_time`, and of a law's states
+# accuracy that matters [rad], [machine's size], that per `Closure.characteristic_time`, and of a
+# law's states
 _COORDINATE_ACCURACY, _VELOCITY_ACCURACY, _CONTROLLER_ACCURACY = 1e-11, 1e-9, 1e-9
 _MAX_STEP_RATIO, _SAFETY_FACTOR = 6.0, 0.9  # change of the step's length from one to the next
 

@@ -15,7 +15,8 @@ from crane.simulation.integration.python_stepper import StepProgress
 from crane.simulation.integration.stick_slip_integrator import StickSlipIntegrator
 from crane.simulation.integration.stick_slip_modes import EVENT_TOLERANCE, locate_event
 
-# of a passive joint in rad and shares of the machine's size per `Closure.characteristic_time`: where the branch
+# of a passive joint in rad and shares of the machine's size per `Closure.characteristic_time`:
+# where the branch
 # ends they grow beyond bounds
 _MAX_PASSIVE_VELOCITY = 300.0
 SCIPY_TOLERANCE = 1e-9  # error of a step, per size of the state

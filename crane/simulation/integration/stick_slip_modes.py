@@ -26,7 +26,8 @@ from crane.dynamics import Dynamics
 from crane.dynamics.joint_forces import REST_VELOCITY
 from crane.machine import Machine
 
-# how far beyond a margin an event is that has been found; see `StickSlipAccelerations.transition_margin`
+# how far beyond a margin an event is that has been found; see
+# `StickSlipAccelerations.transition_margin`
 EVENT_TOLERANCE = 1e-10
 _MAX_VELOCITY_CHANGE = (
     1e-6  # of velocities, what no joint at rest changes when it is brought to it

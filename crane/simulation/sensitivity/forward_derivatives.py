@@ -34,8 +34,8 @@ class ForwardDerivatives(RateProgram):
         """Derivatives at states of one motion.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see `Dynamics.set_stick_slip_modes`) and
-                references (N, c) of the states.
+            constants: The simulation's numbers, with what sticks (see
+                `Dynamics.set_stick_slip_modes`) and references (N, c) of the states.
             states: (N, .) as they are integrated.
             directions: p directions of the numbers, each part with a leading axis.
             has_joints_at_rest: Whether some joint is at rest.
@@ -140,11 +140,19 @@ class ForwardDerivatives(RateProgram):
             with r.loop(r.count) as i, r.loop(r.directions) as j:
                 at_both = i * r.directions + j
                 r.call(
-                    "tangent" + suffix, r.geometry, r.numbers, r.settings, r.frames,
-                    r.references.row_pointer(i, columns), r.states.row_pointer(i, self._state_layout.size),
-                    r.geometries.row_pointer(j, sizes[0]), r.numbered.row_pointer(j, sizes[1]),
-                    r.settled.row_pointer(j, sizes[2]), r.framed.row_pointer(j, sizes[3]),
-                    r.referred.row_pointer(at_both, columns), r.inputs.row_pointer(j, m),
+                    "tangent" + suffix,
+                    r.geometry,
+                    r.numbers,
+                    r.settings,
+                    r.frames,
+                    r.references.row_pointer(i, columns),
+                    r.states.row_pointer(i, self._state_layout.size),
+                    r.geometries.row_pointer(j, sizes[0]),
+                    r.numbered.row_pointer(j, sizes[1]),
+                    r.settled.row_pointer(j, sizes[2]),
+                    r.framed.row_pointer(j, sizes[3]),
+                    r.referred.row_pointer(at_both, columns),
+                    r.inputs.row_pointer(j, m),
                     r.out.row_pointer(at_both, width),
-                )  # fmt: skip
+                )
             r.return_value(r.count)

@@ -157,8 +157,8 @@ class RateProgram:
         """The rate (m,) of the minimal state.
 
         Args:
-            constants: The simulation's numbers, with what sticks (see `Dynamics.set_stick_slip_modes`) and
-                one row of references.
+            constants: The simulation's numbers, with what sticks (see
+                `Dynamics.set_stick_slip_modes`) and one row of references.
             state: As it is integrated.
             has_joints_at_rest: Whether some joint is at rest.
         """

@@ -145,7 +145,7 @@ class _VariationalIntegrator:
         return output_derivatives
 
     def _directional_derivatives(self, nodes: MotionNodes) -> tuple[Array, Array]:
-        """A and B, derivatives of outputs and margin; see `ForwardDerivatives.directional_derivatives`."""
+        """A and B, and the derivatives of outputs and transition margin."""
         reference_changes = nodes.interpolate(self._directions.references)
         return self._forward_derivatives.directional_derivatives(
             self._motion.constants_at(self._nominal_constants, nodes),
@@ -201,7 +201,7 @@ class _VariationalIntegrator:
         )
 
     def _apply_jump(self, jump: TransitionJump, sensitivity: Array) -> Array:
-        """S behind an instant at which joints start or stop; see `SimulatedMotion.sensitivity_jump`."""
+        """Sensitivities S after an instant at which joints start or stop."""
         track, m, nodes = (
             self._motion,
             self._forward_derivatives.state_size,
