@@ -51,7 +51,7 @@ class InPython:
         {},
         {"method": "RK45"},
         pytest.param({"backend": "pinocchio"}, marks=pytest.mark.slow),
-        pytest.param({"method": "LSODA"}, marks=pytest.mark.slow),
+        pytest.param({"method": "LSODA"}, marks=(pytest.mark.slow, pytest.mark.long)),
     ],
 )
 @pytest.mark.parametrize("python", [False, True])

@@ -236,7 +236,7 @@ def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert "Without both it holds the home posture; if not given then, no drive acts" in words
 
 
-@pytest.mark.parametrize("arguments", [["list"], ["info", "ur5_robot"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["info", "ur5_robot"], ["--version"]])
 def test_output_that_cannot_be_written_is_one_line(arguments):
     command = [sys.executable, "-c", MAIN, *arguments]
     with open("/dev/full", "w") as full:
@@ -256,7 +256,7 @@ def test_a_reader_that_has_gone_is_no_error(arguments):
     assert (result.returncode, result.stderr) == (1, "")
 
 
-@pytest.mark.parametrize("delay", [0.0, 1.5])
+@pytest.mark.parametrize("delay", [0.0, 0.5])
 def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
     # a shell that starts tests in the background has them ignore the signal
     code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {MAIN}"
@@ -302,16 +302,16 @@ crane.cli.simulate.progress_bar = progress_bar
 
 def test_an_interrupted_run_leaves_what_it_has(tmp_path):
     out, machine = tmp_path / "run", Path(__file__).parent / "data" / "four_bar.yaml"
-    command = [sys.executable, "-c", CUT + MAIN, "simulate", str(machine), "--duration", "40"]
+    command = [sys.executable, "-c", CUT + MAIN, "simulate", str(machine), "--duration", "8"]
     done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (130, "")
     line = done.stderr.splitlines()[-1]
     assert line.startswith("interrupted at t = ") and str(out) in line
     recording = crane.Recording.from_csv(out / "recording.csv")
     last = recording.time[-1]
-    assert 20 < last < 40 and line.startswith(f"interrupted at t = {last:g} s")
+    assert 4 < last < 8 and line.startswith(f"interrupted at t = {last:g} s")
     assert recording.task == "free motion"
-    assert recording.stopped == f"at t = {last:g} s of 40 s: interrupted"
+    assert recording.stopped == f"at t = {last:g} s of 8 s: interrupted"
     assert f"stopped at {last:.4g} s" in (out / "summary.md").read_text().splitlines()[0]
     whole = crane.simulate(machine, duration=0.5)
     np.testing.assert_allclose(recording.q[: len(whole.time)], whole.q, rtol=0, atol=1e-12)

@@ -94,12 +94,17 @@ class Floats(FormulaConstants):
 
 def formula(dynamics, quantity, q, v_a, x):
     """A quantity by its formulas, without compiling them."""
-    fast = dynamics.machine.closure.fast
-    posture = PositionKinematics(fast.geometry, Floats(fast.geometry.numbers), q.tolist())
-    loops = LoopFormulas(fast._equations, fast._structure, fast._active, fast._passive, posture)
+    compiled = dynamics.machine.closure.compiled_closure
+    posture = PositionKinematics(
+        compiled.geometry, Floats(compiled.geometry.constants), q.tolist()
+    )
+    loops = LoopFormulas(
+        compiled._equations, compiled._structure, compiled._active_columns,
+        compiled._passive_columns, posture,
+    )  # fmt: skip
     sweep = DynamicsFormulas(
-        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(), dynamics.form,
-        quantity in STICK_SLIP_QUANTITIES,
+        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(),
+        dynamics.formula_structure, quantity in STICK_SLIP_QUANTITIES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
 
@@ -263,7 +268,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     dynamics = crane.Dynamics(clad(bare(mini), 3))
     closure, n = mini.closure, 3
     tape = Tape()
-    q, posture, loops = closure.fast.trace(tape, 0, 2)
+    q, posture, loops = closure.compiled_closure.trace(tape, 0, 2)
     constants, v_a = FormulaConstants(tape, 1, dynamics.numbers), tape.load_vector(3, 0, n)
     sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
     rows = differentiate(sweep.passive_force, v_a)
@@ -272,7 +277,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     program.compile()
     at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
     found = np.zeros(n * n)
-    program.call("f", closure.fast.geometry.numbers, dynamics.numbers, at, v, found)
+    program.call("f", closure.compiled_closure.geometry.constants, dynamics.numbers, at, v, found)
     wanted = [
         oracles.derivative(
             lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2

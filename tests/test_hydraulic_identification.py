@@ -277,7 +277,7 @@ def test_noise_like_the_paper_s(machine, slow, method):
 @pytest.mark.parametrize("method", ["weak", "chambers"])
 def test_intervals_cover_and_nothing_is_biased(machine, quick, method):
     data = [column[::5] for column in quick]
-    rng, draws = np.random.default_rng(5), 120
+    rng, draws = np.random.default_rng(5), 80
     errors, inside = np.empty((draws, 5)), np.empty((draws, 5))
     for i in range(draws):
         found = identify_orifices(machine, recorded(data, 1.0, rng), "boom", method)

@@ -73,10 +73,10 @@ def test_noise_is_all_that_is_left(mini, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["ols", "wls"])
 def test_intervals_cover_the_truth(mini, method):
-    """Of 12 recordings, 90 to 99 % of the 95 % intervals."""
+    """Of eight recordings, 90 to 99 % of the 95 % intervals."""
     model = IdentificationModel(mini)
     given, covered = motion(mini, step=4e-3), []
-    for seed in range(12):
+    for seed in range(8):
         result = identify(mini, noisy(given, seed), method=method, bandwidth=30.0)
         truth = result.base.values(model.nominal)
         low, high = result.interval().T

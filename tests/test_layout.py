@@ -1,6 +1,7 @@
 """Imports run one way through the package."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "crane"
@@ -24,8 +25,13 @@ def room(module: str) -> str:
     return module.split(".")[1]
 
 
-def imports(path: Path):
+@cache
+def imports(path: Path) -> tuple[str, ...]:
     """Modules of the package that a file imports when it is imported, not for types only."""
+    return tuple(_imports(path))
+
+
+def _imports(path):
     tree = ast.parse(path.read_text())
     skipped = {
         id(inner)

@@ -16,7 +16,7 @@ from crane.common.errors import CraneError, CraneWarning
 from crane.description import bundled_machines
 from crane.formats.check import check
 
-WRONG = (0.7, 0.8, 0.9, 0.95, 0.99, 1.01, 1.05, 1.1, 1.2, 1.3)
+WRONG = (0.7, 0.9, 0.99, 1.01, 1.1, 1.3)
 LINKAGES = misfits.LINKAGES
 
 

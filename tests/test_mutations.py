@@ -94,13 +94,8 @@ def run(tmp_path, name, count, seed=0):
     assert not wrong, "\n".join(wrong[:40])
 
 
-@pytest.mark.parametrize("name", sorted(bundled_machines()))
-def test_some_mutations(tmp_path, name):
-    run(tmp_path, name, 12)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [60, pytest.param(None, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [25, pytest.param(None, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", sorted(bundled_machines()))
 def test_mutations(tmp_path, name, count):
     run(tmp_path, name, count, seed=1)

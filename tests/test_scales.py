@@ -124,16 +124,18 @@ def test_machines_of_any_size_are_the_same_machine(name, size, folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "size", [x if x in FEW[1:] else pytest.param(x, marks=pytest.mark.long) for x in SIZES]
+    "size", [x if x == FEW[1] else pytest.param(x, marks=pytest.mark.long) for x in SIZES]
 )
-@pytest.mark.parametrize("name", [*QUICK, *SLOW])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(x, marks=pytest.mark.long) for x in QUICK), *SLOW]
+)
 def test_all_machines_at_all_sizes(name, size, folder):
     for backend in ("pinocchio", "compiled")[: 1 if name in LARGE else 2]:
         assert_similar(name, size, folder, backend)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("s", [1e-3, 1e4])
+@pytest.mark.parametrize("s", [1e-3, pytest.param(1e4, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", ["five_bar.urdf", "mini_forwarder.yaml"])
 def test_workspaces_of_any_size(name, s, folder):
     frame = {"frame": "rod_a"} if name == "five_bar.urdf" else {}

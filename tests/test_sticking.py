@@ -175,7 +175,7 @@ def test_many_joints_that_stick_give_way_together(tmp_path, method):
 
 def test_a_loaded_crane_stands_still_for_an_hour(mini):
     """The mini forwarder without drive comes down onto its stop and rests: nothing creeps."""
-    found = run(mini, None, None, 3600.0, 0.1, method="DOP853")
+    found = run(mini, None, None, 3600.0, 1.0, method="DOP853")
     late = found.time > 3.0
     assert (found.q[late] == found.q[-1]).all() and (found.v[late] == 0).all()
     assert found.q[-1, 1] > mini.upper[1]
@@ -187,7 +187,7 @@ def test_a_loaded_crane_stands_still_for_an_hour(mini):
         }
     ).with_payload(crane.Payload(mass=0.3, frame="link7_tip"))
     start = [0.3, 0.015, 0.02]
-    found = run(loaded, None, start, 3600.0, 0.1, method="DOP853")
+    found = run(loaded, None, start, 3600.0, 1.0, method="DOP853")
     assert (found.q == start).all() and (found.v == 0).all()
     weight = Dynamics(loaded).gravity(np.array(start))
     assert 50.0 < abs(weight[1]) < 60.0
@@ -205,12 +205,12 @@ def test_methods_and_backends_agree(mini):
     exact, fixed = lift(method="DOP853"), lift(method="rk4")
     assert np.abs(exact.q - fixed.q).max() < 2e-7
     assert gap(exact) < 1e-9 * np.ptp(exact.channels["work"])
-    python = lift(backend="pinocchio", duration=0.5)
+    python = lift(backend="pinocchio", duration=0.25)
     rests = [f"rest_{joint}" for joint in ("q1", "X1", "X2")]
     for name in ("kinetic", "dissipated", *rests):
-        some = fixed.channels[name][:501]
+        some = fixed.channels[name][:251]
         assert python.channels[name] == pytest.approx(some, abs=1e-9 * np.abs(some).max())
-    assert 0 < (fixed.v[:501] == 0).mean() < 1
+    assert 0 < (fixed.v[:251] == 0).mean() < 1
 
 
 def test_a_boom_on_closed_valves_stays_for_an_hour():
@@ -221,7 +221,7 @@ def test_a_boom_on_closed_valves_stays_for_an_hour():
         for side in "ab"
     }
     machine = crane.load("patu655", {"payload.mass": 211.4, **tight})
-    found = run(machine, None, None, 3600.0, 0.5)
+    found = run(machine, None, None, 3600.0, 2.0)
     assert (found.q == found.q[0]).all() and (found.v == 0).all()
     for name, values in found.channels.items():
         if name.startswith("pressure"):

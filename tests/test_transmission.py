@@ -64,7 +64,7 @@ def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(nam
     tree = yourdfpy.URDF.load(path, load_meshes=False)
     names = {x for x in machine.joints if not x.startswith("base_")}
     assert set(tree.actuated_joint_names) - {"base"} == names
-    for _ in range(5):
+    for _ in range(3):
         q_a = near_home(machine, rng)
         state = transmission.update(machine.active, q_a)
         model, data, _ = by_pinocchio(path.read_text(), state)

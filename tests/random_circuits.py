@@ -4,27 +4,21 @@ Every run has to balance its oil and its energy to 1e-6 of what went through, or
 why it cannot.
 """
 
-import argparse
 import multiprocessing
-import sys
 import tempfile
 import time
 import warnings
-from collections import Counter
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from circuits import gaps
+from hydraulic_rig import rig
 
 import crane
 from crane.control import ValveSignals
 from crane.machine import Machine
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
-from circuits import gaps  # noqa: E402
-from hydraulic_rig import rig  # noqa: E402
 
 BALANCE = 1e-6
 DURATION, STEP, LONGEST = 1.5, 2e-3, 60.0
@@ -270,28 +264,3 @@ def bounded(seed: int, longest: float = LONGEST) -> Outcome:
     process.kill()
     process.join()
     return found
-
-
-def main() -> None:
-    """Run and count."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("count", type=int, nargs="?", default=500)
-    parser.add_argument("--first", type=int, default=0)
-    options = parser.parse_args()
-    begun, outcomes, worst, slowest = time.time(), Counter[str](), [0.0, 0.0], 0.0
-    bad = 0
-    for seed in range(options.first, options.first + options.count):
-        one = bounded(seed)
-        outcomes[one.what] += 1
-        worst = [max(worst[0], one.oil), max(worst[1], one.energy)]
-        slowest = max(slowest, one.seconds)
-        bad += one.bad
-        if one.bad or one.what == "one line" or one.seconds > 20:
-            print(f"{seed}: {one.what}, {one.oil:.1e}, {one.energy:.1e}, {one.seconds:.1f} s, "
-                  f"{one.said}", flush=True)  # fmt: skip
-    print(f"{dict(outcomes)} in {time.time() - begun:.0f} s, at most {slowest:.1f} s; oil "
-          f"{worst[0]:.1e}, energy {worst[1]:.1e}; {bad} to look at")  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()
