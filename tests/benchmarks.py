@@ -1,4 +1,4 @@
-"""Mechanisms of published benchmarks, as URDFs."""
+"""Mechanisms of published benchmarks as URDF texts."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Valid machines broken by small edits: what the tests of reading share."""
+"""Valid machines, small edits that break them, and assertions about the errors."""
 
 import re
 import shutil

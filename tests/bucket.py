@@ -1,4 +1,4 @@
-"""An excavator's bucket linkage: a cylinder turns a rocker on the stick, a link the bucket.
+"""The bucket linkage of an excavator: a cylinder turns a rocker, a link turns the bucket.
 
 Stick along x with the bucket's pin at its end, in the plane y = 0, metres. The cylinder's
 triangle has two mirror images, and so has the four-bar linkage of stick, rocker, link and bucket.

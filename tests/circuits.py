@@ -1,4 +1,4 @@
-"""A circuit that has everything."""
+"""A circuit with every kind of component, and its oil and energy balances."""
 
 import numpy as np
 from hydraulic_rig import rig

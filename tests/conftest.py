@@ -1,4 +1,4 @@
-"""Machines that several modules test with, and how property tests run."""
+"""Machines that several modules test with, and settings of property tests."""
 
 import dataclasses
 import os

@@ -1,4 +1,4 @@
-"""Circuits with everything that they can have, on loads that slide."""
+"""Circuits with every kind of component, on sliding loads, for tests of circuit diagrams."""
 
 from dataclasses import replace
 

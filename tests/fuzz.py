@@ -1,4 +1,4 @@
-"""Valid files with some bytes changed: what becomes of each. Run by test_fuzz.py in a process.
+"""Changes bytes of valid files and judges how each is read. `test_fuzz.py` runs this as a process.
 
     python tests/fuzz.py FORMAT FIRST COUNT
 

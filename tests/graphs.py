@@ -1,4 +1,4 @@
-"""Files whose links and joints make odd graphs: what becomes of each. Run by test_fuzz.py.
+"""Files with odd graphs of links and joints, judged. `test_fuzz.py` runs this as a process.
 
     python tests/graphs.py FORMAT FIRST COUNT
 

@@ -1,4 +1,4 @@
-"""A crane with a grapple that hangs on two free pins, and a floating four-bar with a pendulum."""
+"""A crane with a grapple on two free pins, and a floating four-bar with a pendulum."""
 
 import crane
 

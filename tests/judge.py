@@ -1,4 +1,4 @@
-"""Cases judged in a process of its own, which some of them may end."""
+"""Runs a fuzzing program as a process and collects its verdicts."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A program that is kept between runs: what it gives, and whether it had to be built.
+"""A program that is cached between runs: its result, and whether it was built again.
 
 As a program of its own it checks the one and prints the other: `python kept.py [die N] [late]`,
 where `die N` kills it when it has written its N-th file but not put it in place, and `late` lets

@@ -1,4 +1,4 @@
-"""Processes that end between two calls of the operating system, or at any instant, by SIGKILL."""
+"""Processes that SIGKILL ends between two system calls or at any instant."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Machines of several formats, what is asked of them, and how they are written."""
+"""Test machines in several formats, random states of them, and copies written in other formats."""
 
 import warnings
 from functools import cache

@@ -1,4 +1,4 @@
-"""Planar linkages whose files say the whole home, and the same with one of their lengths wrong.
+"""Planar linkages with a specified home configuration, and the same with one wrong length.
 
 Each is drawn by the places of its pins at home, metres: what joints are at there follows, so that
 a file with right lengths closes as it says, but for the digits.

@@ -1,4 +1,4 @@
-"""Motions of the mini forwarder to identify it from, with the forces of its own parameters."""
+"""Motions of the mini forwarder with the forces of its own parameters, for identification."""
 
 import dataclasses
 

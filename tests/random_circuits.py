@@ -1,4 +1,4 @@
-"""Random circuits on one to three cylinders and motors, crippled and starved ones among them.
+"""Random circuits on one to three cylinders and motors, also damaged and starved ones.
 
 Every run has to balance its oil and its energy to 1e-6 of what went through, or to say in one line
 why it cannot.

@@ -1,4 +1,4 @@
-"""Machines written anew at another size: the same mechanics in other numbers.
+"""Machine files with all quantities scaled by powers of one length and one mass factor.
 
 Lengths times `s`, masses times `m` (s^3 where the material stays the same), at the same gravity.
 Then times scale by sqrt(s), forces by m, torques by m s, and a motion that starts likewise goes on

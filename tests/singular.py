@@ -1,4 +1,4 @@
-"""Linkages that come to dead centres and to postures where branches of motion cross, as URDFs.
+"""Linkages with dead centres and bifurcations as URDF texts.
 
 They lie in the plane of x and z and turn about y; rods are slender, of 1 kg per rod.
 """

@@ -1,4 +1,4 @@
-"""Cylinders put into open machines: their steel, where they fit, and what the machine is then."""
+"""Cylinders added to open machines: steel, mounting points, and the closed machine."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Loops that are proposed where a description leaves them open, and taken over by a command."""
+"""Loops that are proposed for an open description, and the command that adds them."""
 
 import os
 import re

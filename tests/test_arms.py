@@ -1,4 +1,4 @@
-"""The two arms with recordings: geometry, masses and counterbalance from their tables alone."""
+"""The TX40 and the KR300: masses and counterbalance from tables, recordings predicted."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Machines that can be assembled several ways: told where the file does not say which is meant."""
+"""Machines with several assembly modes: the nearest one is taken, and ambiguity is reported."""
 
 import math
 import re

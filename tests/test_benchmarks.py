@@ -1,4 +1,4 @@
-"""Mechanisms of the benchmarks that solvers are judged by, against published or own references."""
+"""Benchmark mechanisms against published or independently computed references."""
 
 import warnings
 

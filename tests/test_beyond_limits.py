@@ -1,4 +1,4 @@
-"""References and motions beyond the limits of a joint: told before, and named where a run ends."""
+"""Motions beyond joint limits: a warning before the run, an error that names the joint."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Long recordings in blocks: the same numbers, in memory that does not grow with the regressor."""
+"""Recordings processed in blocks: same results, and bounded memory."""
 
 import os
 import subprocess

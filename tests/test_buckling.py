@@ -1,4 +1,4 @@
-"""Buckling of cylinders beside finite elements, and where their pins are."""
+"""Buckling loads of cylinders against finite elements."""
 
 from dataclasses import replace
 

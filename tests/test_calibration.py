@@ -1,4 +1,4 @@
-"""A machine fitted through its simulation: virtual recordings of known truth, and what is said."""
+"""Calibration through the simulation: virtual recordings of known parameters, and its report."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Lifting capacity beside statics by hand, cell by cell, and beside brute force."""
+"""Lifting capacity against statics by hand, cell by cell, and against brute force."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Limits of pins in lifting capacities, pin forces and buckling under them, by hand."""
+"""Lifting capacity with limits of pin forces and buckling, against statics by hand."""
 
 import dataclasses
 import re

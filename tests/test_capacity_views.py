@@ -1,4 +1,4 @@
-"""Rated loads as they are shown: pressures, table, pictures, page and command."""
+"""Output of lifting capacity: pressures, table, figures, page and command."""
 
 import csv
 import dataclasses

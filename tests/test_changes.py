@@ -1,4 +1,4 @@
-"""Machines loaded with some of their numbers changed."""
+"""Machines loaded with changed parameters."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""Everything that `crane check` finds, line by line."""
+"""Findings of `crane check`, line by line."""
 
 import shlex
 from dataclasses import dataclass

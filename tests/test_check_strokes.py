@@ -1,4 +1,4 @@
-"""What check says of tasks beyond the strokes, and of strokes where loops do not close."""
+"""`crane check` reports tasks beyond the strokes, and strokes at which the loops do not close."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Which joints to drive, and which overconstrained machines move: against closed forms."""
+"""Selection of the active joints and mobility of overconstrained machines."""
 
 import itertools
 import re

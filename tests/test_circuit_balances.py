@@ -1,4 +1,4 @@
-"""A circuit with all parts at once: its balances, and the methods that integrate it."""
+"""Oil and energy balances of a circuit with all components, and agreement of the methods."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What `crane check` says of circuits: loose ends, ways back, regulators, other units."""
+"""`crane check` on circuits: unconnected ports, return lines, regulators, units."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Circuits in machine files: what is read, written, changed, locked, linearized and refused."""
+"""Circuits in machine files: reading, writing, changes, locked joints, linear models, errors."""
 
 import warnings
 

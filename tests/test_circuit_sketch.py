@@ -1,4 +1,4 @@
-"""Drawn circuits: every part once with its words, nets that hang together and touch no other."""
+"""Circuit diagrams: every component once with its label, connected lines that touch no other."""
 
 import itertools
 from collections import Counter

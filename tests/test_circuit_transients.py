@@ -1,4 +1,4 @@
-"""Circuits beside their equations, written out again and integrated by scipy to 1e-10."""
+"""Transients of circuits against the same equations integrated by scipy to 1e-10."""
 
 import numpy as np
 import pytest

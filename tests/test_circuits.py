@@ -1,4 +1,4 @@
-"""Pumps with their regulators, valves and what is between nodes, each against a closed form."""
+"""Pumps with regulators, valves and components between nodes, each against a closed form."""
 
 import numpy as np
 import pytest

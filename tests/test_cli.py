@@ -1,3 +1,5 @@
+"""The command line: output, errors in one line, imports, interrupts and written files."""
+
 import os
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""Closing from anywhere: random mechanisms, beside scipy, with all their assemblies beside."""
+"""Multi-start search of a closed home: random mechanisms, against scipy and all assembly modes."""
 
 import numpy as np
 import pytest

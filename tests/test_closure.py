@@ -1,4 +1,4 @@
-"""Closing the loops: against closed forms, differences, and what each type of loop promises."""
+"""Loop closure against closed forms and differences, for each type of loop."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Machine code of one machine against the Pinocchio backend and the closure in numpy."""
+"""Machine code of a machine against the Pinocchio backend and the closure in numpy."""
 
 import copy
 import threading

@@ -1,4 +1,4 @@
-"""The program of docs/controllers.md, and what the page promises beyond it."""
+"""The program of docs/controllers.md works as the page describes."""
 
 import re
 import warnings

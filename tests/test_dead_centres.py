@@ -1,4 +1,4 @@
-"""Runs that pass dead centres, and postures where branches cross, by any active joint."""
+"""Runs through dead centres and bifurcations with any active joint."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Dead time of valves, against closed forms of the spool, scipy, and commands that are late."""
+"""Dead time of valves against closed forms of the spool and scipy."""
 
 import numpy as np
 import pytest

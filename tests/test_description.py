@@ -1,4 +1,4 @@
-"""What is read: valid machines, warnings, where machines are found, and mutated files."""
+"""Valid descriptions, warnings, machine lookup, and randomly changed files."""
 
 import random
 import re

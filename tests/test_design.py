@@ -1,4 +1,4 @@
-"""Designs beside linkage problems whose optimum is known, and slopes beside differences."""
+"""Design optimisation against known optima; derivatives against differences."""
 
 import numpy as np
 import pytest

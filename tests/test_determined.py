@@ -1,4 +1,4 @@
-"""What a recording does not determine is said; deviations are those of what is printed."""
+"""Parameters that a recording does not determine are reported, with their deviations."""
 
 import dataclasses
 import re

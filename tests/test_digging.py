@@ -1,4 +1,4 @@
-"""Break-out and tool forces beside free bodies by hand, brute force and the lifting capacity."""
+"""Breakout and tool forces against free-body diagrams, brute force and the lifting capacity."""
 
 import numpy as np
 import pytest

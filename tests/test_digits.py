@@ -1,4 +1,4 @@
-"""Machines written with few digits, whose surplus equations contradict the others by that much."""
+"""Machines with few digits, whose redundant equations contradict the others by as much."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Recordings with defects: each is told in a line that names column and figure, others are not."""
+"""Recordings with defects: each defect causes one warning that names the column."""
 
 import dataclasses
 import warnings

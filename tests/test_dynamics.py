@@ -1,4 +1,4 @@
-"""Equations of motion: against Lagrange on paper, Pinocchio's constraint solver, and balances."""
+"""Equations of motion against Lagrange's on paper, Pinocchio's constraint solver, and balances."""
 
 import dataclasses
 import warnings

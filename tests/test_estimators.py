@@ -1,3 +1,5 @@
+"""Estimators: closed forms, robustness, and coverage of their intervals."""
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt

@@ -1,4 +1,4 @@
-"""Recordings without noise, of motions that tell little: what is found, how far to trust it."""
+"""Identification from recordings without noise and with little information."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The bundled excavator beside what data sheets of its class print, and its cycle's balance."""
+"""The bundled excavator against data sheets of its class, and the energy balance of its cycle."""
 
 import warnings
 

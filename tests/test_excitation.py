@@ -1,4 +1,4 @@
-"""References for identification: what they are, that they keep limits, and what they tell."""
+"""Excitation trajectories: limits are kept, and the information that they carry."""
 
 import numpy as np
 import pytest

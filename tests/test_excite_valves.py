@@ -1,4 +1,4 @@
-"""Signals of valves for calibration: that limits are kept, and what they tell."""
+"""Valve signals for calibration: limits are kept, and the information that they carry."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Forces from outside: by Pinocchio's own external forces, closed forms, and energy."""
+"""External forces against Pinocchio's, closed forms and energy."""
 
 import dataclasses
 import warnings

@@ -1,4 +1,4 @@
-"""Names in figures stand there as they are, whatever matplotlib makes of their letters."""
+"""Names in figures appear literally, without interpretation by matplotlib."""
 
 import re
 from types import SimpleNamespace

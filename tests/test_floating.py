@@ -1,4 +1,4 @@
-"""Machines whose root floats: both backends, Pinocchio's open tree, closed forms of motion."""
+"""Machines with a floating base: both backends, Pinocchio's open tree, closed forms of motion."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Machines in other formats: written, and read again; couplings of URDF+."""
+"""Machines written in other formats and read again; couplings of URDF+."""
 
 import dataclasses
 import itertools

@@ -1,4 +1,4 @@
-"""The decoupled formulation against lone sub-chains, and what it leaves out."""
+"""The decoupled formulation against separate sub-chains."""
 
 from pathlib import Path
 

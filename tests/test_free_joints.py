@@ -1,4 +1,4 @@
-"""Joints that nothing drives: dynamics against paper, MuJoCo and Pinocchio; who may do what."""
+"""Free joints: dynamics against equations on paper, MuJoCo and Pinocchio; allowed operations."""
 
 import dataclasses
 

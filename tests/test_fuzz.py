@@ -1,4 +1,4 @@
-"""Valid files with bytes changed, and odd graphs, by the thousand: read, or refused in one line.
+"""Files with changed bytes and with odd graphs are read, or refused in one line.
 
 What counts as well is in fuzz.py: an error of the package or a closed machine, within a bound on
 the work, that is the same as before exactly if another parser finds the same words and numbers in

@@ -1,4 +1,4 @@
-"""Damaged visuals, meshes and recordings by the hundred: taken, or refused in one line.
+"""Damaged visuals, meshes and recordings are accepted, or refused in one line.
 
 What counts as well is in fuzz_inputs.py: nothing that is drawn refuses a machine; a recording is
 plotted, shown, identified from and replayed, or refused by an error of the package; each within

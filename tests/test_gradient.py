@@ -1,4 +1,4 @@
-"""Gradients of sums over simulations: sensitivities, closed forms, differences."""
+"""Gradients of sums over simulations against sensitivities, closed forms and differences."""
 
 import numpy as np
 import pytest

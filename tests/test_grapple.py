@@ -1,4 +1,4 @@
-"""The grapple that hangs: its sway against equations on paper, and references that leave none."""
+"""A hanging grapple: sway against equations on paper, and references without residual sway."""
 
 import hanging
 import numpy as np

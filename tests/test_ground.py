@@ -1,4 +1,4 @@
-"""Contact with the ground: statics of a block on a slope, falls, wheels, energy."""
+"""Ground contact: statics of a block on a slope, falls, wheels, energy."""
 
 import warnings
 

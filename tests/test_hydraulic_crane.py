@@ -1,4 +1,4 @@
-"""The full-size crane on its hydraulics: what the issue of it asks to be shown."""
+"""The full-size crane on its hydraulics: balances, convergence, control and output."""
 
 import warnings
 

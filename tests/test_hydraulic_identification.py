@@ -1,4 +1,4 @@
-"""Valves, oil and cylinder friction from recordings that another program of equations made."""
+"""Valves, oil and cylinder friction identified from independently simulated recordings."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The electro-hydraulic forwarder paper again: its claims, its page, and `crane circuit`."""
+"""The reproduction of the electro-hydraulic forwarder paper: claims, page, and `crane circuit`."""
 
 import re
 import subprocess

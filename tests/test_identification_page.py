@@ -1,4 +1,4 @@
-"""The case of docs/identification.md: its commands, its program, and the figures on the page."""
+"""The commands, the program and the figures of docs/identification.md agree with the page."""
 
 import contextlib
 import io

@@ -1,4 +1,4 @@
-"""What an identification leaves behind: machine files, a report, parameters; and payloads."""
+"""Output of identification: machine files, report, parameters, payloads."""
 
 import csv
 import dataclasses

@@ -1,4 +1,4 @@
-"""Identification from motions whose truth is known."""
+"""Identification from motions with known parameters."""
 
 import dataclasses
 from functools import partial

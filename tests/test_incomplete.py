@@ -1,4 +1,4 @@
-"""Files that leave something open: completed, told, and right."""
+"""Incomplete files: completed by documented assumptions, with a warning."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Inertias that no body has: what is computed with, what is told, and what stays refused."""
+"""Physically impossible inertias: when they are corrected, reported or refused."""
 
 import warnings
 from pathlib import Path

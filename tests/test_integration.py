@@ -1,4 +1,4 @@
-"""Steps in machine code against the same steps in Python, and against other methods."""
+"""Integration steps in machine code against the same steps in Python, and other methods."""
 
 import numpy as np
 import pytest

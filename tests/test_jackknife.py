@@ -1,4 +1,4 @@
-"""Standard deviations that need no model of the noise."""
+"""Jackknife standard deviations, which need no noise model."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a run says of itself: chatter, stops that gain energy, pistons beyond their cylinders."""
+"""Remarks on a run: chatter, end stops that gain energy, pistons beyond their cylinders."""
 
 import re
 import warnings

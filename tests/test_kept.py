@@ -1,4 +1,4 @@
-"""Programs that later runs find by what they depend on, whatever befell the files."""
+"""Cached programs are found again by their keys, also after damage to the files."""
 
 import os
 import shutil

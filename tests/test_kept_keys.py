@@ -1,4 +1,4 @@
-"""What programs are found by says all that their formulas depend on."""
+"""Keys of cached programs contain everything that the formulas depend on."""
 
 import copy
 import dataclasses

@@ -1,4 +1,4 @@
-"""What is found once and kept between runs: home and structure of machines, motions of tasks."""
+"""Cached results: home and structure of machines, motions of tasks."""
 
 import dataclasses
 import pickle

@@ -1,4 +1,4 @@
-"""Whatever a command has written when it is killed: what was there, or what it writes, never both.
+"""A killed command leaves either the old files or the new ones, never a mixture.
 
 What SIGKILL leaves is what is on the disk: so the disk is copied before each call that a command
 makes on files, and looked at. Buffers of the process are lost, as they would be, and so are locks.

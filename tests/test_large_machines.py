@@ -1,4 +1,4 @@
-"""Chains, trees and rings of many joints: their dynamics beside Pinocchio's."""
+"""Dynamics of chains, trees and rings with many joints against Pinocchio."""
 
 from functools import cache
 from pathlib import Path

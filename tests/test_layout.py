@@ -1,4 +1,4 @@
-"""Imports run one way through the package."""
+"""The order of imports and the names of modules."""
 
 import ast
 from functools import cache

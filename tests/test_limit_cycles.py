@@ -1,4 +1,4 @@
-"""Oscillations that do not decay: found in samples, told of runs, foretold of load sensing."""
+"""Limit cycles: detected in samples, reported for runs, predicted for load sensing."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Linear models: closed forms, small steps of the simulation, other programs' formats."""
+"""Linear models against closed forms, short simulations and formats of other programs."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Linkages and parallel robots from files of several formats: how they move."""
+"""Motion of linkages and parallel robots from files of several formats."""
 
 import numpy as np
 import pinocchio as pin

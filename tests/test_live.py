@@ -1,4 +1,4 @@
-"""Live views: loops closed at every move, an edge instead of a jump, nothing left at the end."""
+"""Live views: closed loops after every move, limits of the branch, end of the process."""
 
 import os
 import re

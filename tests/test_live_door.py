@@ -1,4 +1,4 @@
-"""Who gets into a live view: not a page of somebody else, and no value that means nothing."""
+"""Access control of live views: other web pages and invalid values are rejected."""
 
 import asyncio
 import http.client

@@ -1,4 +1,4 @@
-"""Break-out forces of a loader whose tilt cylinder stands on the frame, beside statics by hand."""
+"""Breakout forces of a wheel loader whose tilt cylinder stands on the frame, against statics."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Logs of other programs as recordings."""
+"""Logs of other programs read as recordings."""
 
 import functools
 from pathlib import Path

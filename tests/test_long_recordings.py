@@ -1,4 +1,4 @@
-"""Recordings as long as an hour at 1 ms do not fill the memory, and are what they were."""
+"""Recordings of an hour at 1 ms need little memory and keep their values."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The assembled machine: what it says of itself, and what it refuses."""
+"""The assembled machine: its properties and its errors."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Every line that a user sees for a broken machine file."""
+"""Errors of broken machine files, line by line."""
 
 import pytest
 from broken import ROCKER, assert_refused, case, swap, whole

@@ -1,4 +1,4 @@
-"""What a page draws on a machine: arrows that can be compared, springs, bodies that slide."""
+"""Markers on a page's machine: force arrows on a common scale, springs, sliding bodies."""
 
 import warnings
 from pathlib import Path

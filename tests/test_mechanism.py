@@ -1,4 +1,4 @@
-"""Every line that a user sees for well described parts that make no machine."""
+"""Errors of valid parts that make no machine, line by line."""
 
 import pytest
 from broken import GROUND, MINI, ROCKER, assert_refused, case, copy_machine, swap

@@ -1,4 +1,4 @@
-"""Linkages with one length wrong: refused with the gap and that length, never turned over."""
+"""Linkages with one wrong length: the error names the gap and the length, no branch is changed."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""MJCF files: what they say is what MuJoCo computes with."""
+"""MJCF files are read with the meaning that MuJoCo gives them."""
 
 import re
 import sys

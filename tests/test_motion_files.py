@@ -1,4 +1,4 @@
-"""Motions from files: points, recordings and noisy samples; and lever tasks with a start."""
+"""Motions from files: points, recordings, noisy samples, and lever tasks with a start."""
 
 import warnings
 

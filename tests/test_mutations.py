@@ -1,4 +1,4 @@
-"""Every value of every bundled machine file replaced by another: told where it stands, once.
+"""Any changed value in a bundled machine file causes errors at its own place only.
 
 An error is true if it points at what was changed, at what that is part of, or names it: a value
 that is right by itself may not fit others. All else would follow from the error that was told.

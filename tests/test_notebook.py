@@ -1,4 +1,4 @@
-"""What notebooks show of machines, runs and results, and that nothing in a name gets out of it."""
+"""Output of machines, runs and results in notebooks, with names escaped."""
 
 import dataclasses
 import inspect

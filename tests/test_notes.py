@@ -1,4 +1,4 @@
-"""Words beside numbers of written machine files, which load as they were, to the last bit."""
+"""Comments in written machine files, which are read again with identical numbers."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Numbers that a user gives, numbers that a user reads, and lines that hold them."""
+"""Numbers in options, in output, and in lines of tables."""
 
 import numpy as np
 import pytest

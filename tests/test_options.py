@@ -1,4 +1,4 @@
-"""Options at the edge of what they take: an answer, or one line that says what is wrong.
+"""Options with extreme values give an answer, or one line that says what is wrong.
 
 What counts as well is in fuzz_options.py: exit status 0 to 2, no traceback, within 60 s of
 computing and 2 GB, an error alone on its line and nothing left behind it, and of a call that

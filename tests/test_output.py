@@ -1,3 +1,5 @@
+"""Files and folders are written completely or not at all."""
+
 import ast
 import os
 import shutil

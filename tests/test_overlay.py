@@ -1,4 +1,4 @@
-"""Two runs of a machine over each other: how far they are apart is told."""
+"""Two runs compared in one figure, with their difference."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is said of the package agrees wherever it is said; what it lacks is told in one line."""
+"""Metadata agrees everywhere, and a missing extra is an error of one line."""
 
 import re
 import sys

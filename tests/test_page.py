@@ -1,4 +1,4 @@
-"""The page in a browser: what it shows is what was recorded, and nothing leaves it."""
+"""The run page in a browser: shown values equal the recording, no outside requests."""
 
 import base64
 import dataclasses

@@ -1,4 +1,4 @@
-"""The convention of Gepetto's example-parallel-robots."""
+"""Machines in the convention of Gepetto's example-parallel-robots."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""How often a sample of a recording is read, closed and computed on its way to the parameters."""
+"""Number of times that a sample is read, closed and evaluated during identification."""
 
 import numpy as np
 import pytest

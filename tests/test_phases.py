@@ -1,4 +1,4 @@
-"""Levers that are held until joints have come somewhere: phases of a task."""
+"""Phases of lever tasks that end when joints reach a value."""
 
 import numpy as np
 import pytest

@@ -1,3 +1,5 @@
+"""Figures of recordings: curves, labels, formats."""
+
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Where a hydraulic run's power goes: closed forms, balances, and what is shown of them."""
+"""Power balance of hydraulic runs: closed forms, balances, figures and table."""
 
 import itertools
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is wrong with a prior is told in terms of the parameters that it is about."""
+"""Errors of priors name the parameters that they concern."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Random circuits, crippled and starved ones among them: they balance, or say why not."""
+"""Random circuits, also damaged and starved ones, keep their balances or end with one line."""
 
 import pytest
 from random_circuits import bounded

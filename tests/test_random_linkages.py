@@ -1,4 +1,4 @@
-"""Random planar linkages: they load with what is proposed, close, and move as multipliers say.
+"""Random planar linkages load, close, and move as constraint dynamics says.
 
 Trees of revolute and prismatic joints in a vertical plane, closed by one to three pins at random
 places. Which joints to drive is left to the package. What is thrown away is counted by reason.

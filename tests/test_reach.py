@@ -1,4 +1,4 @@
-"""Reach and ends of strokes in a study: as far as a closed form says, not as a grid has it."""
+"""Reach and stroke ends in studies against closed forms, not against a grid."""
 
 import warnings
 

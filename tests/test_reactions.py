@@ -1,4 +1,4 @@
-"""Forces in the joints: by hand, body by body, and beside Pinocchio's constraint solver."""
+"""Reactions of joints against free-body diagrams and Pinocchio's constraint solver."""
 
 import hanging
 import numpy as np

@@ -1,4 +1,4 @@
-"""The virtual rig against simulations of the plant, and against what its sensors may tell."""
+"""The virtual rig against simulations of the plant, and models of its sensors."""
 
 import dataclasses
 

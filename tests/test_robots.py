@@ -1,4 +1,4 @@
-"""Parallel robots as others exported them: they close, hold and fall without a change."""
+"""Parallel robots exported by others: they close, hold and fall unchanged."""
 
 import warnings
 from pathlib import Path

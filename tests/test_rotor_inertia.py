@@ -1,4 +1,4 @@
-"""Rotors that turn with joints, behind their gears: in every quantity, format and backend."""
+"""Rotor inertias behind gears: in every quantity, format and backend."""
 
 import warnings
 

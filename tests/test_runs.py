@@ -1,3 +1,5 @@
+"""Folders of runs: recording, summary and metadata."""
+
 import os
 import re
 

@@ -1,4 +1,4 @@
-"""The same machine at other sizes: it closes, moves and is checked as it is at one metre.
+"""A machine scaled to other sizes closes, moves and is checked as the original.
 
 Lengths times s, masses times s^3 or another factor, times by the root of s: every number of the
 mechanics follows from those of the machine as it is by one factor (`scaled.py`).

@@ -1,4 +1,4 @@
-"""Seals that press with the pressure and brakes that let go with the spool: closed forms."""
+"""Pressure-dependent seal friction and spring-applied brakes against closed forms."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Sensitivities of simulations: closed forms, and differences of simulations."""
+"""Sensitivities of simulations against closed forms and differences of simulations."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Exact derivatives of the dynamics: differences of order 8, Pinocchio's own, and each other."""
+"""Derivatives of the dynamics against differences of order 8 and Pinocchio's."""
 
 import warnings
 from functools import cache

@@ -1,4 +1,4 @@
-"""Sensors of a machine: what is known of them, what they disagree on, logs that they name."""
+"""Sensors of a machine: corrections, redundancy, and logs that name them."""
 
 import dataclasses
 import re

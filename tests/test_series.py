@@ -1,4 +1,4 @@
-"""Joints with several freedoms, as series of joints with one each."""
+"""Joints with several freedoms as series of joints with one each."""
 
 import numpy as np
 import pinocchio as pin

@@ -1,4 +1,4 @@
-"""Circuits in few lines: what holds for all items, bores and rods, and the manual's crane."""
+"""Short forms of circuits in machine files: defaults for all items, bores and rods."""
 
 import re
 import textwrap

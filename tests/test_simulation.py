@@ -1,3 +1,5 @@
+"""Simulations: outputs, tolerances, start states, errors."""
+
 import warnings
 
 import numpy as np

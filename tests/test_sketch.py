@@ -1,4 +1,4 @@
-"""Sketches: pins where forward kinematics puts them, every name once, no words on others."""
+"""Sketches: pins at forward kinematics, every name once, labels that overlap nothing."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Tipping: hand moments, Pinocchio's free-flyer, and machines that stand on contacts."""
+"""Tipping: moments by hand, Pinocchio's free-flyer, and machines on contacts."""
 
 import shutil
 

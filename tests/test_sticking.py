@@ -1,4 +1,4 @@
-"""Friction that sticks: rest, break-away, stops and stick-slip, against closed forms."""
+"""Stiction: rest, break-away, stops and stick-slip against closed forms."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Which joints at rest stay so: least squares within bounds, and rows that are independent."""
+"""Forces of resting joints: bounded least squares and independent rows."""
 
 import numpy as np
 import pytest

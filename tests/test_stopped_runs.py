@@ -1,4 +1,4 @@
-"""Runs that stop before their time leave what there is of them, and say when and why."""
+"""Runs that stop early keep their samples and report the time and the reason."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a URDF says and nobody reads is told; meshes are found by names of any kind."""
+"""Unknown URDF elements are reported, and mesh file names of any kind are resolved."""
 
 import warnings
 

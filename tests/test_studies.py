@@ -1,4 +1,4 @@
-"""Design studies: what is measured, and that it does not matter where."""
+"""Design studies: measures are correct and independent of the process that computes them."""
 
 import os
 import signal

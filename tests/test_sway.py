@@ -1,4 +1,4 @@
-"""What sway tells: a free joint is a row whose force is known to be zero."""
+"""Identification from sway: rows of free joints, whose force is zero."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Terms of a model and what is known before, by name: in the machine file and in calls."""
+"""Terms of the identification model and priors by name: in the machine file and in calls."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""Long curves are drawn with fewer points, and look the same."""
+"""Long curves are drawn with fewer points and the same appearance."""
 
 import numpy as np
 import pytest

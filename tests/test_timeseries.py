@@ -1,3 +1,5 @@
+"""Time series as CSV files: reading, writing and errors."""
+
 import math
 import os
 

@@ -1,4 +1,4 @@
-"""A closed machine in ROS: its tree as URDF, states of all joints from those of actuators."""
+"""A closed machine in ROS: tree as URDF, states of all joints from those of the actuators."""
 
 import runpy
 import sys

@@ -1,4 +1,4 @@
-"""Valves whose chambers have a spool each, against closed forms, scipy and their balances."""
+"""Valves with one spool per chamber against closed forms, scipy and their balances."""
 
 import dataclasses
 import warnings

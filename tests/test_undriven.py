@@ -1,4 +1,4 @@
-"""Joints that are active because a machine has their freedom, though nothing drives them."""
+"""Active joints that no actuator drives."""
 
 import warnings
 

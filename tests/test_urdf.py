@@ -1,4 +1,4 @@
-"""Every line that a user sees for a broken URDF, with the loops of URDF+ too."""
+"""Errors of broken URDF files, including the loops of URDF+, line by line."""
 
 import os
 

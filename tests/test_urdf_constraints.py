@@ -1,4 +1,4 @@
-"""`<constraint>`, as proposed for URDF: where it is asked for, the same as `<loop>`."""
+"""The proposed URDF element `<constraint>` is equivalent to `<loop>`."""
 
 import numpy as np
 import pytest

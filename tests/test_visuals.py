@@ -1,4 +1,4 @@
-"""What URDFs draw: whatever stands there is drawn, or told and left out, and never needed."""
+"""Visuals of URDFs are drawn or reported and left out, and never required."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""What takes long says so on a terminal, and nowhere else."""
+"""Long computations show progress on a terminal only."""
 
 import os
 import pty

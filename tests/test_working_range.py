@@ -1,4 +1,4 @@
-"""A working range beside triangles by hand, brute force over the strokes, and data sheets."""
+"""Working ranges against triangles by hand, brute force over the strokes, and data sheets."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Workspaces against geometry on paper: triangle inequalities, circles, pins of cranes."""
+"""Workspaces against triangle inequalities, circles and pins of cranes."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""The home posture written into files: what stands there stays, and loading again searches not."""
+"""The home configuration written into files: other text stays, loading needs no search."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""xacro files: expanded as xacro does, with packages found as this program finds them."""
+"""xacro files expand as with xacro itself, with packages found by this program's rules."""
 
 import shutil
 import warnings

@@ -1,4 +1,4 @@
-"""The command line, called in this process: what a user types, and what comes of it."""
+"""The command line called in this process, with its exit status, output and errors."""
 
 import contextlib
 import io

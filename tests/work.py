@@ -1,4 +1,4 @@
-"""How much a call computes: lines of the package that it runs, whatever else the machine does."""
+"""Counts the lines of the package that a call executes, independently of the machine's load."""
 
 import sys
 from collections import Counter

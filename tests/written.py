@@ -1,4 +1,4 @@
-"""Every command that writes, with arguments that cost little, and what they read."""
+"""Every command that writes, with cheap arguments, and the files that it reads."""
 
 import shutil
 import warnings
