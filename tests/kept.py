@@ -32,7 +32,7 @@ def toy(factor=3.0, built=None):
         with program.routine("each", counts=("count",), arrays=("x", "out")) as r:
             with r.loop(r.count) as i:
                 r.call("formula", r.x.row(i, 2), r.out.row(i, 3))
-            r.give(r.count)
+            r.return_value(r.count)
 
     return Program.from_cache(("toy", factor), build)
 

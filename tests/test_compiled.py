@@ -135,9 +135,9 @@ NAMES = ["mini", "loaded mini", "bare mini", "slider_crank", "ur5_robot", "xarm7
 )
 def test_every_quantity_agrees_with_pinocchio(machines, name, quantities):
     machine, share = machines[name]
-    samples = draw(machine, 40, share=share)
+    samples = draw(machine, 15, share=share)
     if name == "slider_crank":
-        samples["q"] = np.random.default_rng(0).uniform(0.2, 2.8, (40, 1))
+        samples["q"] = np.random.default_rng(0).uniform(0.2, 2.8, (15, 1))
     both = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
     for quantity in quantities:
         found, wanted = (ask(dynamics, quantity, samples) for dynamics in both)
@@ -244,7 +244,7 @@ def test_the_trunk_is_the_body_that_carries_all_others(machines, five_bar, tmp_p
 def test_an_oblique_trunk_agrees_with_pinocchio(tmp_path, kind, closed):
     machine = dressed(on_a_stand(tmp_path, kind, closed))
     assert machine.closure.compiled_closure.geometry.trunk == 1
-    samples = draw(machine, 40)
+    samples = draw(machine, 15)
     home, stand = machine.home[machine.closure.active], machine.active.index("stand")
     moved = samples["q"][:, stand].copy()
     samples["q"] = home + np.random.default_rng(1).uniform(-0.3, 0.3, samples["q"].shape)

@@ -148,7 +148,8 @@ def test_halving_the_step_changes_nothing(task):
     assert np.abs(half.q[::2] - whole.q).max() < 1e-7
 
 
-@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "swing"])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach", pytest.param("swing", marks=pytest.mark.long)])
 def test_halving_the_step_changes_less_than_a_start_beside(loaded, task):
     """A rod that slows down below the Stribeck velocity sticks and slips.
 

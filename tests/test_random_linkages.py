@@ -122,7 +122,7 @@ def driven(path):
     return machine
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(plans())
 def test_random_linkages_move_as_constraint_dynamics_says(plan):
     with tempfile.TemporaryDirectory() as folder:

@@ -48,7 +48,7 @@ def test_they_close(name):
     assert (machine.home <= coordinates.upper + 1e-9).all()
 
 
-@pytest.mark.parametrize("name", FREEDOMS)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_check_fits_on_a_screen(name):
     told = typed("check", ROBOTS / name / "robot.yaml")
     lines = told.stdout.splitlines()

@@ -66,7 +66,7 @@ def compare(dynamics, quantity, friction, span, arguments, tolerance=1e-9, pace=
 
     def value(*given):
         q_a, v_a, x = (*given, *[np.zeros((9, n))] * (3 - len(given)))
-        return dynamics.at(key, machine.closure.solve(q_a), v_a, x)
+        return dynamics.evaluate_closed(key, machine.closure.solve(q_a), v_a, x)
 
     for part, derivative in enumerate(found.values()):
         for k in range(n):
