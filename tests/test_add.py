@@ -137,7 +137,7 @@ def test_an_open_digger_becomes_a_closed_one(closed, tmp_path):
 
 
 def test_the_force_of_the_boom_cylinder_by_moments(closed):
-    """Weights about the boom's pin, and a cylinder with weight of its own between two pins."""
+    """Gravity moments about the boom's pin, with the weight of the cylinder between two pins."""
     dynamics = crane.Dynamics(closed)
     q_a = covered(closed, closed.active, np.random.default_rng(5), 7)
     for sample, q in zip(q_a, closed.closure.solve(q_a), strict=True):
@@ -181,7 +181,7 @@ def test_the_closed_digger_moves_as_it_should(closed):
 
 
 def test_without_weight_it_is_the_open_machine(tmp_path):
-    """Cylinders of a hair's width, seen from the booms' angles."""
+    """With very light cylinders the machine moves as the open one does."""
     first = crane.load(planar(tmp_path))
     for name, given, before in (("hoist", LIFT, "digger.urdf"), ("crowd", FOLD, "a.yaml")):
         length = given.get("dead_length", given["stroke"] + 4 * given["bore"])
@@ -198,7 +198,7 @@ def test_without_weight_it_is_the_open_machine(tmp_path):
 
 
 def test_in_space_the_barrel_has_a_universal_joint(tmp_path):
-    """Eyes beside the boom's plane, and between bodies that turn about two axes."""
+    """Mounting points beside the boom's plane, and between bodies that turn about two axes."""
     given = [
         ("hoist", ["house:0.9,0.4,0.1", "boom:1.9,0.2,0.3"], 0.1, 0.9, None),
         ("side", ["boom:2.6,0.4,0", "post:0.1,0.35,0.2"], 0.06, 0.4, 1.3),
@@ -298,7 +298,7 @@ def test_of_two_joints_it_drives_the_one_it_moves_best(tmp_path):
 
 
 def test_home_goes_where_the_cylinder_fits(tmp_path):
-    """At zero the eyes are too near each other for it."""
+    """At the zero configuration the mounting points are closer than the retracted cylinder."""
     given = LIFT | {"stroke": 0.6, "dead_length": 1.8}
     added, told = told_by(
         crane.add_cylinder, planar(tmp_path), name="hoist", out=tmp_path / "d.yaml", **given
@@ -348,7 +348,7 @@ def test_its_ends_are_dead_centres_where_these_come_first(tmp_path, along):
 
 
 def test_its_ends_are_where_the_machine_closes(tmp_path):
-    """Of a slider that its crank and rod let go no farther than they reach in line."""
+    """The stroke of a slider ends where its crank and rod are in line."""
     data = Path(__file__).parent / "data"
     text = (data / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {data}/")
     (tmp_path / "s.yaml").write_text(text.replace("active: [theta]", "active: [s]"))
@@ -377,7 +377,7 @@ def test_strokes_beyond_a_dead_centre_are_told(tmp_path):
 
 
 def test_machines_lighter_than_their_cylinder_are_told(tmp_path):
-    """Files of other people have placeholders for masses: forces would be those of the steel."""
+    """Placeholder masses in a file are reported, since only the steel would have weight."""
     path = planar(tmp_path)
     path.write_text(path.read_text().replace('mass value="800.0"', 'mass value="0.03"'))
     lift, fold = LIFT | {"name": "hoist"}, FOLD | {"name": "crowd"}

@@ -198,7 +198,7 @@ def test_one_loop_six_drives_a_passive_angle_and_stroke(kr300):
 
 
 def test_the_stroke_is_that_of_the_printed_length(kr300):
-    """Over the whole range of link 2, whatever the other joints do."""
+    """Holds over the whole range of link 2, independently of the other joints."""
     q_a = postures(kr300, 300)
     q = kr300.closure.solve(q_a)
     stroke = q[:, kr300.column("stroke")]
@@ -208,7 +208,7 @@ def test_the_stroke_is_that_of_the_printed_length(kr300):
 
 
 def test_the_gas_pulls_as_printed(kr300):
-    """tau_2 = -p A dlength/dq2; everything else is moved by no gas."""
+    """tau_2 = -p A dlength/dq2; the gas exerts no force on other joints."""
     q2 = np.linspace(kr300.lower[1], kr300.upper[1], 50)
     q_a = at_link_2(kr300, q2)
     slope = np.imag(length(q2 + 1j * COMPLEX_STEP)) / COMPLEX_STEP
@@ -221,7 +221,7 @@ def test_the_gas_pulls_as_printed(kr300):
 
 
 def test_the_gas_carries_the_arm(kr300):
-    """Leant forwards, link 2 would fall; the cylinder takes more than a third of that."""
+    """The cylinder carries more than a third of the weight moment of a leaning link 2."""
     q_a = at_link_2(kr300, np.deg2rad([-50.0]))
     dynamics = crane.Dynamics(kr300)
     weight, gas = dynamics.gravity(q_a)[0, 1], dynamics.passive(q_a, 0 * q_a)[0, 1]

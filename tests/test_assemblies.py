@@ -132,7 +132,7 @@ def test_limits_decide(tmp_path):
 
 
 def test_nearby_homes_never_differ_silently(tmp_path):
-    """With frames turned any way at zero, and strokes all along."""
+    """Holds for any orientation of the frames at zero, and for all strokes."""
     random = np.random.default_rng(0)
     flips = 0
     for _ in range(4):

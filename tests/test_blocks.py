@@ -93,7 +93,7 @@ def test_covariance_is_that_of_all_rows_at_once():
 
 @pytest.mark.parametrize("bandwidth", [12.0, 200.0])
 def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
-    """With a term that depends on the past; none of the blocks is held."""
+    """Also with a term that depends on earlier samples; no block stays in memory."""
     given = motion(mini, duration=10.0)
     terms = [*default_terms(mini), PreslidingFriction(mini, "X1", 1e-3)]
     settings = {"prior": 0.3, "bandwidth": bandwidth, "terms": terms}
@@ -165,7 +165,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 @pytest.mark.slow
 @pytest.mark.long
 def test_five_minutes_at_a_kilohertz_unthinned():
-    """Their regressor alone takes 0.5 GB, and five copies were made of it."""
+    """The regressor would take 0.5 GB as a whole."""
     command = [sys.executable, "-W", "ignore", "-c", LONG]
     here = Path(__file__).parent
     paths = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}

@@ -390,7 +390,7 @@ def test_a_machine_that_cannot_be_written_is_left_out_with_a_warning(
 
 
 def test_the_machine_says_how_well_its_numbers_are_known(fitted, tmp_path):
-    """Beside each, in the lines where they stand; it loads as what was found, to the last bit."""
+    """Deviations stand beside the values; the file loads as the fitted machine, bit by bit."""
     _, _, found = fitted
     write_calibration(tmp_path, found)
     text = "".join(x.read_text() for x in (tmp_path / "machine").iterdir())
@@ -423,7 +423,7 @@ def test_the_page_says_what_was_found(fitted, tmp_path):
 
 
 def test_what_is_left_tells_what_is_missing(fitted):
-    """Nothing of the fitted one; of one whose pressure is 1 bar off, whichever way it goes."""
+    """No remark on the fitted recording; one on a recording whose pressure is 1 bar off."""
     machine, _, found = fitted
     by_name = {one.name: one for one in residual_dependences(found)}
     assert list(by_name) == ["x", "pressure_x_a", "pressure_x_b"]
@@ -532,7 +532,7 @@ def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
 
 @pytest.mark.slow
 def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
-    """Without its pressures the recording hardly tells what the rig lifts."""
+    """Without pressures the recording has little information about the load."""
     machine, path, _ = fitted
     numbers = TRUTH | {f"sensor.pressure_x_{side}.noise": 1e8 for side in "ab"}
     wide, narrow = (
@@ -546,7 +546,7 @@ def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
 @pytest.mark.long
 @pytest.mark.slow
 def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
-    """Air in a chamber that nobody asked for; without it nothing is missed."""
+    """Air in a chamber that is not fitted is reported; without air nothing is."""
     machine, gas = simple(tmp_path), 2e-5
     air = "cylinder.x.gas_a"
     fit = ["valve.x.neutral", "load_x.mass", "friction.x.coulomb"]

@@ -86,7 +86,7 @@ def test_pin_forces_and_margins_are_those_of_statics_by_hand(excavator, chart):
 
 
 def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
-    """Gravity leaned to many sides, one after another."""
+    """The worst direction of a slope equals that of many single directions."""
     slope = 0.1
     bare = crane.load("excavator")
     chart = crane.capacity(bare, "bucket", radii=[5.0, 7.0], heights=[0.0, 2.0], slope=slope)

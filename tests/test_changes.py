@@ -197,7 +197,7 @@ def test_a_locked_joint_stays_where_it_is_put(mini):
 
 
 def test_fingers_that_mimic_can_be_locked():
-    """One of the two is enough; both have to agree."""
+    """Either of the two may be given; if both are given they have to agree."""
     with pytest.raises(crane.CraneError, match="'panda_finger_joint2_mimic' does not allow"):
         crane.load("panda", lock={"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.03})
     alone = crane.load("panda", lock={"panda_finger_joint2": 0.02})

@@ -760,7 +760,7 @@ MODEL = """<model name="{}"><link name="base"><inertial><mass>5</mass></inertial
 @pytest.mark.parametrize("floating", [[], ["--floating"]])
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_the_next_command_loads_the_same_machine(tmp_path, floating):
-    """Of several models of a world, with the options that were given."""
+    """Its command loads one of several models of a world with the given options."""
     (tmp_path / "a world").mkdir()
     path = tmp_path / "a world" / "two.sdf"
     path.write_text(WORLD.format(MODEL.format("one arm"), MODEL.format("other")))

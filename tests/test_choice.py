@@ -120,7 +120,7 @@ def test_bennetts_condition_is_needed(tmp_path):
 
 
 def test_bennetts_linkage_of_the_other_hand_is_told_to_be_far_from_what_the_file_says(tmp_path):
-    """The other way round, a length is negative: opposite hinges turn the same way then."""
+    """With opposite hinges reversed a length is negative, and they turn the same way."""
     path = bennett(tmp_path, other=-OTHER_LENGTH)
     with pytest.raises(crane.CraneError, match="three is 2.6 rad off, loop 'four' the other way"):
         crane.load(path)

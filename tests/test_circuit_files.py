@@ -61,7 +61,7 @@ def test_all_numbers_are_named_and_can_be_changed(tmp_path):
 
 
 def test_every_number_of_the_circuit_acts(tmp_path):
-    """What can be set is among the numbers of the formulas."""
+    """Every parameter that can be set is a constant of the formulas."""
     from circuit_state import circuit_of
 
     machine = everything(tmp_path)

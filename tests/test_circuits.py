@@ -346,7 +346,7 @@ def test_a_floating_load_sinks_by_its_weight(tmp_path):
 
 
 def test_a_floating_load_that_lands_is_followed(tmp_path):
-    """It bounces while both chambers are sucked empty, in a few steps per row."""
+    """A load that bounces on two empty chambers needs few steps per recorded row."""
     machine = rig(tmp_path, {**SIMPLE, "float_from": 0.8, "float_coefficient": 3e-6})
     with pytest.warns(crane.CraneWarning, match="beyond its stroke"):
         run = moved(machine, {"x": -1.0}, 1.2, initial=[0.5])

@@ -168,7 +168,7 @@ def loaded_by(tmp_path, *arguments, code=MAIN, slow=SLOW):
 
 
 def test_check_of_a_tree_imports_no_scipy(tmp_path):
-    """Importing scipy takes as long as all else that it does."""
+    """scipy is not imported: that would double the time of the command."""
     urdf = (DATA / "four_bar" / "ground.urdf").read_text()
     (tmp_path / "tree.urdf").write_text(urdf)
     others = (*SLOW, "crane.cli.simulate", "crane.formats.sdf.sdf_translation", "llvmlite.binding")
@@ -219,7 +219,7 @@ def test_version_and_units_in_help():
 
 
 def test_a_hydraulic_machine_without_signals_stands_on_its_valves(tmp_path):
-    """It is not free: no lever is moved."""
+    """Without signals the valves stay closed; the machine is not free."""
     run = typed("simulate", "patu655", "--duration", "0.02", "--out", tmp_path / "run")
     assert run.stdout.startswith("# patu655: valves at rest\n")
 

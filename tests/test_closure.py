@@ -249,7 +249,7 @@ def from_closed_form(machine, q):
 
 @pytest.mark.slow
 def test_far_samples_stay_on_the_branch_around_holes(five_bar):
-    """Half of all crank angles leave the rods too short: straight ways lead through holes."""
+    """Half of all crank angles cannot be closed, so straight paths lead through gaps."""
     q_a = np.random.default_rng(14).uniform(-3, 3, (240, 2))
     found, missed = [], 0
     for sample in q_a:

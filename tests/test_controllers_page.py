@@ -166,7 +166,7 @@ def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch)
 
 
 def test_states_begin_where_the_machine_stands(page):
-    """`begin` sees the inverse dynamics at the start, whoever asks."""
+    """`begin` receives the inverse dynamics at the start."""
 
     class Held(ControlLaw):
         def begin(self, at):

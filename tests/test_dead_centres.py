@@ -37,7 +37,7 @@ def run(machine, joint, speed, duration, **settings):
 
 @pytest.mark.parametrize("method, step", [("rk4", 2e-4), ("DOP853", 1e-3)])
 def test_a_crank_turns_through_the_dead_centres_of_its_slider(tmp_path, method, step):
-    """As it does by the crank itself, which has none."""
+    """The motion equals that with the crank as active joint, which has no dead centre."""
     alone = singular.slider_crank(tmp_path, "a", 0.3, 0.6)
     wanted = run(alone, "a", 12.0, 1.0, step=step, method=method)
     machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
@@ -178,7 +178,7 @@ def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path, made):
 @pytest.mark.slow
 @pytest.mark.parametrize("rod", [2.0, 1.3])
 def test_postures_follow_a_recorded_stroke_through_dead_centres(tmp_path, rod):
-    """From the slider alone: where it turns the crank goes on, three times round."""
+    """From the slider's stroke alone the crank is followed through three revolutions."""
     crank = singular.slider_crank(tmp_path, "a", 1.0, rod)
     found = run(crank, "a", 3.0, 5.0, step=2e-3)
     wanted = singular.postures(crank, found)

@@ -220,7 +220,7 @@ def test_a_motion_that_determines_nothing_is_refused_unless_trusted():
 
 
 def test_a_joint_that_only_trembles_stands_still(mini):
-    """Its rows tell nothing: friction at rest makes any force."""
+    """Rows at rest carry no information, since friction can balance any force."""
     rng, time = np.random.default_rng(1), 0.01 * np.arange(3000)
     home = mini.home[mini.closure.active]
     q = home + np.outer(np.sin(1.5 * time), [0.3, 5e-3, 0.0]) + 1e-5 * rng.normal(size=(3000, 3))

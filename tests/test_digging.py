@@ -92,7 +92,7 @@ def test_what_the_drives_give_alone_is_pressure_times_levers(excavator):
 
 @pytest.mark.parametrize("weights", [False, True])
 def test_what_holds_ends_what_digs(excavator, weights):
-    """Every cause by free bodies at the posture that is said; no posture of a grid is better."""
+    """Every limit agrees with free bodies there; no configuration of a grid gives more force."""
     found = crane.breakout(excavator, weights=weights)
     for one in (found.bucket, found.arm):
         q = excavator.closure.solve(one.q_a)

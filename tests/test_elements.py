@@ -613,7 +613,7 @@ def test_columns_of_identification(mini):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_identified_machines_keep_them(tmp_path):
-    """Also those that a lock took, whose frames are one body while it holds."""
+    """Elements of locked joints, whose frames belong to one body, are kept as well."""
     path = copy_machine(MINI, tmp_path)
     path.write_text(
         path.read_text()

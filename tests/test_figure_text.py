@@ -33,7 +33,7 @@ def picture(text, **options):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_is_set_as_it_is(name):
-    """As matplotlib sets it where it is told that there is no mathematics."""
+    """The text looks as matplotlib sets it with mathematics switched off."""
     expected = picture(name, parse_math=False)
     assert expected.min() < 200
     np.testing.assert_array_equal(picture(escape_label(name)), expected)

@@ -123,7 +123,7 @@ def test_a_double_pendulum_on_a_moving_tip_is_that_of_lagrange(double, backend):
 
 
 def test_it_swings_as_its_equations_do_while_the_tip_is_driven(double):
-    """Computed torque: the tip keeps to its reference, the pins to the equations on paper."""
+    """Under computed torque the tip follows its reference, the pins the equations on paper."""
     path = crane.point_to_point([0.2, 0.3], [0.7, 1.1], 1.5)
     start = np.array([0.2, 0.3, 0.1, -0.5])
     run = crane.simulate(

@@ -410,7 +410,7 @@ def test_feedback_damps_what_is_left(payload, joint):
 
 
 def test_feedback_takes_what_a_plan_did_not_know(loaded):
-    """A plan for 200 kg, and 160 kg in the claws."""
+    """A reference planned for 200 kg still reduces sway with 160 kg."""
     plan = crane.fastest_trajectory(loaded, crane.task_trajectory(loaded, "swing"), "flat")
     lighter = carrying(160.0)
     sway, left = Sway(lighter), []

@@ -250,7 +250,7 @@ def test_a_program_sees_what_the_machine_does(patu):
 
 
 def test_a_program_starts_anew_in_each_simulation(patu):
-    """Spools begin at neutral, not where the last simulation left them."""
+    """Spools start at neutral in every simulation."""
     program = SampledCommand(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
     first, again = (crane.simulate(patu, program, duration=0.2) for _ in range(2))
     np.testing.assert_array_equal(first.q, again.q)
@@ -265,7 +265,7 @@ def test_methods_that_call_no_program_are_refused(patu, method):
 
 
 def test_circuit_follows_the_active_joints(patu):
-    """Cylinders, valves and gains of joints that are driven no more go together."""
+    """Cylinders, valves and gains of joints that lose their drive are removed together."""
     left = patu.with_active_joints(["slew", "q2", "X_tilt", "X_ext"]).hydraulics
     for parts in (left.cylinders, left.valves, left.control):
         assert list(parts) == ["slew", "X_tilt", "X_ext"]

@@ -308,7 +308,7 @@ def test_noisy_pressures_do_not_shrink_beta(machine, quick):
 
 
 def test_least_squares_on_derivatives_is_biased(machine, quick):
-    """Why the weak form is the default.
+    """Least squares on derivatives is biased, so the weak form is the default.
 
     The stroke's smoother takes the oil's oscillation, 0.02 mm, for noise, the force's does not:
     F' on the left has no counterpart on the right, and 1/beta goes to zero.
@@ -699,7 +699,7 @@ def test_valve_whose_load_rings(compensated, frequency):
 
 
 def test_means_over_periods_leave_what_does_not_ring(compensated):
-    """Noise, slow ramps and plain steps are judged as they were."""
+    """Noise, slow ramps and plain steps raise no warning of ringing."""
     time = np.arange(0, 42, 1e-2)
     run = driven(staircase(time), time, 5e-4, np.random.default_rng(0))
     found = identify_valve(compensated, run, "boom")

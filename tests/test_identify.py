@@ -106,7 +106,7 @@ def test_intervals_cover_the_truth_of_rigs_as_users_identify_them():
 
 
 def test_what_friction_does_near_standstill_is_in_no_row_that_counts(mini):
-    """However wrong: the filter's kernel has an end, and rows it touches are left out."""
+    """The filter has finite length, and rows that it reaches are left out."""
     given, slow = motion(mini, step=4e-3), np.array([0.1, 1e-3, 1e-3])
     stuck = np.abs(given.v) <= slow
     assert stuck.mean() < 0.2
@@ -260,7 +260,7 @@ def test_what_cannot_be_identified(mini):
 
 
 def test_a_joint_of_one_row_is_refused(mini):
-    """Whose noise nothing tells: all but one of its rows are slower than the limit given."""
+    """The noise cannot be estimated where all rows but one are slower than the limit."""
     given = motion(mini, step=4e-3)
     given = dataclasses.replace(given, v=given.v.copy())
     given.v[:, 1] = 0.0

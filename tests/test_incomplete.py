@@ -202,7 +202,7 @@ def test_a_massless_link_is_the_limit_of_a_light_one(tmp_path):
 
 
 def test_a_rotor_of_inertia_without_mass_moves_as_its_inertia_says(tmp_path):
-    """A flywheel on the crank's end: M grows by its inertia alone."""
+    """A massless flywheel with inertia adds its inertia to M, and nothing else."""
     rotor = WHEEL.replace('<mass value="1"/>', '<mass value="0"/>').replace("rocker_pin", "BASE")
     (tmp_path / "wheel.urdf").write_text('<robot name="wheel"><link name="BASE"/>' + "\n" + rotor)
     machine, told = loaded(tmp_path / "wheel.urdf")

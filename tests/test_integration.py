@@ -307,7 +307,7 @@ def test_a_first_step_that_fails_is_told_alike(forwarder, steps, speed):
 
 
 def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeypatch):
-    """Wherever the failure falls among the chunks."""
+    """The run ends the same in whichever chunk the failure occurs."""
     control, settings = crane.PI(forwarder, crane.task_trajectory(forwarder, "lift")), {
         "duration": 0.5, "step": 5e-3
     }  # fmt: skip

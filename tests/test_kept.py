@@ -92,7 +92,7 @@ def test_what_is_found_is_called_as_what_was_built(place):
 
 
 def test_other_processes_find_it(place):
-    """Whatever order their sets of words have."""
+    """The key does not depend on the order of sets."""
     assert answer(child(place, "late")) == "built"
     for seed in "12":
         assert answer(child(place, "late", env={"PYTHONHASHSEED": seed})) == "found"
@@ -179,7 +179,7 @@ def test_missing_files_are_made_anew(place, kind):
 
 
 def test_files_of_another_name_are_not_taken(place):
-    """What was written whole, but for another program, is no less wrong."""
+    """A complete file of another program is rejected as well."""
     assert ask()
     one = {file.suffix: file for file in files(place)}
     assert ask(4.0)
@@ -221,7 +221,7 @@ def test_a_folder_that_others_may_write_is_not_read(place):
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="nobody is root here")
 def test_a_folder_that_may_only_be_read_serves(place):
-    """Also where it is full, or lies on something that cannot be written."""
+    """Programs work also if the folder is full or cannot be written."""
     assert ask()
     place.chmod(0o500)
 
@@ -254,7 +254,7 @@ def test_the_folder_is_bounded(place, monkeypatch):
 
 
 def test_processes_that_compile_at_once(place):
-    """Each is right, and what they leave is whole."""
+    """Each process has a correct program, and the files are complete."""
     at_once = [child(place, "late") for _ in range(4)]
     assert set(map(answer, at_once)) <= {"built", "found"}
     assert len(files(place)) == 2 and len(list(place.iterdir())) == 2
@@ -272,7 +272,7 @@ def test_a_killed_process_leaves_nothing_that_harms(place, count):
 
 
 def test_a_changed_package_finds_nothing(place, tmp_path):
-    """Every change counts, also one that leaves length and time of a file as they were."""
+    """Every change counts, also one that keeps the length and time of a file."""
     copy = tmp_path / "again" / "crane"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "models"))
 
@@ -307,7 +307,7 @@ def test_a_package_that_changes_meanwhile_keeps_nothing(place, monkeypatch):
 
 
 def test_a_package_that_changed_before_it_was_read_finds_nothing(place, monkeypatch):
-    """What its files say is kept, but it is not what was loaded."""
+    """Programs are not taken from the cache if the files are newer than the loaded package."""
     assert ask() and not ask()
     monkeypatch.setattr(crane, "LOADED", 0.0)
     package_digest._files_digest.cache_clear()

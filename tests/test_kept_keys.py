@@ -311,7 +311,7 @@ def counted(kept, built, depends, build):
 @pytest.mark.slow
 @pytest.mark.long
 def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeypatch):
-    """Each finds only what is its own, whatever was kept before it, the second time all of it."""
+    """Each machine finds only its own programs, and all of them the second time."""
     built, first = [], []
     # something of the standard library, so that the package does not look patched
     monkeypatch.setattr(Program, "kept", partial(counted, Program.from_cache, built))

@@ -107,7 +107,7 @@ def test_an_entry_that_cannot_be_read_is_made_anew(place, content):
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_a_single_call_takes_the_short_way_in_a_later_process(place, fresh):
-    """Arrays that come from a file have numpy's own type, which a pickle's have not."""
+    """Arrays that are read from a file have numpy's type."""
     fresh()
     for name in ("mini_forwarder", "patu655", "excavator", "kr300"):
         lines = []

@@ -88,7 +88,7 @@ def test_no_module_hides_a_name_of_the_package():
 
 
 def test_no_module_hides_a_name_of_its_folder():
-    """A folder hands on no name that one of its modules has."""
+    """An `__init__.py` exports no name that one of its modules has."""
     hidden = []
     for path in PACKAGE.rglob("__init__.py"):
         modules = {other.stem for other in path.parent.glob("*.py")}

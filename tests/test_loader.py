@@ -196,7 +196,7 @@ def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
 
 
 def test_a_toggle_is_beside_it_alone(with_toggle):
-    """Within a hundredth of the stroke, and not where the lever is least or without end."""
+    """The extreme is found within 1 % of the stroke, away from zero and infinite levers."""
     strokes = Strokes(StaticsEvaluator(with_toggle))
     closure = with_toggle.closure
     lift = wheel_loader.LIFTED

@@ -114,7 +114,7 @@ def peak(*arguments):
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted otherwise here")
 @pytest.mark.long
 def test_memory_grows_by_less_than_a_recording(tmp_path):
-    """Three minutes later a recording of 40 columns has grown by 320 bytes a sample."""
+    """Memory grows by 320 bytes per sample of 40 columns."""
     taken = {}
     for duration in (90, 270):
         out = tmp_path / str(duration)

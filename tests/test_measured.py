@@ -214,7 +214,7 @@ def test_measured_strokes_are_taken_as_they_are(machine, columns, truth, tmp_pat
 
 
 def test_strokes_win_over_angles(machine, columns, truth, tmp_path):
-    """Angles beside measured strokes are channels, right or wrong, in any unit."""
+    """Angles beside measured strokes become channels, whatever their values and unit."""
     columns["X1 [mm]"] = 1e3 * truth["q"][:, 1]
     columns["X2 [cm]"] = 1e2 * truth["q"][:, 2]
     columns["q2 [gon]"] = columns.pop("q2 [deg]") + 7.0
@@ -428,7 +428,7 @@ def test_sensors_that_agree_within_their_noise_are_not(machine, columns, truth, 
 
 
 def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, monkeypatch):
-    """Nor does what an error calls a sample: it counts from the first of all."""
+    """Sample numbers in errors count from the first sample of the recording."""
     file = write(tmp_path, columns)
     whole = read_measured(machine, file)
     monkeypatch.setattr(measured_configurations, "_BLOCK_SAMPLES", 50)

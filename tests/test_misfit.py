@@ -67,7 +67,7 @@ def test_right_lengths_close_as_said_without_a_word(name, tmp_path):
 
 @pytest.mark.parametrize("name", SOME_SLOW)
 def test_no_wrong_length_turns_a_linkage_over(name, tmp_path):
-    """Right assembly near what is said, or an error with the gap and the length."""
+    """The assembly mode of the specified home, or an error with the gap and the length."""
     linkage, refused = LINKAGES[name], 0
     said = linkage.home()
     for (length, value), share in itertools.product(linkage.lengths().items(), WRONG):
@@ -89,7 +89,7 @@ def test_no_wrong_length_turns_a_linkage_over(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["bucket", pytest.param("loader", marks=pytest.mark.slow)])
 def test_changes_may_move_home_and_not_turn_it_over(name, tmp_path):
-    """A variant is another machine than the one of which the file says home."""
+    """A changed length may move home, but not change the assembly mode."""
     linkage = LINKAGES[name]
     path = linkage.write(tmp_path)
     far = 0

@@ -77,7 +77,7 @@ def test_a_machine_with_notes_loads_as_it_was(crane_file, tmp_path):
 
 
 def test_notes_of_whatever_number(tmp_path):
-    """Each number of a machine once; what stands in no line is said at the head."""
+    """Each parameter is commented once; parameters without a line are listed at the head."""
     machine = crane.load("patu655")
     every = numbers(machine)
     file = crane.write_machine(machine, tmp_path / "every", {x: f"<{x}>" for x in every})

@@ -143,7 +143,7 @@ def test_a_place_is_told_once():
 
 
 def test_a_task_that_fails_in_a_study_is_named_once():
-    """Its row says why once, not that the task's task cannot be done."""
+    """The row gives the reason once."""
     found, reason = measure_variant(
         StudyJob("patu655", {"X_lift.upper": 0.2}, {}, ("reach",), False)
     )

@@ -80,7 +80,7 @@ def test_a_library_that_is_not_there_is_told_with_its_extra(module, monkeypatch)
 
 @pytest.mark.parametrize("tried", [(), ("--try", "bandwidth=2,5")])
 def test_identify_says_at_once_what_feasible_bodies_need(tried, tmp_path, monkeypatch):
-    """Neither after the work nor as what ends each of many trials."""
+    """A missing extra is reported before the work, not by each of many trials."""
     typed("simulate", "mini_forwarder", "--task", "lift", "--out", tmp_path / "run")
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     result = typed(

@@ -77,7 +77,7 @@ def line(found, name):
 
 
 def test_extremes_survive_thinning_out(machine):
-    """One wild sample of a million is seen, to the precision of a float."""
+    """One outlier in a million samples is visible."""
     time = np.arange(300_001) * 1e-3
     rng = np.random.default_rng(3)
     tau = rng.normal(size=(len(time), 3))

@@ -55,7 +55,7 @@ def test_delays_are_looked_for_in_few_samples(mini, recording, monkeypatch):
 
 
 def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monkeypatch):
-    """The machine's own forces and the load's are computed at the same postures."""
+    """Forces of the machine and of the load are computed at the same closed configurations."""
     N = len(recording.time)
     with passes(monkeypatch) as count:
         identify_payload(mini, recording)
@@ -65,7 +65,7 @@ def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monk
 
 
 def test_strokes_from_angles_are_closed_twice(mini, recording, tmp_path, monkeypatch):
-    """From the angles to the strokes, and back, to see that these tell the posture."""
+    """Closed once from angles to strokes, once back to verify that strokes give the angles."""
     N, q = len(recording.time), mini.closure.solve(recording.q)
     columns = {"time [s]": recording.time}
     columns |= {f"{x} [rad]": q[:, mini.column(x)] for x in ("q1", "q2", "q3")}

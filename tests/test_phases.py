@@ -90,7 +90,7 @@ def test_each_lever_is_held_until_its_position_and_taken_back(machine, found):
 
 
 def test_a_phase_ends_within_a_look_of_its_positions(found):
-    """By the clock, which is one look late; it goes on evenly and never back."""
+    """The task clock runs evenly and never backwards, one sample late."""
     time, clock = found.time, found.channels["phase"]
     assert (np.diff(clock) >= 0).all() and clock[-1] == 2
     ends = [time[np.searchsorted(clock, k - 1e-12)] - LOOK for k in (1, 2)]
@@ -115,7 +115,7 @@ def test_it_ends_when_the_levers_are_back_or_lasts_as_long_as_is_asked(machine, 
 
 
 def test_a_run_is_the_same_to_the_last_bit(machine, found):
-    """Also of a command that was used before, and was cut in the middle."""
+    """A command gives the same again after an interrupted use."""
     under = machine.under(*machine.tasks["both"].loads)
     command = crane.joystick(under, "both")
     crane.simulate(under, command, duration=0.5, step=1e-2)

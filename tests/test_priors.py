@@ -80,7 +80,7 @@ def test_a_prior_that_is_none(four_bar, one_way, prior, feasible, message):
 
 
 def test_a_share_of_the_description_is_about_friction_too(four_bar, one_way):
-    """Friction has the described size, its offset that of what it is the offset of."""
+    """The prior of friction is its described value, that of an offset is the friction's."""
     rough = four_bar.replace(
         friction={"crank": Friction(coulomb=4.0, viscous=0.5, smoothing=1e-3)}
     )

@@ -165,7 +165,7 @@ def test_random_linkages_move_as_constraint_dynamics_says(plan):
 
 
 def test_most_draws_are_kept():
-    """Runs after the draws; what was thrown away is told by `pytest -s`."""
+    """Most draws are used; `pytest -s` prints the reasons of the others."""
     if not DRAWN:
         pytest.skip("the draws were not made in this process")
     print(dict(DRAWN), dict(POSTURES))

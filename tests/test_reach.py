@@ -77,7 +77,7 @@ def arm(tmp_path_factory):
 
 
 def test_reach_of_three_cylinders_is_that_in_line(arm):
-    """Where the barrels sit, and how long the strokes are, does not change it."""
+    """Equal geometry has equal reach, whatever the mounting points and strokes."""
     wanted = BASE[0] + sum(ARMS)
     for change in ({}, {"barrel1.x": 0.08}, {"barrel2.z": 0.47}, {"X1.lower": -0.21}):
         found = measure_strokes(crane.load(arm, change))

@@ -111,7 +111,7 @@ def test_fast_sampling_becomes_the_continuous_controller(mini, exact, path):
 
 
 def test_substeps_are_stable(stiff, path, monkeypatch):
-    """Half as long: the true motion is the same to far below what the sensors tell."""
+    """With half the substep the motion changes by much less than the sensors' resolution."""
     coarse = Rig(stiff, 1, sensors=ideal(stiff)).run(path)
     monkeypatch.setattr(rig, "_STABLE", rig._STABLE / 2)
     fine = Rig(stiff, 1, sensors=ideal(stiff)).run(path)

@@ -163,7 +163,7 @@ def test_tips_are_reached_at_any_size(s, folder):
 
 @pytest.mark.parametrize("s", [1e-3, 1e4])
 def test_a_loop_that_stays_open_is_told_at_any_size(s, folder):
-    """By as much as it is open, in metres."""
+    """The error gives the gap in metres."""
     told = {}
     for scale in (ONE, Scale(s)):
         path = written("four_bar.yaml", scale, folder / "open")

@@ -385,7 +385,7 @@ def test_measured_pressures_of_the_tank_count(tmp_path, backend):
 
 
 def test_what_holds_nothing_beside_what_holds_much(tmp_path):
-    """A brake that is released has a limit of next to nothing; that tells nothing of others."""
+    """The small limit of a released brake does not affect the scales of other joints."""
     slight = dict.fromkeys(("c1", "c2", "c3", "c4"), 1e-12)
     machine = rig(tmp_path, ORIFICE | slight, axis="1 0 0", joints=("x", "y"),
                   cylinder={"brake": BRAKE})  # fmt: skip
@@ -556,7 +556,7 @@ def test_linear_models_have_seals_that_slide(tmp_path):
 
 @pytest.mark.slow
 def test_calibration_finds_seals(tmp_path, monkeypatch):
-    """Which are smooth, too, while it is far off; they alone make this joint stick."""
+    """Laws of seals are smooth away from rest; here they alone cause stiction."""
     made, variant = {}, CalibrationProblem.simulated_machine
 
     def noted(problem, z, smooth):

@@ -220,7 +220,7 @@ def test_changes_of_sensors_that_are_none():
 
 
 def test_sensors_that_agree_say_nothing(machine, motion, tmp_path):
-    """Nor do noisy ones, whichever columns there are."""
+    """Noisy recordings cause no warning, whichever columns they have."""
     assert told(machine, written(tmp_path, motion)) == []
     random = np.random.default_rng(1)
     off = {
@@ -463,7 +463,7 @@ def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
 
 
 def test_a_delay_reads_beyond_the_window(machine, motion, tmp_path):
-    """The end of a window holds what a late sensor says after it."""
+    """A window contains the samples that a delayed sensor gives after its end."""
     path = written(tmp_path, motion, [])
     table = timeseries.read_table(path)
     late = {"X_lift": Sensor(delay=0.1)}

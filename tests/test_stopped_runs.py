@@ -32,7 +32,7 @@ def same(part, whole):
 
 
 def test_errors_of_controllers_carry_the_run_until_then(mini):
-    """Whatever a controller in Python raises, until the step in which it does."""
+    """Any exception of a Python controller leaves the samples up to its step."""
 
     def hold(until):
         def law(time, q_a, v_a):

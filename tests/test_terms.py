@@ -349,7 +349,7 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
     ],
 )
 def test_what_judges_nothing_is_told(tmp_path, crank, arguments, message):
-    """And the machine is identified all the same; no report says that it was judged."""
+    """The machine is identified, and no report claims a validation."""
     done = typed("identify", *crank, *arguments, "--prior", "0.3",
                  "--out", tmp_path / "out")  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -429,7 +429,7 @@ def test_the_prior_that_predicts_is_chosen(arm):
     ],
 )
 def test_what_cannot_be_tried(arm, tried, options, message):
-    """A name that nothing has is no setting that predicts badly."""
+    """An unknown name is an error, not a setting with a bad prediction."""
     with pytest.raises(InputError) as caught:
         cross_validate(arm, moved(arm), tried, **options)
     assert str(caught.value).startswith(message)
@@ -437,7 +437,7 @@ def test_what_cannot_be_tried(arm, tried, options, message):
 
 
 def test_a_part_at_rest_judges_nothing(arm):
-    """The others do."""
+    """The other parts are validated."""
     motion, rest = moved(arm), slice(640, 960)
     held = {name: getattr(motion, name).copy() for name in ("time", "q", "v", "a", "tau")}
     held["q"][rest] = held["q"][640]
@@ -482,7 +482,7 @@ def test_parts_are_predicted_by_the_others_alone(arm):
 
 
 def test_two_recordings_teach_as_one(arm):
-    """What neither is long enough for alone; a validation of two is judged as both."""
+    """Two short validation parts are judged together."""
     one, two = moved(arm, seed=0), moved(arm, seed=1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
@@ -568,7 +568,7 @@ def test_velocities_of_standstill_that_are_none(arm, slow, message):
 
 
 def test_a_body_without_mass_cannot_be_a_share_of_itself(tmp_path, arm):
-    """One line instead of what numpy says of a body of nothing."""
+    """A body without mass causes one line, no numpy warning."""
     text = (arm.chains[0].urdf).read_text()
     (tmp_path / "arm.urdf").write_text(text.replace('<mass value="0.2"/>', '<mass value="0"/>'))
     with warnings.catch_warnings():

@@ -91,7 +91,7 @@ def test_argument_that_the_file_does_not_have(arm):
 
 @pytest.mark.parametrize("how", ["given", "above", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"])
 def test_where_packages_are_found(arm, how, tmp_path, monkeypatch):
-    """Away from its packages, the file needs one of the ways to them."""
+    """Outside of its packages the file needs a package path."""
     away = tmp_path / "elsewhere" / "deep"
     away.mkdir(parents=True)
     path = Path(shutil.move(arm, away / "arm.xacro"))
