@@ -27,7 +27,7 @@ def about(axis, angle):
 
 def places(machine, q):
     """Matrices of all links at a closed posture (nq,), in the world."""
-    tree, out = machine.tree, {machine.tree.root: np.eye(4)}
+    tree, out = machine.tree, {machine.tree.root_link: np.eye(4)}
     waiting = list(tree.joints.values())
     while waiting:
         joint = waiting.pop(0)
@@ -65,7 +65,7 @@ def balance(machine, q, gravity, load, frame, force=(0.0, 0.0, 0.0)):
         while (joint := _joint_of(tree, carrier)) is not None and joint.kind == "fixed":
             carrier = joint.parent
         rigid[link] = carrier
-    bodies = [joint.child for joint in tree.moving]
+    bodies = [joint.child for joint in tree.moving_joints]
     right = {body: np.zeros(6) for body in bodies}
 
     def add(link, point, pull):
@@ -79,7 +79,7 @@ def balance(machine, q, gravity, load, frame, force=(0.0, 0.0, 0.0)):
     place = at[frame][:3, 3]
     add(frame, place, load * np.asarray(gravity) + np.asarray(force))
     unknowns = []  # name, (6, k) directions of the wrench, predecessor, successor, origin
-    for joint in tree.moving:
+    for joint in tree.moving_joints:
         origin, axis = at[joint.child][:3, 3], at[joint.child][:3, :3] @ np.array(joint.axis)
         driven = joint.name in machine.active
         along = np.r_[axis, 0, 0, 0] if joint.kind == "prismatic" else np.r_[0, 0, 0, axis]

@@ -279,7 +279,7 @@ def got(spec):
     named = spec.path.name == "four_bar.yaml"  # others are named by their files if by nothing
     parts = []
     for name, value in sorted(vars(spec).items()):
-        if name in ("where", "path"):
+        if name in ("source_locations", "path"):
             continue
         if name == "name" and not named:
             continue
@@ -288,7 +288,9 @@ def got(spec):
         if name == "payload":
             value = value and value.urdf.name
         parts.append((name, value))
-    return re.sub(r"(?<![\w.])-0\.0(?![\w.])", "0.0", re.sub(r", where='[^']*'", "", repr(parts)))
+    return re.sub(
+        r"(?<![\w.])-0\.0(?![\w.])", "0.0", re.sub(r", source_location='[^']*'", "", repr(parts))
+    )
 
 
 def judge(kind, seed, folder):

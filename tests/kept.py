@@ -28,10 +28,10 @@ def toy(factor=3.0, built=None):
         total = factor * x
         for _ in range(LONG // 2):
             total = y + total * 0.5
-        program.add("formula", 1, {"value": [total], "given": [x, y]})
-        with program.routine("each", counts=("count",), arrays=("x", "out")) as r:
+        program.add_formula("formula", 1, {"value": [total], "given": [x, y]})
+        with program.add_routine("each", counts=("count",), arrays=("x", "out")) as r:
             with r.loop(r.count) as i:
-                r.call("formula", r.x.row(i, 2), r.out.row(i, 3))
+                r.call("formula", r.x.row_pointer(i, 2), r.out.row_pointer(i, 3))
             r.return_value(r.count)
 
     return Program.from_cache(("toy", factor), build)
@@ -39,7 +39,7 @@ def toy(factor=3.0, built=None):
 
 def value(program):
     """What it makes of 2 and 5 twice, if it is what it should be."""
-    layout = program.outputs("formula")
+    layout = program.formula_outputs("formula")
     x, out = np.array([[2.0, 5.0], [2.0, 5.0]]), np.empty((2, layout.size))
     assert program.call("each", 2, x, out) == 2
     assert (layout.view(out).given == x).all() and out[0, 0] == out[1, 0]

@@ -117,7 +117,7 @@ def closed(tmp_path):
 
 def test_an_open_digger_becomes_a_closed_one(closed, tmp_path):
     assert closed.active == ("hoist", "crowd") and closed.free == ()
-    assert closed.undriven == ()
+    assert closed.undriven_joints == ()
     assert [loop.type for loop in closed.closure.equations.loops] == ["revolute"] * 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "d.yaml", "digger.urdf"]
     rng = np.random.default_rng(3)

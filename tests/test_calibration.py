@@ -113,7 +113,7 @@ def test_channels_count_by_what_is_left_of_them_in_the_end(tmp_path, monkeypatch
     machine = simple(tmp_path)
     path = recorded(machine, tmp_path / "run.csv", 1, truth)
     monkeypatch.setattr(
-        "crane.identification.calibration.calibrate.found_by",
+        "crane.identification.calibration.calibrate.estimate_with_profiles",
         lambda search, count: searches.append(search) or estimate_with_profiles(search, count),
     )
     near = crane.load(machine.path, changes=truth | {friction: 2400.0})

@@ -30,7 +30,7 @@ def cells(chart, count, seed=0):
 def strength(machine, chart, joint, slope):
     """What a cylinder exerts at most against a load that asks for more with this sign."""
     cylinder, supply = machine.hydraulics.cylinders[joint], machine.hydraulics.supply
-    pressure = supply.pressure if joint in chart.raising else cylinder.relief
+    pressure = supply.pressure if joint in chart.raising_joints else cylinder.relief
     a, b, tank = cylinder.area_a, cylinder.area_b, supply.tank
     return pressure * a - tank * b if slope > 0 else tank * a - pressure * b
 
@@ -46,12 +46,14 @@ def by_hand(machine, chart, q):
             found[joint] = chart.rule.hydraulic * max((end - none[joint]) / slope, 0.0)
     at = places(machine, q)
     for cause in chart.causes:
-        if cause.why != "tips":
+        if cause.reason != "tips":
             continue
-        one, two = (at[name][:3, 3] for name in cause.what.split(" to "))
+        one, two = (at[name][:3, 3] for name in cause.element.split(" to "))
         held, pulled = (moment(machine, q, G, m, chart.frame, one, two) for m in (0.0, 1000.0))
         slope = (pulled - held) / 1000.0
-        found[cause.what] = chart.rule.tipping * (max(-held / slope, 0.0) if slope > 0 else np.inf)
+        found[cause.element] = chart.rule.tipping * (
+            max(-held / slope, 0.0) if slope > 0 else np.inf
+        )
     return found
 
 
@@ -314,7 +316,7 @@ def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
         excavator, rule=crane.Rule("own", "", tipping=1 / 1.1), slope=np.deg2rad(5), **at
     )
     assert by_rule.loads[0, 0, 0] == by_hand.loads[0, 0, 0]
-    assert by_rule.limiting_factors[by_rule.limiting_factor_index[0, 0, 0]].why == "tips"
+    assert by_rule.limiting_factors[by_rule.limiting_factor_index[0, 0, 0]].reason == "tips"
 
 
 def test_what_moves_straight_up_ends_on_a_slope_too(tmp_path):

@@ -38,19 +38,19 @@ def force(machine, q, load, name):
 
 
 def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
-    ends = {chart.causes[k].what for k in chart.ends if chart.causes[k].why == "pin force"}
+    ends = {chart.causes[k].element for k in chart.ends if chart.causes[k].reason == "pin force"}
     assert ends == set(PINS)
     for cell in map(tuple, cells(chart, 25)):
         q = excavator.closure.solve(chart.q_a[cell])
         for k, cause in enumerate(chart.causes):
-            if cause.why != "pin force":
+            if cause.reason != "pin force":
                 continue
             found = chart.each[cell][k] / 0.8
             if not found:
-                assert force(excavator, q, 0.0, cause.what) >= PINS[cause.what]
+                assert force(excavator, q, 0.0, cause.element) >= PINS[cause.element]
                 continue
 
-            def left(load, name=cause.what, q=q):
+            def left(load, name=cause.element, q=q):
                 return force(excavator, q, load, name) - PINS[name]
 
             samples = [left(load) for load in np.linspace(0, found * (1 - 1e-9), 5)]

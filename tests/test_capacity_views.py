@@ -89,18 +89,18 @@ def test_the_table_has_the_cells_of_the_chart(chart):
             for s in range(2)
         ]
         for text, (load, k) in zip(row, cells, strict=False):
-            star = "*" if k >= 0 and chart.causes[k].why != "tips" else ""
+            star = "*" if k >= 0 and chart.causes[k].reason != "tips" else ""
             assert text == ("" if math.isnan(load) else f"{math.floor(load)}{star}")
             starred += bool(star)
     assert 10 < starred < 60
     for height, row, far in zip(table.heights, rows, table.max_radii, strict=True):
-        there = chart.at_places([far, far + 0.02], [height])
+        there = chart.at_positions([far, far + 0.02], [height])
         assert np.isfinite(there.loads[:, 0, 0]).all() and np.isnan(there.loads[:, 0, 1]).all()
         assert [int(x.rstrip("*")) for x in row[-3:-1]] == np.floor(there.loads[:, 0, 0]).tolist()
         assert float(row[-1]) == pytest.approx(far, abs=0.005)
     text = chart.to_markdown()
     assert all(f" {cell} |" in text for row in rows for cell in row if cell)
-    assert chart.rule.says in text and "X_boom 350 bar (working pressure)" in text
+    assert chart.rule.description in text and "X_boom 350 bar (working pressure)" in text
 
 
 def test_where_nothing_tips_nothing_is_marked():

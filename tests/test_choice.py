@@ -297,7 +297,7 @@ def test_condition_is_that_of_the_orthonormal_equations(mini, stewart, five_bar)
             least = np.linalg.svd(rows, compute_uv=False)[-1]
             assert found == pytest.approx(1 / least, rel=1e-9)
         stack = closure.solve(machine.home[closure.active] + np.zeros((3, 1)))
-        assert closure.condition(stack) == pytest.approx(3 * [found], rel=1e-9)
+        assert closure.condition_number(stack) == pytest.approx(3 * [found], rel=1e-9)
 
 
 def null_rows(matrix):

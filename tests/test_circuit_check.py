@@ -252,7 +252,11 @@ SHARES = {("valve", "dead_band"), ("valve", "hysteresis"), ("valve", "float_from
 
 
 def test_all_numbers_of_a_circuit_are_in_the_table():
-    names = {(kind.__name__.lower(), name) for kind in KINDS for name in parameter_names(kind)}
+    names = {
+        (kind.__name__.removeprefix("Circuit").lower(), name)
+        for kind in KINDS
+        for name in parameter_names(kind)
+    }
     names |= {("motor", name) for name in MOTOR_KEYS}
     lacking = {(kind, name) for kind, name in names if plausible_range(name, False, kind) is None}
     assert lacking == UNJUDGED | SHARES
@@ -265,7 +269,10 @@ def test_defaults_are_usual(kind):
         if entry.name in parameter_names(kind) and isinstance(entry.default, float):
             for turning in (False, True):
                 text = implausible_value_text(
-                    entry.name, entry.default, turning, kind.__name__.lower()
+                    entry.name,
+                    entry.default,
+                    turning,
+                    kind.__name__.removeprefix("Circuit").lower(),
                 )
                 assert not text, (kind, entry.name)
 

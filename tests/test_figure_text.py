@@ -82,7 +82,7 @@ def test_figures_of_a_machine_with_such_names(tmp_path):
         crane.study(machine.path, vary, [r"$\sw$"], [r"peak_$\bad$"], processes=1), figures[3]
     )
     channel = SimpleNamespace(
-        name=r"$\bad$", unit=r"$\u$", measured=time, simulated=time, rms=0.0, relative=0.0
+        name=r"$\bad$", unit=r"$\u$", measured=time, simulated=time, rms=0.0, relative_rms=0.0
     )
     plot_comparison(SimpleNamespace(time=time, channels=[channel]), figures[4])
     assert all(figure.stat().st_size for figure in figures)

@@ -95,7 +95,7 @@ def test_the_tip_moves_as_its_jacobian_says(arm):
         ends = []
         for sign in (1, -1):
             at = pin.integrate(arm.model, arm.coordinates.configuration(q), sign * h * v)
-            ends.append(kinematics.position(arm.from_configuration.from_configuration(at)))
+            ends.append(kinematics.position(arm.coordinates.from_configuration(at)))
         slope = (ends[0] - ends[1]) / (2 * h)
         np.testing.assert_allclose(kinematics.jacobian(q) @ v, slope, atol=1e-8)
 

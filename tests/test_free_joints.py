@@ -116,7 +116,7 @@ def test_a_double_pendulum_on_a_moving_tip_is_that_of_lagrange(double, backend):
     both = dynamics.hybrid(q[0], v[0], a_d[0])
     np.testing.assert_allclose(np.concatenate(both), [*tau_d[0], *a_f[0]], rtol=1e-13)
     # the full inverse and forward dynamics agree, with no force at the pins
-    tau = double.spread(tau_d, "tau_d")
+    tau = double.expand_driven(tau_d, "tau_d")
     np.testing.assert_allclose(dynamics.forward(q, v, tau), np.hstack([a_d, a_f]), rtol=1e-9)
     again = dynamics.inverse(q, v, np.hstack([a_d, a_f]))
     np.testing.assert_allclose(again, tau, rtol=0, atol=1e-10 * np.abs(tau).max())
@@ -160,7 +160,7 @@ def test_accelerations_of_the_hanging_grapple_are_those_of_mujoco(machine, tmp_p
         a_d = random.normal(size=2)
         tau_d, a_f = dynamics.hybrid(q, v, a_d, friction=True)
         oracle.place(q, v)
-        wanted = oracle.accelerations(oracle.forces(q, machine.spread(tau_d, "tau_d")))
+        wanted = oracle.accelerations(oracle.forces(q, machine.expand_driven(tau_d, "tau_d")))
         np.testing.assert_allclose(
             [*a_d, *a_f], oracle_order(same, machine, wanted), rtol=0,
             atol=1e-10 * np.abs(wanted).max(),

@@ -150,8 +150,8 @@ def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
     """To rounding, where both take the same steps: none in parts, or each."""
     case, accuracy = list(made()), np.inf
     if parted:
-        monkeypatch.setattr(variational_integration, "DEEPEST", 1)
-        monkeypatch.setattr(adjoint_integration, "DEEPEST", 1)
+        monkeypatch.setattr(variational_integration, "MAX_REFINEMENTS", 1)
+        monkeypatch.setattr(adjoint_integration, "MAX_REFINEMENTS", 1)
         case[3], accuracy = 0.1, 0.0
     back, forward, size, switches = both(*case, accuracy)
     assert (np.abs(back - forward) <= 1e-10 * size).all(), np.abs(back - forward) / size

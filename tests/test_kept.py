@@ -321,12 +321,12 @@ def another(*_):
 @pytest.mark.parametrize(
     "owner, name, value",
     [
-        (crane.dynamics.dynamics_formulas, "effects", another),
-        (DynamicsFormulas, "mass", property(another)),
-        (PositionKinematics, "frame", staticmethod(another)),
+        (crane.dynamics.dynamics_formulas, "evaluate_force_law", another),
+        (DynamicsFormulas, "mass_matrix", property(another)),
+        (PositionKinematics, "loop_frame", staticmethod(another)),
         (DynamicsFormulas, "kinetic", cached_property(another)),
-        (machine_code, "_target", lambda: None),
-        (crane.closure.compiled_closure, "Loops", type("Loops", (), {})),
+        (machine_code, "_target_machine", lambda: None),
+        (crane.closure.compiled_closure, "LoopFormulas", type("LoopFormulas", (), {})),
         (crane.dynamics.compiled_dynamics, "QUANTITIES", {"inverse": another}),
     ],
 )

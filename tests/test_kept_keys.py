@@ -314,7 +314,7 @@ def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeyp
     """Each machine finds only its own programs, and all of them the second time."""
     built, first = [], []
     # something of the standard library, so that the package does not look patched
-    monkeypatch.setattr(Program, "kept", partial(counted, Program.from_cache, built))
+    monkeypatch.setattr(Program, "from_cache", partial(counted, Program.from_cache, built))
     loops._SHARED_CODE.clear()  # machines of other tests may still be there
     for number, machine in enumerate(variants(tmp_path)):
         found, wanted = results(machine)

@@ -33,7 +33,7 @@ def recording(mini):
 def undelayed(monkeypatch):
     """Without the search for delays, which looks at samples of its own."""
     nothing = np.full(3, np.nan), np.full(3, np.nan), 0
-    monkeypatch.setattr("crane.identification.mechanics.identify.delays", lambda *_: nothing)
+    monkeypatch.setattr("crane.identification.mechanics.identify.force_delays", lambda *_: nothing)
 
 
 def test_a_sample_is_closed_once_on_its_way_to_the_parameters(

@@ -115,8 +115,8 @@ def test_it_ends_when_the_levers_are_back_or_lasts_as_long_as_is_asked(machine, 
 
 
 def test_a_run_is_the_same_to_the_last_bit(machine, found):
-    """A command gives the same again after an interrupted use."""
-    under = machine.under(*machine.tasks["both"].loads)
+    """Also of a command that was used before, and was cut in the middle."""
+    under = machine.with_external_forces(*machine.tasks["both"].loads)
     command = crane.joystick(under, "both")
     crane.simulate(under, command, duration=0.5, step=1e-2)
     for _ in range(2):
@@ -129,7 +129,9 @@ def test_recorded_signals_do_the_same_again(machine, found):
     force = np.stack([seen[f"load_earth_force_{axis}"] for axis in "xyz"], axis=1)
     earth = crane.Wrench("load_x", force, times=found.time, name="earth")
     again = crane.simulate(
-        machine.under(earth), crane.ValveSignals(machine, found.time, signals), step=2e-3
+        machine.with_external_forces(earth),
+        crane.ValveSignals(machine, found.time, signals),
+        step=2e-3,
     )
     np.testing.assert_allclose(again.q, found.q, atol=1e-6)
 

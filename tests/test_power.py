@@ -389,7 +389,7 @@ def compared(patu, **more):
 
 def test_runs_beside_each_other(patu):
     """Each one's classes sum to its shafts; time, peak, work per mass as by hand."""
-    found = compared(patu, moved=500.0)
+    found = compared(patu, moved_mass=500.0)
     for run, account in found.balances.items():
         assert sum(found.energy_by_class(run).values()) == pytest.approx(
             account.totals["shaft"], rel=1e-9

@@ -320,7 +320,7 @@ def test_determined_is_what_no_stress_changes(mini):
         assert stress.shape[1] == len(jacobian) - len(mini.closure.passive)
         data = equations.data
         frames = [data.oMi[joint] * local for joint, local in equations.frames]
-        rows = equations.wrenches(
+        rows = equations.constraint_wrenches(
             np.array([x.rotation for x in frames]), np.array([x.translation for x in frames])
         )
         lambdas = stress @ rng.normal(size=stress.shape[1])
@@ -343,7 +343,7 @@ def test_determined_is_what_no_stress_changes(mini):
 def test_a_unit_force_is_what_it_adds(mini):
     reactions = Reactions(mini)
     _, (q, v, a) = moving(mini, 4)
-    for held in (mini.tip, mini.tree.root):
+    for held in (mini.tip, mini.tree.root_link):
         unit = reactions.unit_load_wrenches(q, held)
         assert np.allclose(unit[2], reactions.unit_load_wrenches(q[2], held), atol=1e-12)
         force = np.array([3.0, -2.0, 5.0])

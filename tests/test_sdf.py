@@ -60,7 +60,7 @@ def assert_same_driven(one, two, rng, reach, count=4):
         assert one.closure.residual(full) < 1e-12
         mass, gravity = here.mass_matrix(q), here.gravity(q)
         assert np.abs(mass - there.mass_matrix(q)).max() < 1e-10 * np.abs(mass).max()
-        weight = 9.81 * one.tree.mass
+        weight = 9.81 * one.tree.total_mass
         assert np.abs(gravity - there.gravity(q)).max() < 1e-12 * weight
 
 

@@ -93,7 +93,7 @@ def test_moving_it_takes_what_a_free_flyer_needs(standing):
     motion = crane.ComputedTorque(standing, crane.task_trajectory(standing, "swing"))
     pull = crane.Wrench(standing.tip, (300.0, -200.0, -800.0), (0.0, 50.0, 20.0))
     run = crane.simulate(standing, motion, None, 6.0, 0.05, loads=[pull])
-    stability = TippingStability(standing.under(pull))
+    stability = TippingStability(standing.with_external_forces(pull))
     dynamics, closure = crane.Dynamics(standing), standing.closure
     model = pin.Model()
     root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")

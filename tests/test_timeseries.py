@@ -238,7 +238,7 @@ def test_lines_across_blocks_are_counted(tmp_path, monkeypatch, end):
 
 
 def test_more_numbers_than_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("crane.recordings.timeseries.MOST", 8)
+    monkeypatch.setattr("crane.recordings.timeseries.MAX_NUMBERS", 8)
     with pytest.raises(RecordingError, match="holds 3 lines of 3 columns, give at most 8 numbers"):
         read_text(tmp_path, GOOD + "1,2,3\n")
     assert len(read_text(tmp_path, GOOD).values) == 2

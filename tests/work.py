@@ -76,7 +76,17 @@ def passes(monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(CompiledQuantity, "__init__", named)
-        counted(CompiledClosure, "follow", lambda _: ["closed"], lambda out, _: out)
-        counted(CompiledQuantity, "each", lambda x: ["closed", quantity(x)], lambda out, _: out)
-        counted(CompiledQuantity, "along", lambda x: [quantity(x)], lambda _, given: len(given[0]))
+        counted(CompiledClosure, "follow_targets", lambda _: ["closed"], lambda out, _: out)
+        counted(
+            CompiledQuantity,
+            "evaluate_targets",
+            lambda x: ["closed", quantity(x)],
+            lambda out, _: out,
+        )
+        counted(
+            CompiledQuantity,
+            "evaluate_closed_stack",
+            lambda x: [quantity(x)],
+            lambda _, given: len(given[0]),
+        )
         yield count

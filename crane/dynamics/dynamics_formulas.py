@@ -268,7 +268,7 @@ class DynamicsFormulas:
         if not self.formula_structure.circuit_friction_columns:
             return self
         out = copy(self)
-        for name in ("_at_joints", "_passive"):  # what is known already of their friction
+        for name in ("_joint_law_values", "_passive_joint_forces"):  # cached friction
             out.__dict__.pop(name, None)
         out._joint_laws = list(self._joint_laws)
         for i, more in zip(

@@ -511,7 +511,7 @@ class RadauStepper(ErrorControlledStepper):
                     r.tol,
                     jacobian,
                 )
-                r.set(jacobian_time, t)
+                r.assign(jacobian_time, t)
             r.call("real_factors", jacobian, step.length, real)
             r.call("complex_factors", jacobian, step.length, pair)
             r.store(ratio, 0, select(previous_length > 0.0, length / previous_length, 0.0))
@@ -535,21 +535,21 @@ class RadauStepper(ErrorControlledStepper):
                     r.tol,
                     iterate,
                 )
-                r.set(tries, tries + 1)
+                r.assign(tries, tries + 1)
                 last = r.new_variable(norm)
-                r.set(norm, iterate["norm"])
+                r.assign(norm, iterate["norm"])
                 with r.if_then(tries > 1):
-                    r.set(convergence_rate, norm / last)
+                    r.assign(convergence_rate, norm / last)
                     with r.if_then(
                         convergence_rate * norm
                         < (convergence_rate * -1.0 + 1.0) * _NEWTON_TOLERANCE
                     ):
-                        r.set(done, 1)
+                        r.assign(done, 1)
                     with r.if_then(~(convergence_rate < 1.0)):
-                        r.set(done, 0)
-                        r.set(tries, _MAX_NEWTON_ITERATIONS)
+                        r.assign(done, 0)
+                        r.assign(tries, _MAX_NEWTON_ITERATIONS)
                 with r.if_then(norm < 1e-3 * _NEWTON_TOLERANCE):
-                    r.set(done, 1)
+                    r.assign(done, 1)
                 with r.if_then((done > 0) | (tries >= _MAX_NEWTON_ITERATIONS)):
                     r.break_loop()
             Z = iterate.element_pointer("Z")
@@ -564,11 +564,11 @@ class RadauStepper(ErrorControlledStepper):
             with r.if_then(done < 1):
                 r.store(step.step_result.element_pointer("error"), 0, 2.0)
                 r.store(step.step_result.element_pointer("change"), 0, 0.25)
-                r.set(convergence_rate, 1.0)
-                r.set(jacobian_time, select(jacobian_time < t, -np.inf, jacobian_time))
+                r.assign(convergence_rate, 1.0)
+                r.assign(jacobian_time, select(jacobian_time < t, -np.inf, jacobian_time))
             with r.if_else():
                 r.copy(previous_stages, Z, STAGES * size)
-                r.set(previous_length, select(step.step_result["error"] <= 1.0, length, 0.0))
+                r.assign(previous_length, select(step.step_result["error"] <= 1.0, length, 0.0))
 
         def interpolate(t: RoutineValue, length: RoutineValue) -> None:
             r.call("dense", iterate.element_pointer("Z"), step.dense_output)

@@ -83,10 +83,10 @@ class RungeKuttaStepper(MachineCodeStepper):
             k1 = r.local_array("k1", program.formula_outputs("observe"))
             k2, k3, k4 = (r.local_array(f"k{i}", size) for i in (2, 3, 4))
             result = r.local_array("result", self.closure_code.formula_outputs("newton"))
-            machine, half = (r.geometry, r.numbers, r.control), r.h.at(1)
+            machine, half = (r.geometry, r.numbers, r.control), r.h.element_pointer(1)
             with r.loop(r.steps) as i:
                 first = r.refs.row_pointer(i, 2 * columns)
-                middle, last = first.at(columns), first.at(2 * columns)
+                middle, last = first.element_pointer(columns), first.element_pointer(2 * columns)
                 self.call_formula(r, "observe", *machine, first, r.state, k1)
                 if self.has_stick_slip:
                     with r.if_then(k1["margin"] < -EVENT_TOLERANCE):
@@ -94,7 +94,7 @@ class RungeKuttaStepper(MachineCodeStepper):
                         r.return_value(i)
                 row = r.out.row_pointer(i, size + seen)
                 r.copy(row, r.state, size)
-                r.copy(row.at(size), k1.element_pointer("seen"), seen)
+                r.copy(row.element_pointer(size), k1.element_pointer("seen"), seen)
                 r.call("blend", r.state, k1, half, following)
                 self.call_formula(r, "rate", *machine, middle, following, k2)
                 r.call("blend", r.state, k2, half, following)

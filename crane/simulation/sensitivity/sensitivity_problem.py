@@ -55,7 +55,7 @@ class SensitivityProblem(NamedTuple):
         is_sampled = isinstance(control, ValveDrive) and control.period
         if is_sampled or not isinstance(control, TracedController):
             raise InputError(
-                "a controller in Python has no formulas, write it as a crane.control.Law"
+                "a controller in Python has no formulas, write it as a crane.control.ControlLaw"
             )
         dynamics = Dynamics(machine)
         names = tuple(_default_outputs(machine) if outputs is None else outputs)
