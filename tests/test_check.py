@@ -890,7 +890,7 @@ ODD = {
     "kinds.yaml": (
         b"name: 1\nchains: 5\nloops: 3\nactive: {a: 1}\ntip: [1]\ntasks: 4\nhome: 1e999\n"
     ),
-    "nested.yaml": b"[" * 1_200,
+    "nested.yaml": b"[" * 600,
     "nested.urdf": b'<robot name="r">' + b"<a>" * 100_000 + b"</a>" * 100_000 + b"</robot>",
     "deep.urdf": tree(3_000, lambda i: i - 1).encode(),
     "wide.urdf": tree(3_000, lambda i: 0, "1,5").encode(),

@@ -101,7 +101,7 @@ def test_inertia_and_weight_equal_lagrange_with_the_published_numbers(dynamics):
 
 
 def test_inverse_dynamics_equal_lagrange_with_the_published_numbers(dynamics):
-    q_a, v_a, a_a, _ = states(100, seed=1)
+    q_a, v_a, a_a, _ = states(40, seed=1)
     q_a[:, 1:] = np.clip(q_a[:, 1:], 1e-4, STROKE - 1e-4)  # room for differences
     exact = np.array([oracles.mini_forwarder_force(*sample) for sample in zip(q_a, v_a, a_a)])  # noqa: B905
     found = dynamics.inverse(q_a, v_a, a_a)

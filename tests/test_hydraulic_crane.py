@@ -137,7 +137,8 @@ def test_stiff_oil_moves_with_its_flow(loaded):
     assert gaps[2] < gaps[1] / 5
 
 
-@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "swing"])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach", pytest.param("swing", marks=pytest.mark.long)])
 def test_halving_the_step_changes_nothing(task):
     """Where friction does not fall with speed, two motions side by side stay so."""
     even = {f"friction.{joint}.stiction": 0.0 for joint in ("X_lift", "X_tilt", "X_ext")}

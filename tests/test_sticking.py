@@ -205,12 +205,12 @@ def test_methods_and_backends_agree(mini):
     exact, fixed = lift(method="DOP853"), lift(method="rk4")
     assert np.abs(exact.q - fixed.q).max() < 2e-7
     assert gap(exact) < 1e-9 * np.ptp(exact.channels["work"])
-    python = lift(backend="pinocchio", duration=0.25)
+    python = lift(backend="pinocchio", duration=0.5)
     rests = [f"rest_{joint}" for joint in ("q1", "X1", "X2")]
     for name in ("kinetic", "dissipated", *rests):
-        some = fixed.channels[name][:251]
+        some = fixed.channels[name][:501]
         assert python.channels[name] == pytest.approx(some, abs=1e-9 * np.abs(some).max())
-    assert 0 < (fixed.v[:251] == 0).mean() < 1
+    assert 0 < (fixed.v[:501] == 0).mean() < 1
 
 
 def test_a_boom_on_closed_valves_stays_for_an_hour():
@@ -221,7 +221,7 @@ def test_a_boom_on_closed_valves_stays_for_an_hour():
         for side in "ab"
     }
     machine = crane.load("patu655", {"payload.mass": 211.4, **tight})
-    found = run(machine, None, None, 3600.0, 2.0)
+    found = run(machine, None, None, 3600.0, 0.5)
     assert (found.q == found.q[0]).all() and (found.v == 0).all()
     for name, values in found.channels.items():
         if name.startswith("pressure"):
