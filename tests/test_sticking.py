@@ -221,7 +221,7 @@ def test_a_boom_on_closed_valves_stays_for_an_hour():
         for side in "ab"
     }
     machine = crane.load("patu655", {"payload.mass": 211.4, **tight})
-    found = run(machine, None, None, 3600.0, 0.5)
+    found = run(machine, None, None, 3600.0, 2.0)
     assert (found.q == found.q[0]).all() and (found.v == 0).all()
     for name, values in found.channels.items():
         if name.startswith("pressure"):
