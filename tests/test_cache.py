@@ -57,10 +57,10 @@ def test_another_process_reads_it(place, translated):
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from pathlib import Path\n"
         "import test_cache as t\n"
-        "t.cache.folder = lambda: Path(sys.argv[2])\n"
+        "t.file_cache.cache_folder = lambda: Path(sys.argv[2])\n"
         "def never(*_): raise AssertionError('translated')\n"
-        "t.engine._translated = never\n"
-        f"t.engine._SPEED = {machine_code._OPTIMIZATION_LEVEL}\n"
+        "t.machine_code._compile_to_object_code = never\n"
+        f"t.machine_code._OPTIMIZATION_LEVEL = {machine_code._OPTIMIZATION_LEVEL}\n"
         "assert t.square_sum() == 16.0\n"
     )
     here = os.path.dirname(__file__)

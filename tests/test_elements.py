@@ -94,17 +94,12 @@ class Floats(FormulaConstants):
 
 def formula(dynamics, quantity, q, v_a, x):
     """A quantity by its formulas, without compiling them."""
-    compiled = dynamics.machine.closure.compiled_closure
-    posture = PositionKinematics(
-        compiled.geometry, Floats(compiled.geometry.constants), q.tolist()
-    )
-    loops = LoopFormulas(
-        compiled._equations, compiled._structure, compiled._active_columns,
-        compiled._passive_columns, posture,
-    )  # fmt: skip
+    fast = dynamics.machine.closure.compiled_closure
+    posture = PositionKinematics(fast.geometry, Floats(fast.geometry.constants), q.tolist())
+    loops = LoopFormulas(fast._equations, fast._structure, fast._active, fast._passive, posture)
     sweep = DynamicsFormulas(
-        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(),
-        dynamics.formula_structure, quantity in STICK_SLIP_QUANTITIES,
+        posture, loops, Floats(dynamics.formula_constants), q.tolist(), v_a.tolist(), dynamics.formula_structure,
+        quantity in STICK_SLIP_QUANTITIES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
 
@@ -269,7 +264,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     closure, n = mini.closure, 3
     tape = Tape()
     q, posture, loops = closure.compiled_closure.trace(tape, 0, 2)
-    constants, v_a = FormulaConstants(tape, 1, dynamics.numbers), tape.load_vector(3, 0, n)
+    constants, v_a = FormulaConstants(tape, 1, dynamics.formula_constants), tape.load_vector(3, 0, n)
     sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
     rows = differentiate(sweep.passive_force, v_a)
     program = Program()
@@ -277,7 +272,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     program.compile()
     at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
     found = np.zeros(n * n)
-    program.call("f", closure.compiled_closure.geometry.constants, dynamics.numbers, at, v, found)
+    program.call("f", closure.compiled_closure.geometry.constants, dynamics.formula_constants, at, v, found)
     wanted = [
         oracles.derivative(
             lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2
@@ -671,7 +666,7 @@ def test_operations_of_machines_without_elements_read_none():
     machine = crane.load("mini_forwarder")
     dynamics = crane.Dynamics(machine)
     assert (
-        len(dynamics.numbers) == 33 * machine.model.nv + 4 + 7
+        len(dynamics.formula_constants) == 33 * machine.model.nv + 4 + 7
         and dynamics.formula_structure.distance_bodies == ()
     )
     sizes = [

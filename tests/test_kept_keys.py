@@ -30,16 +30,16 @@ MACHINES = ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf")
 # it has
 READ = {
     "equations": {
-        "axis1", "axis2", "is_translation", "loop_of_row", "sign", "factors", "offsets", "loops",
-        "coordinates",
+        "axis_of_frame1", "axis_of_frame2", "is_translation", "loop_of_row", "sign",
+        "coupling_factors", "coupling_offsets", "loops", "coordinates",
     },
     "coordinates": {"parents"},
     "loop": {"type"},
-    "structure": {"rows", "redundant", "blocks", "surplus"},
-    "surplus": {"allowed"},
+    "structure": {"independent_rows", "redundant_rows", "blocks", "redundancy"},
+    "redundancy": {"tolerance"},
     "geometry": {
-        "parents", "revolute", "flyers", "turns", "numbers", "frame_bodies", "trunk", "flying",
-        "massless",
+        "parents", "is_revolute", "floating_bases", "body_rotations", "constants", "frame_bodies",
+        "reference_body", "floating_bodies", "massless_bodies",
     },
 }  # fmt: skip
 
@@ -76,7 +76,7 @@ def formulas(machine, fast):
     """All kinds of formulas that come from a machine: name and what builds them."""
     dynamics = crane.Dynamics(machine)
     n = len(machine.active)
-    yield "loops", lambda program: fast._build(program, fast._signs(fast._home))
+    yield "loops", lambda program: fast._build(program, fast._determinant_signs(fast._home))
     for name in quantities.QUANTITIES:
         rest = dynamics.constant_pattern, n, dynamics.formula_structure
         yield (
@@ -115,7 +115,7 @@ def keys(fast, equations=None, structure=None, geometry=None, signs=None, **own)
             object.__setattr__(part, attribute, value)
     for attribute, value in own.items():
         setattr(other, attribute, value)
-    return other._key(fast._signs(fast._home) if signs is None else signs)
+    return other._cache_key(fast._determinant_signs(fast._home) if signs is None else signs)
 
 
 def alone(part, owner, *names):
@@ -139,30 +139,38 @@ def test_whatever_changes_of_a_machine_changes_the_key(place, tmp_path):
     (rows, columns), *blocks = structure.blocks
     loop = dataclasses.replace(equations.loops[0], type="fixed")
     different = [
-        *alone("equations", equations, "axis1", "axis2", "is_translation", "loop_of_row", "sign"),
-        *alone("geometry", geometry, "parents", "revolute", "turns", "frame_bodies"),
+        *alone(
+            "equations",
+            equations,
+            "axis_of_frame1",
+            "axis_of_frame2",
+            "is_translation",
+            "loop_of_row",
+            "sign",
+        ),
+        *alone("geometry", geometry, "parents", "is_revolute", "body_rotations", "frame_bodies"),
         {"equations": {"loops": (loop, *equations.loops[1:])}},
-        {"structure": {"rows": structure.independent_rows[::-1]}},
-        {"structure": {"redundant": np.append(structure.redundant_rows, 0)}},
+        {"structure": {"independent_rows": structure.independent_rows[::-1]}},
+        {"structure": {"redundant_rows": np.append(structure.redundant_rows, 0)}},
         {"structure": {"blocks": ((rows[::-1], columns), *blocks)}},
         {"structure": {"blocks": ((rows, columns[::-1]), *blocks)}},
         {"structure": {"blocks": (*structure.blocks, (rows, columns))}},
-        {"structure": {"surplus": RedundancyGap(2.0 * structure.redundancy.tolerance)}},
-        {"geometry": {"flyers": (1,)}},
-        {"_active": fast._active_columns[::-1]},
-        {"_passive": fast._passive_columns[::-1]},
+        {"structure": {"redundancy": RedundancyGap(2.0 * structure.redundancy.tolerance)}},
+        {"geometry": {"floating_bases": (1,)}},
+        {"_active_columns": fast._active_columns[::-1]},
+        {"_passive_columns": fast._passive_columns[::-1]},
         {"signs": -fast._determinant_signs(fast._home)},
     ]
     for index in (0, 9, -1):
         for value in (0.0, 1.0, -1.0, -0.0, 0.5):
             numbers = with_entry(geometry.constants, index, value)
             if folding_pattern(numbers) != folding_pattern(geometry.constants):
-                different.append({"geometry": {"numbers": numbers}})
+                different.append({"geometry": {"constants": numbers}})
     places = [
         cache_entry_name(keys(fast)),
         *(cache_entry_name(keys(fast, **change)) for change in different),
     ]
-    for name in ("factors", "offsets"):
+    for name in ("coupling_factors", "coupling_offsets"):
         values = changed(getattr(coupled._equations, name))
         places.append(cache_entry_name(keys(coupled, equations={name: values})))
     places.append(cache_entry_name(keys(coupled)))
@@ -196,7 +204,7 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, 2.0, 0.3, -0.7, np.nan, np.inf, 1e300)
 def test_numbers_that_are_not_told_change_no_formula(name, dressed_crank):
     """Where numbers say the same to the key, the formulas are the same to the letter."""
     fast, dynamics = dressed_crank.closure.compiled_closure, crane.Dynamics(dressed_crank)
-    base = fast.geometry.numbers if name == "loops" else dynamics.numbers
+    base = fast.geometry.constants if name == "loops" else dynamics.constants
     random, texts = np.random.default_rng(3), {}
     for _ in range(60):
         some = random.integers(len(base), size=random.integers(1, 4))
@@ -216,12 +224,12 @@ def text_with(name, fast, dynamics, values):
     """The formulas where a machine has other numbers."""
     other = copy.copy(fast)
     if name == "loops":
-        other.geometry = dataclasses.replace(fast.geometry, numbers=values)
+        other.geometry = dataclasses.replace(fast.geometry, constants=values)
         try:
-            return text(lambda program: other._build(program, fast._signs(fast._home)))
+            return text(lambda program: other._build(program, fast._determinant_signs(fast._home)))
         except ZeroDivisionError:  # no machine
             return "singular"
-    rest = values, len(dynamics.machine.active), dynamics.form
+    rest = values, len(dynamics.machine.active), dynamics.formula_structure
     return text(lambda program: quantities._build_quantity(program, name, fast, *rest))
 
 

@@ -103,7 +103,7 @@ def test_inverse_anywhere(mini, tip, q1, x1, x2):
 def test_inverse_tracks_a_path_from_a_guess(mini, tip):
     time = np.linspace(0, 1, 60)[:, None]
     q_a = np.array([0.2, 0.002, 0.003]) + time * [1.0, 0.026, 0.025]
-    found = tip.inverse(tip.position(q_a), guess=q_a[0])
+    found = tip.inverse(tip.position(q_a), initial_guess=q_a[0])
     assert np.abs(found - q_a).max() < 1e-9
 
 
@@ -164,7 +164,7 @@ def test_limits_bound_the_inverse(mini, tip):
     with pytest.raises(UnreachableTipError, match=r"\(sample 1\)"):
         tip.inverse([tip.position([0.4, 0.029, 0.012]), beyond])
     with pytest.raises(LimitError, match=r"guess: X1 = 0\.032"):
-        tip.inverse(beyond, guess=[0.4, 0.032, 0.012])
+        tip.inverse(beyond, initial_guess=[0.4, 0.032, 0.012])
 
 
 def test_bad_arguments(mini, slider_crank, stewart, tip):

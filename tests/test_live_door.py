@@ -151,11 +151,11 @@ def test_a_mistake_does_not_end_it(live, monkeypatch):
 
     with monkeypatch.context() as context:
         context.setattr(page._session, "move", wrong)
-        page.work([(next(iter(page._sliders)), 0.0)])
-        assert "a mistake" in page._warning.content
-    page.work([("home", 1.0)])
-    assert "a mistake" not in page._warning.content
-    assert np.isfinite(page._session.posture.q).all()
+        page.process_requests([(next(iter(page._sliders)), 0.0)])
+        assert "a mistake" in page._warning_html.content
+    page.process_requests([("home", 1.0)])
+    assert "a mistake" not in page._warning_html.content
+    assert np.isfinite(page._session.posture.configuration).all()
 
 
 class Elsewhere(BaseHTTPRequestHandler):

@@ -106,7 +106,7 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
     for part in (slice(0, 700), slice(700, None)):
         starts = (0,) if part.start == 0 else ()
         at = model.samples(q[part], v[part], 0 * v[part], STEP, starts)
-        at = dataclasses.replace(at, memory=memory)
+        at = dataclasses.replace(at, term_states=memory)
         parts.append(term.columns(at)[:, 0, 0])
     np.testing.assert_allclose(np.concatenate(parts), found, rtol=1e-13)
     with pytest.raises(InputError, match="'q1.memory' remembers time, give the step"):
