@@ -21,7 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
 import yaml  # noqa: E402
-from work import TooMuchWorkError, at_most  # noqa: E402
+from executed_lines import TooMuchWorkError, at_most  # noqa: E402
 
 import crane  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402

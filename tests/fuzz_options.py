@@ -1,4 +1,4 @@
-"""Calls of every command with extreme option values. `test_options.py` runs this as a process.
+"""Calls every command with extreme option values; `test_extreme_options.py` runs this.
 
     python tests/fuzz_options.py reported
     python tests/fuzz_options.py FIRST COUNT [COMMAND]

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import CraneWarning

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from circuits import gaps
+from full_circuit import gaps
 from hydraulic_rig import rig
 
 import crane

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
+from command_line import typed
 from excavators import planar
 from test_open_loops import five_bar
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

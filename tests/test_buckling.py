@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hanging import joint, link
+from hanging_loads import joint, link
 from scipy.linalg import eigh
 from test_reactions import BEAM, load
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import typed
 from hydraulic_rig import COMPENSATED, rig
-from typed import typed
 
 import crane
 from crane.cli.runs import write_calibration

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from broken import MODELS
+from broken_machines import MODELS
 from free_bodies import balance
 from scipy.optimize import brentq
 from test_capacity import G, cells

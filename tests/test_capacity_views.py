@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_line import typed
 from free_bodies import balance
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.path import Path
-from typed import typed
 
 import crane
 from crane.ratings.capacity_report import slew_labels

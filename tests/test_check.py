@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from broken import (
+from broken_machines import (
     GROUND,
     LOOPED,
     MACHINE,
@@ -17,8 +17,8 @@ from broken import (
     whole,
     with_line,
 )
-from typed import typed
-from work import TooMuchWorkError, at_most
+from command_line import typed
+from executed_lines import TooMuchWorkError, at_most
 
 import crane
 from crane.description import bundled_machines, example_robots

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from circuits import SIGNALS, TIMES, everything, gaps
+from full_circuit import SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
 
 import crane

@@ -7,8 +7,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import yaml
+from command_line import typed
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
-from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError

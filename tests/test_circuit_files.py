@@ -4,9 +4,9 @@ import warnings
 
 import numpy as np
 import pytest
-from circuits import ALL, SIGNALS, TIMES, everything, gaps
+from command_line import typed
+from full_circuit import ALL, SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
-from typed import typed
 
 import crane
 from crane.common.errors import DescriptionError, InputError

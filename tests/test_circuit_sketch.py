@@ -4,11 +4,11 @@ import itertools
 from collections import Counter
 from dataclasses import replace
 
-import drawn_circuits as circuits
+import diagram_circuits as circuits
 import pytest
+from command_line import typed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_sketch import overlaps
-from typed import typed
 
 import crane
 from crane.common.errors import InputError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from circuit_state import flow, now
-from circuits import gaps
+from full_circuit import gaps
 from hydraulic_rig import AREA_A, AREA_B, HOSE, ORIFICE, STROKE, rig
 from scipy.optimize import brentq
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broken import DATA, MINI, copy_machine
-from typed import MAIN, typed
+from broken_machines import DATA, MINI, copy_machine
+from command_line import MAIN, typed
 
 import crane
 from crane.cli import entry

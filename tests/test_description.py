@@ -7,7 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broken import DATA, GROUND, LOOPED, MACHINE, MINI, MODELS, ROCKER, Edit, copy_machine, swap
+from broken_machines import (
+    DATA,
+    GROUND,
+    LOOPED,
+    MACHINE,
+    MINI,
+    MODELS,
+    ROCKER,
+    Edit,
+    copy_machine,
+    swap,
+)
 
 import crane
 from crane.common.errors import (

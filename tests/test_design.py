@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.formats.machine_loading import MachineVariants

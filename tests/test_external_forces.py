@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pinocchio as pin
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.codegen.symbolic import scale_vector

@@ -7,9 +7,9 @@ import warnings
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
+from command_line import typed
 from linkages import MACHINES, WRITERS, assert_same, loaded, postures, rewritten
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

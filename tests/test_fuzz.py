@@ -1,12 +1,12 @@
 """Files with changed bytes and with odd graphs are read, or refused in one line.
 
-What counts as well is in fuzz.py: an error of the package or a closed machine, within a bound on
-the work, that is the same as before exactly if another parser finds the same words and numbers in
-the file. In graphs.py it is that whatever is no tree is told, ring by ring, within such a bound.
+`fuzz.py` demands an error of the package or a closed machine within a bound on the executed lines,
+and the same machine as before exactly if another parser finds the same words and numbers in the
+file. `fuzz_graphs.py` demands that every cycle of a graph that is no tree is reported.
 """
 
 import pytest
-from judge import judge
+from fuzz_process import judge
 
 FORMATS = ("machine", "urdf", "urdf+", "parallel", "mjcf", "sdf", "xacro")
 GRAPHS = FORMATS[:-1]
@@ -29,7 +29,7 @@ def test_some_changed_files(kind):
 @pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", GRAPHS)
 def test_odd_graphs(kind, count):
-    run(kind, 0, count, "graphs.py")
+    run(kind, 0, count, "fuzz_graphs.py")
 
 
 @pytest.mark.slow

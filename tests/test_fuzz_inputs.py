@@ -6,7 +6,7 @@ plotted, shown, identified from and replayed, or refused by an error of the pack
 """
 
 import pytest
-from judge import judge
+from fuzz_process import judge
 
 COUNTS = {"visuals": 120, "meshes": 10, "npz": 50, "csv": 90}  # meshes: 20 files each
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from executed_lines import at_most
 from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, Ramp, block, swung
-from work import at_most
 
 import crane
 from crane.common.errors import CraneError

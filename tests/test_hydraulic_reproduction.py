@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import typed
 from test_cli import one_error
-from typed import typed
 
 import crane
 from crane.common.errors import RecordingError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 PAGE = Path(__file__).parents[1] / "docs" / "identification.md"
 NUMBER = r"-?\d+(?:\.\d*)?(?:e[+-]\d+)?"

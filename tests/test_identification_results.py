@@ -8,12 +8,12 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-import motions
+import forwarder_motions
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
+from forwarder_motions import NOISE
 from lxml import etree
-from motions import NOISE
 from scipy.interpolate import CubicSpline
 
 import crane
@@ -33,7 +33,7 @@ HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 COLUMNS = HERE / "scripts" / "columns" / "patu655.txt"
 pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
-motion = partial(motions.motion, duration=20.0, noise=1.0)
+motion = partial(forwarder_motions.motion, duration=20.0, noise=1.0)
 
 
 @pytest.fixture(scope="module")

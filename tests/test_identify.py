@@ -3,10 +3,10 @@
 import dataclasses
 from functools import partial
 
-import motions
+import forwarder_motions
 import numpy as np
 import pytest
-from motions import NOISE, noisy
+from forwarder_motions import NOISE, noisy
 from rig import Rig, Tolerances, default_sensors
 from scipy.interpolate import CubicSpline
 
@@ -24,7 +24,7 @@ from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-motion = partial(motions.motion, step=2e-3)
+motion = partial(forwarder_motions.motion, step=2e-3)
 
 
 @pytest.fixture(scope="module")

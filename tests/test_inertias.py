@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from command_line import typed
 from lxml import etree
 from scipy.linalg import null_space
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError

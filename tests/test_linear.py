@@ -4,8 +4,8 @@ import warnings
 
 import numpy as np
 import pytest
+from command_line import typed
 from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

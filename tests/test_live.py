@@ -10,11 +10,11 @@ import warnings
 import numpy as np
 import pinocchio as pin
 import pytest
+from command_line import MAIN, typed
 from conftest import DATA
+from executed_lines import at_most
 from hypothesis import given
 from hypothesis import strategies as st
-from typed import MAIN, typed
-from work import at_most
 
 import crane
 from crane.common.errors import CraneWarning, InputError, RecordingError

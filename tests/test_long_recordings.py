@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.cli.runs import read_run, write_run

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import MINI, copy_machine, swap
+from broken_machines import MINI, copy_machine, swap
 from oracles import (
     D_IN_2,
     B,

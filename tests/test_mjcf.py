@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import DATA
+from broken_machines import DATA
 from linkages import WRITERS, assert_same, postures, rewritten
 
 import crane

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import typed
 from packaging.requirements import Requirement
-from typed import typed
 
 import crane
 from crane.common import optional_libraries

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from work import at_most
+from executed_lines import at_most
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

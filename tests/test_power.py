@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from command_line import typed
+from executed_lines import at_most
 from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, ORIFICE, rig
-from typed import typed
-from work import at_most
 
 import crane
 from crane.recordings import Recording

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import InputError

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import oracles
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

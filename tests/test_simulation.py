@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 from scipy.integrate import solve_ivp
 
 import crane

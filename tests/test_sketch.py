@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 import pytest
+from command_line import typed
 from conftest import DATA
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError

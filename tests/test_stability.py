@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pinocchio as pin
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import typed
 from oracles import SliderCrank
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, SimulationError

@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yourdfpy
-from broken import DATA
+from broken_machines import DATA
+from command_line import typed
+from executed_lines import at_most
 from lxml import etree
-from typed import typed
-from work import at_most
 
 import crane
 from crane.common.errors import InputError, OutOfReachError

@@ -3,7 +3,7 @@
 import os
 
 import pytest
-from broken import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
+from broken_machines import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
 
 import crane
 from crane.formats.xml_file import XmlFile

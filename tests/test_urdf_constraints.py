@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from broken import DATA, LOOPED
-from typed import typed
+from broken_machines import DATA, LOOPED
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError

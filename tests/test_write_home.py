@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 import yaml
-from broken import DATA, LOOPED, MACHINE, copy_machine, swap
-from typed import typed
+from broken_machines import DATA, LOOPED, MACHINE, copy_machine, swap
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, OutputError

@@ -4,12 +4,12 @@ import math
 import re
 import warnings
 
-import bucket
+import bucket_linkage
 import numpy as np
 import pytest
-from broken import DATA, LOOPED, copy_machine, swap
-from typed import typed
-from work import at_most
+from broken_machines import DATA, LOOPED, copy_machine, swap
+from command_line import typed
+from executed_lines import at_most
 
 import crane
 from crane.closure.assembly_modes import find_alternative_assembly_modes
@@ -26,13 +26,15 @@ def apart(one, two):
     return max(abs(math.remainder(a - b, 2 * math.pi)) for a, b in zip(one, two, strict=True))
 
 
-def assembly(path, stroke, zero=bucket.ZERO):
+def assembly(path, stroke, zero=bucket_linkage.ZERO):
     """Which of the four it is, and what was said of it."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         machine = crane.load(path)
-    q = [machine.home[machine.column(joint)] for joint in bucket.PASSIVE]
-    (which,) = (i for i, a in enumerate(bucket.assemblies(stroke, zero)) if apart(a, q) < 1e-9)
+    q = [machine.home[machine.column(joint)] for joint in bucket_linkage.PASSIVE]
+    (which,) = (
+        i for i, a in enumerate(bucket_linkage.assemblies(stroke, zero)) if apart(a, q) < 1e-9
+    )
     return which, [str(warning.message) for warning in caught]
 
 
@@ -42,18 +44,18 @@ def lines(text):
 
 def test_two_strokes_that_differ_little_are_assembled_differently_and_both_are_told(tmp_path):
     (one, told), (two, also) = (
-        assembly(bucket.write(tmp_path, stroke), stroke) for stroke in (0.20, 0.25)
+        assembly(bucket_linkage.write(tmp_path, stroke), stroke) for stroke in (0.20, 0.25)
     )
     assert one != two
     for lines_told in (told, also):
         assert len(lines_told) == 1
         assert lines_told[0].endswith("; 1 more such: crane check tells them")
     for stroke in (0.20, 0.25):
-        assert check(bucket.write(tmp_path, stroke)).status == 1
+        assert check(bucket_linkage.write(tmp_path, stroke)).status == 1
 
 
 def test_the_line_names_the_other_and_how_to_choose_it(tmp_path):
-    report = check(bucket.write(tmp_path, 0.25))
+    report = check(bucket_linkage.write(tmp_path, 0.25))
     assert report.errors == 0
     assert [finding.line for finding in report.findings] == [8, 8]
     assert str(report.findings[1]) == (
@@ -62,11 +64,11 @@ def test_the_line_names_the_other_and_how_to_choose_it(tmp_path):
         "other (bucket 2.14 rad off) or bucket: 0.8118, link: 2.632 to keep this one "
         "(link 2.63 rad off what it says)"
     )
-    now, _ = assembly(bucket.write(tmp_path, 0.25), 0.25)
+    now, _ = assembly(bucket_linkage.write(tmp_path, 0.25), 0.25)
     reached = set()
     for finding in report.findings:
         for k, choice in enumerate(CHOICES.search(finding.message).groups()):
-            path = bucket.write(tmp_path, 0.25, home=lines(choice))
+            path = bucket_linkage.write(tmp_path, 0.25, home=lines(choice))
             which, _ = assembly(path, 0.25)
             assert (which == now) == (k == 1)
             reached.add(which)
@@ -76,12 +78,12 @@ def test_the_line_names_the_other_and_how_to_choose_it(tmp_path):
 @pytest.mark.parametrize("which", range(4))
 def test_a_file_that_says_what_is_meant_gets_it_without_a_word(which, tmp_path):
     for stroke in (0.20, 0.5, 0.9):
-        values = bucket.assemblies(stroke, bucket.ZERO)[which]
+        values = bucket_linkage.assemblies(stroke, bucket_linkage.ZERO)[which]
         said = lines(", ".join(
             f"{joint}: {value + 0.1:.3f}"
-            for joint, value in zip(bucket.PASSIVE, values, strict=True)
+            for joint, value in zip(bucket_linkage.PASSIVE, values, strict=True)
         ))  # fmt: skip
-        path = bucket.write(tmp_path, stroke, home=said)
+        path = bucket_linkage.write(tmp_path, stroke, home=said)
         assert assembly(path, stroke) == (which, [])
         if stroke != 0.5:
             continue
@@ -94,10 +96,10 @@ def test_what_is_named_in_part_is_taken_or_told(which, tmp_path):
     """One joint of each loop decides, but what it leads to may be another assembly."""
     silent = 0
     for stroke in STROKES[::8]:
-        _, rocker, link, pin = bucket.assemblies(stroke, bucket.ZERO)[which]
+        _, rocker, link, pin = bucket_linkage.assemblies(stroke, bucket_linkage.ZERO)[which]
         for name, value in (("bucket", pin), ("link", link)):
             named = f"  rocker: {rocker:.2f}\n  {name}: {value:.2f}\n"
-            found, told = assembly(bucket.write(tmp_path, stroke, home=named), stroke)
+            found, told = assembly(bucket_linkage.write(tmp_path, stroke, home=named), stroke)
             assert told or found == which
             silent += not told
     assert silent
@@ -105,12 +107,12 @@ def test_what_is_named_in_part_is_taken_or_told(which, tmp_path):
 
 def test_a_guess_far_from_all_is_told(tmp_path):
     """Between the two assemblies, whichever it leads to."""
-    one, two = (bucket.assemblies(0.25, bucket.ZERO)[i] for i in (0, 2))
+    one, two = (bucket_linkage.assemblies(0.25, bucket_linkage.ZERO)[i] for i in (0, 2))
     middle = lines(", ".join(
         f"{joint}: {a + 0.45 * math.remainder(b - a, 2 * math.pi):.3f}"
-        for joint, a, b in zip(bucket.PASSIVE, one, two, strict=True)
+        for joint, a, b in zip(bucket_linkage.PASSIVE, one, two, strict=True)
     ))  # fmt: skip
-    path = bucket.write(tmp_path, 0.25, home=middle)
+    path = bucket_linkage.write(tmp_path, 0.25, home=middle)
     assert any(
         "'eye' can be assembled another way" in line.message for line in check(path).findings
     )
@@ -118,12 +120,12 @@ def test_a_guess_far_from_all_is_told(tmp_path):
 
 def test_limits_decide(tmp_path):
     """An assembly outside of limits is none; one within is told where home is outside."""
-    rockers = [q[1] for q in bucket.assemblies(0.25, bucket.ZERO)]
+    rockers = [q[1] for q in bucket_linkage.assemblies(0.25, bucket_linkage.ZERO)]
     for which, wide in ((0, 2), (2, 0)):
         low, high = rockers[which] - 0.5, rockers[which] + 0.5
         assert not low <= rockers[wide] <= high
         limits = f'<limit lower="{low:.3f}" upper="{high:.3f}" effort="1e9" velocity="1e9"/>'
-        path = bucket.write(tmp_path, 0.25, limits=limits)
+        path = bucket_linkage.write(tmp_path, 0.25, limits=limits)
         told = [finding.message for finding in check(path).findings]
         eye = [what for what in told if what.startswith("loop 'eye'")]
         outside = [what for what in told if "outside of its limits" in what]
@@ -139,7 +141,7 @@ def test_nearby_homes_never_differ_silently(tmp_path):
         zero = (0.0, *random.uniform(-math.pi, math.pi, 3).tolist())
         before = None
         for stroke in STROKES[::2]:
-            which, told = assembly(bucket.write(tmp_path, stroke, zero=zero), stroke, zero)
+            which, told = assembly(bucket_linkage.write(tmp_path, stroke, zero=zero), stroke, zero)
             if before is not None and which != before[0]:
                 flips += 1
                 assert told or before[1], (zero, stroke)
@@ -152,12 +154,12 @@ def test_all_others_are_found(tmp_path):
     random = np.random.default_rng(1)
     for stroke in random.choice(STROKES, 12):
         zero = (0.0, *random.uniform(-math.pi, math.pi, 3).tolist())
-        path = bucket.write(tmp_path, float(stroke), zero=zero)
+        path = bucket_linkage.write(tmp_path, float(stroke), zero=zero)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
             machine = crane.load(path)
-        columns = [machine.column(joint) for joint in bucket.PASSIVE]
-        four = bucket.assemblies(float(stroke), zero)
+        columns = [machine.column(joint) for joint in bucket_linkage.PASSIVE]
+        four = bucket_linkage.assemblies(float(stroke), zero)
         at_home = [apart(a, machine.home[columns]) < 1e-9 for a in four].index(True)
         guess = machine.home + np.pi / 2  # which says nothing
         found = find_alternative_assembly_modes(
@@ -209,10 +211,10 @@ def home_of(path):
 
 def test_a_home_far_from_what_the_file_says_is_refused_unless_asked_for(tmp_path):
     """The nearest assembly is 0.9 rad off."""
-    _, rocker, link, pin = bucket.assemblies(0.25, bucket.ZERO)[0]
+    _, rocker, link, pin = bucket_linkage.assemblies(0.25, bucket_linkage.ZERO)[0]
     for off in (0.2, 0.9):
         said = f"  rocker: {rocker + off:.3f}\n  link: {link - off:.3f}\n  bucket: {pin:.3f}\n"
-        path = bucket.write(tmp_path, 0.25, home=said)
+        path = bucket_linkage.write(tmp_path, 0.25, home=said)
         if off < 0.5:
             assert assembly(path, 0.25)[0] == 0
             continue
@@ -232,7 +234,7 @@ def test_a_home_far_from_what_the_file_says_is_refused_unless_asked_for(tmp_path
 
 
 def test_the_sketch_shows_all_that_are_near(tmp_path):
-    path = bucket.write(tmp_path, 0.25)
+    path = bucket_linkage.write(tmp_path, 0.25)
     done = typed("sketch", path, "--out", tmp_path / "all.svg")
     assert done.stdout.startswith(
         "dashed: 2 other assemblies that the file does not rule out; crane check tells how to "
@@ -241,16 +243,18 @@ def test_the_sketch_shows_all_that_are_near(tmp_path):
     drawn = (tmp_path / "all.svg").read_text()
     for index in (1, 2):
         assert f'id="assembly {index}"' in drawn and f"other assembly {index}" in drawn
-    values = bucket.assemblies(0.25)[0]
-    home = lines(", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket.PASSIVE, values, strict=True)))
-    path = bucket.write(tmp_path, 0.25, home=home)
+    values = bucket_linkage.assemblies(0.25)[0]
+    home = lines(
+        ", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket_linkage.PASSIVE, values, strict=True))
+    )
+    path = bucket_linkage.write(tmp_path, 0.25, home=home)
     done = typed("sketch", path, "--out", tmp_path / "one.svg")
     assert "dashed" not in done.stdout
     assert "assembly" not in (tmp_path / "one.svg").read_text()
 
 
 def test_machines_without_masses_are_told_of_other_assemblies(tmp_path):
-    path = bucket.write(tmp_path, 0.25)
+    path = bucket_linkage.write(tmp_path, 0.25)
     urdf = tmp_path / "bucket_linkage.urdf"
     urdf.write_text(re.sub(r"<inertial>.*?</inertial>", "", urdf.read_text()))
     told = [finding.message for finding in check(path).findings]

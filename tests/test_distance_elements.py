@@ -8,9 +8,9 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
-from broken import MACHINE, MINI, assert_refused, case, copy_machine, swap
+from broken_machines import MACHINE, MINI, assert_refused, case, copy_machine, swap
+from command_line import typed
 from test_compiled import off
-from typed import typed
 
 import crane
 from crane.closure.kinematics_formulas import FormulaConstants, LoopFormulas, PositionKinematics

@@ -3,7 +3,7 @@
 import warnings
 
 import pytest
-from broken import DATA, LOOPED, copy_machine, swap
+from broken_machines import DATA, LOOPED, copy_machine, swap
 
 import crane
 import crane.view.page.machine_visuals

@@ -1,6 +1,6 @@
 """Files with odd graphs of links and joints, judged. `test_fuzz.py` runs this as a process.
 
-    python tests/graphs.py FORMAT FIRST COUNT
+    python tests/fuzz_graphs.py FORMAT FIRST COUNT
 
 prints what fuzz.py prints. A draw is a tree of links with some of: a ring, a joint from a link to
 itself, a second parent, a root that is a child, rings and links beside it, joints that mimic each
@@ -18,7 +18,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from work import TooMuchWorkError, at_most
+from executed_lines import TooMuchWorkError, at_most
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

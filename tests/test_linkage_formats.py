@@ -3,7 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import DATA
+from broken_machines import DATA
 from linkages import LARGE, MACHINES, dynamics_of, loaded, multipliers, postures
 from oracles import constraint_dynamics, derivative
 

@@ -6,10 +6,10 @@ import re
 import shutil
 import warnings
 
-import misfits
+import misfit_linkages
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -17,7 +17,7 @@ from crane.description import bundled_machines
 from crane.formats.check import check
 
 WRONG = (0.7, 0.9, 0.99, 1.01, 1.1, 1.3)
-LINKAGES = misfits.LINKAGES
+LINKAGES = misfit_linkages.LINKAGES
 
 
 def places(machine, linkage):
@@ -213,7 +213,9 @@ def test_a_geared_rotor_is_no_matter_of_assembly(tmp_path):
     linkage = LINKAGES["crank and rocker"]
     path = linkage.write(tmp_path)
     urdf = tmp_path / "linkage.urdf"
-    rotor = misfits.link("rotor") + misfits.joint("spin", "ground", "rotor", (0.0, 0.0))
+    rotor = misfit_linkages.link("rotor") + misfit_linkages.joint(
+        "spin", "ground", "rotor", (0.0, 0.0)
+    )
     rotor = rotor.replace("</joint>", '<mimic joint="crank" multiplier="50"/></joint>')
     urdf.write_text(urdf.read_text().replace("</robot>", rotor + "</robot>"))
     for said in ("", "  spin: 0.1\n"):

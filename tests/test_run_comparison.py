@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 from crane import simulate
 from crane.recordings.recording import Recording

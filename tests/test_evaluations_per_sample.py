@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from motions import motion
-from work import passes
+from executed_lines import passes
+from forwarder_motions import motion
 
 import crane
 from crane.cli.runs import read_run

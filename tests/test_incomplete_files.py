@@ -4,9 +4,9 @@ import warnings
 
 import numpy as np
 import pytest
-from broken import GROUND, LOOPED, MACHINE, MINI, ROCKER, Edit, copy_machine, swap
+from broken_machines import GROUND, LOOPED, MACHINE, MINI, ROCKER, Edit, copy_machine, swap
+from command_line import typed
 from test_mechanism import CHAIN_B1, ROD_INERTIAL, WHEEL
-from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning

@@ -14,8 +14,8 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from typed import MAIN, typed
-from written import COMMANDS, read, writing
+from command_line import MAIN, typed
+from writing_commands import COMMANDS, read, writing
 
 import crane
 

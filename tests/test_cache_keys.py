@@ -346,7 +346,7 @@ from crane.codegen.program_cache import Note
 from crane.common import cache
 warnings.simplefilter("ignore")
 crane.LOADED += 3600.0
-import test_kept_keys
+import test_cache_keys
 notes, write = {}, Note.write
 for name in sys.argv[1:]:
     machine = test_kept_keys.load(name)

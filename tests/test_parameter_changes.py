@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 import crane.cli

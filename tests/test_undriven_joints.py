@@ -3,7 +3,7 @@
 import warnings
 
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneWarning

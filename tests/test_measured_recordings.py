@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import oracles
 import pytest
-from broken import MINI, copy_machine, swap
-from typed import typed
+from broken_machines import MINI, copy_machine, swap
+from command_line import typed
 
 import crane
 from crane.cli.runs import read_run

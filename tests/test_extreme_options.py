@@ -6,7 +6,7 @@ succeeds no figure that no machine has.
 """
 
 import pytest
-from judge import judge
+from fuzz_process import judge
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-import singular
+import singular_linkages
 import yaml
 from hydraulic_rig import AREA_A, AREA_B, ORIFICE, rig
 
@@ -403,13 +403,13 @@ def test_seals_press_through_dead_centres(tmp_path):
         "cylinders": {"s": Cylinder("s", 2e-4, 2e-4, 1e-3, 1e-3, seal_friction=2e-5)},
         "valves": {"s": Valve("s", 4e-6, 4e-6, 4e-6, 4e-6)},
     }
-    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
+    machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
     machine = machine.replace(
         friction={"s": crane.Friction(coulomb=2.0)},
         hydraulics=Hydraulics(Supply(5e6), Oil(), **parts),
     )
     signals = crane.ValveSignals(machine, [0.0], {"s": [0.3]})
-    start = singular.start(machine, "a", 15.0)
+    start = singular_linkages.start(machine, "a", 15.0)
     with pytest.warns(crane.CraneWarning, match=r"^'s' passes a dead centre"):
         found = crane.simulate(machine, signals, start, 0.8, 1e-3)
     a = np.abs(np.diff(np.sign(found.v[:, 0]))) > 0

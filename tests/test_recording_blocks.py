@@ -6,7 +6,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import motions
+import forwarder_motions
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ from crane.identification.signals import kalman_smoother
 from crane.identification.signals.signal_processing import Motion, filter_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-motion = partial(motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
+motion = partial(forwarder_motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
 
 LONG = """
 import resource, sys, numpy as np, crane
-from test_blocks import motion
+from test_recording_blocks import motion
 from crane.identification.mechanics.identify import identify
 from crane.identification.signals.signal_processing import Motion
 machine = crane.load("mini_forwarder")

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import yaml
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
@@ -374,7 +374,7 @@ def test_a_rest_that_stands_still_does_not_judge(tmp_path, crank):
 @pytest.fixture(scope="module")
 def crank(tmp_path_factory):
     """A machine and a recording of it, as arguments."""
-    from broken import DATA
+    from broken_machines import DATA
 
     folder = tmp_path_factory.mktemp("crank")
     machine = crane.load(DATA / "four_bar.yaml")

@@ -1,7 +1,7 @@
 """A machine scaled to other sizes closes, moves and is checked as the original.
 
 Lengths times s, masses times s^3 or another factor, times by the root of s: every number of the
-mechanics follows from those of the machine as it is by one factor (`scaled.py`).
+mechanics follows from those of the machine as it is by one factor (`scaled_machines.py`).
 """
 
 import re
@@ -11,8 +11,8 @@ from functools import cache
 import numpy as np
 import pytest
 import test_random_linkages
-from broken import DATA, MODELS
-from scaled import Scale
+from broken_machines import DATA, MODELS
+from scaled_machines import Scale
 
 import crane
 from crane.common.errors import CraneError

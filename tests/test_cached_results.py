@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import scipy.interpolate  # noqa: F401  what is spared
 import scipy.linalg  # noqa: F401
-from broken import DATA
-from work import at_most
+from broken_machines import DATA
+from executed_lines import at_most
 
 import crane
 from crane.closure.constraint_tolerances import RedundancyGap

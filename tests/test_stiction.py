@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-import singular
+import singular_linkages
 from scipy.integrate import solve_ivp
 
 import crane
@@ -141,7 +141,7 @@ def test_many_joints_that_stick_give_way_together(tmp_path, method):
 
     On its way joints turn while others move on.
     """
-    machine = singular.four_bar(tmp_path, "a")
+    machine = singular_linkages.four_bar(tmp_path, "a")
     limits = {"a": 3.0, "b": 1.0, "c": 2.0}
     machine = machine.replace(
         friction={joint: crane.Friction(coulomb=x) for joint, x in limits.items()}

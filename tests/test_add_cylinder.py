@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from command_line import typed
 from excavators import FOLD, LIFT, planar, spatial
 from oracles import SliderCrank
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

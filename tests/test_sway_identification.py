@@ -2,10 +2,10 @@
 
 import warnings
 
-import hanging
+import hanging_loads
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -52,7 +52,7 @@ def noisy(run, angle, force=0.0, seed=1):
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory):
-    return crane.load(hanging.file(tmp_path_factory.mktemp("sway")))
+    return crane.load(hanging_loads.file(tmp_path_factory.mktemp("sway")))
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ import re
 import warnings
 from functools import partial
 
-import motions
+import forwarder_motions
 import numpy as np
 import pytest
-from broken import DATA
-from motions import NOISE, noisy
+from broken_machines import DATA
+from forwarder_motions import NOISE, noisy
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
@@ -25,7 +25,7 @@ from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 
-motion = partial(motions.motion, period=8.0, duration=16.0)
+motion = partial(forwarder_motions.motion, period=8.0, duration=16.0)
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import yaml
+from command_line import typed
 from hydraulic_rig import rig
-from typed import typed
 
 import crane
 from crane.formats import write_machine

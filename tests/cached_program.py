@@ -1,8 +1,8 @@
 """A program that is cached between runs: its result, and whether it was built again.
 
-As a program of its own it checks the one and prints the other: `python kept.py [die N] [late]`,
-where `die N` kills it when it has written its N-th file but not put it in place, and `late` lets
-it have loaded the package long after its files changed.
+Run as `python cached_program.py [die N] [late]` it checks the result and prints "built" or
+"found". `die N` kills the process between writing its N-th file and putting it in place; `late`
+simulates a package that was loaded long after its files changed.
 """
 
 import os

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 
-import kept
+import cached_program
 import llvmlite.binding as llvm
 import numpy as np
 import pytest
@@ -45,8 +45,8 @@ def another_processor():
 def ask(factor=3.0):
     """Whether the program had to be built; its numbers are right either way."""
     built = []
-    got = kept.value(kept.toy(factor, built))
-    assert got == pytest.approx(kept.wanted(factor), rel=1e-12)
+    got = cached_program.value(cached_program.toy(factor, built))
+    assert got == pytest.approx(cached_program.wanted(factor), rel=1e-12)
     return bool(built)
 
 
@@ -59,7 +59,7 @@ def child(place, *arguments, **more):
     environment = os.environ | {"XDG_CACHE_HOME": str(place.parent.parent)}
     environment |= {"PYTHONPATH": str(more.get("package", PACKAGE).parent)}
     return subprocess.Popen(
-        [sys.executable, kept.__file__, *map(str, arguments)],
+        [sys.executable, cached_program.__file__, *map(str, arguments)],
         env=environment | more.get("env", {}),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -80,11 +80,11 @@ def test_a_later_program_is_found(place):
 
 
 def test_what_is_found_is_called_as_what_was_built(place):
-    one, two = kept.toy(), kept.toy()
+    one, two = cached_program.toy(), cached_program.toy()
     assert two.formula_outputs("formula") == one.formula_outputs(
         "formula"
     ) and two.function_address("each")
-    assert two.max_formula_length == one.max_formula_length > kept.LONG
+    assert two.max_formula_length == one.max_formula_length > cached_program.LONG
     with pytest.raises(TypeError, match="'each' takes 3 arguments, not 2"):
         two.call("each", 1, np.zeros(2))
     with pytest.raises(KeyError):
@@ -104,7 +104,7 @@ def test_a_formula_that_is_too_long_is_known_to_be(place, monkeypatch):
     built = []
     for _ in range(2):
         with pytest.raises(FormulaTooLongError):
-            kept.toy(built=built)
+            cached_program.toy(built=built)
     assert len(built) == 1
     monkeypatch.setattr(program, "MAX_OPERATIONS", 10_000)
     assert ask() and not ask()
@@ -302,7 +302,7 @@ def test_a_package_that_changes_meanwhile_keeps_nothing(place, monkeypatch):
         def append(self, _):
             monkeypatch.setattr(crane, "LOADED", 0.0)
 
-    kept.toy(built=Changing())
+    cached_program.toy(built=Changing())
     assert not files(place, "note")
 
 
