@@ -45,7 +45,7 @@ class Oracle:
 
     def _floats(self, name):
         """Columns of a free joint that is one free-flyer here, None of others."""
-        names, floating = self.machine.joints, self.machine.coordinates.floating
+        names, floating = self.machine.joints, self.machine.coordinates.floating_base_columns
         first = names.index(f"{name}_x") if f"{name}_x" in names else -1
         return np.arange(first, first + 6) if first in floating else None
 

@@ -89,20 +89,20 @@ def test_numbers_of_a_virtual_rig_come_back(fitted):
     """Within their intervals, from a file that is wrong by up to 75 %."""
     _, _, found = fitted
     truth = TRUTH | {"sensor.x.zero": 4e-3}
-    for one in found.fitted:
-        assert not one.bound, one.name
+    for one in found.parameters:
+        assert not one.at_bound, one.name
         assert abs(one.value - truth[one.name]) < 2.0 * one.interval + 1e-9, one
-    told = {one.name: one.interval for one in found.fitted}
+    told = {one.name: one.interval for one in found.parameters}
     assert told["load_x.mass"] < 100 and told["valve.x.neutral"] < 0.02
     assert told["oil.bulk_modulus"] < 0.1e9
 
 
 def test_the_rest_of_the_recording_is_predicted_to_its_noise(fitted):
     _, _, found = fitted
-    for sensor, noise in zip(found.sensors, (2e-4, 2e4, 2e4), strict=True):
-        assert sensor.rms(sensor.after, True) < 1.1 * noise
-        assert sensor.rms(sensor.after, False) < 1.2 * noise, sensor.name
-        assert sensor.rms(sensor.before, False) > 3 * noise
+    for sensor, noise in zip(found.channels, (2e-4, 2e4, 2e4), strict=True):
+        assert sensor.rms(sensor.simulated_after, True) < 1.1 * noise
+        assert sensor.rms(sensor.simulated_after, False) < 1.2 * noise, sensor.name
+        assert sensor.rms(sensor.simulated_before, False) > 3 * noise
 
 
 @pytest.mark.slow
@@ -389,10 +389,10 @@ def test_the_machine_says_how_well_its_numbers_are_known(fitted, tmp_path):
     _, _, found = fitted
     write_calibration(tmp_path, found)
     text = "".join(x.read_text() for x in (tmp_path / "machine").iterdir())
-    for one in found.fitted:
+    for one in found.parameters:
         words = f"fitted ±{one.interval:.2g}, 95 %{one.remark and f', {one.remark}'} (was "
         (line,) = [x for x in text.splitlines() if words in x and repr(one.value) in x]
-        assert f"(was {one.before:.6g})" in line
+        assert f"(was {one.simulated_before:.6g})" in line
     again = crane.load(tmp_path / "machine" / "rig.yaml")
     assert again.hydraulics == found.machine.hydraulics
     assert again.friction == found.machine.friction and again.sensors == found.machine.sensors
@@ -407,11 +407,11 @@ def test_the_page_says_what_was_found(fitted, tmp_path):
     assert "<script" not in page and "http" not in page and page.count("<img") == 7
     rows = re.findall(r"<tr[^>]*><td><code>([^<]*)</code></td>(.*?)</tr>", page)
     cells = {name: re.findall(r"<td[^>]*>([^<]*)</td>", rest) for name, rest in rows}
-    for one in found.fitted:
+    for one in found.parameters:
         assert cells[one.name][:3] == [one.unit, f"{one.start:.5g}", f"{one.value:.5g}"]
         assert f"--set {one.name}={one.value:.8g}" in page
     assert "the file&#x27;s is off by" in page and "0 to 4 s, the rest is held out" in page
-    for channel in found.sensors:
+    for channel in found.channels:
         assert f"{channel.name}</code></td><td>" in page
         noise = 2e-4 if channel.name == "x" else 2e4
         assert channel.noise == pytest.approx(noise, rel=0.25)
@@ -426,11 +426,13 @@ def test_what_is_left_tells_what_is_missing(fitted):
     one = by_name["pressure_x_b"]
     assert (one.drive, one.chamber, one.speed_unit, one.unit) == ("x", "b", "m/s", "Pa")
     assert len(one.residual) == 401 == len(one.motion["speed"])
-    x = found.sensors[0]
-    rate = np.gradient(x.after, x.time)[x.train]
+    x = found.channels[0]
+    rate = np.gradient(x.simulated_after, x.time)[x.train_mask]
     assert np.std(rate - one.motion["speed"]) < 0.05 * np.std(rate)
     side = np.sign(np.round(found.states["run.csv"]["x_velocity"], 3))
-    off = [replace(x, after=x.after + 1e5 * side * (x.unit == "Pa")) for x in found.sensors]
+    off = [
+        replace(x, after=x.simulated_after + 1e5 * side * (x.unit == "Pa")) for x in found.channels
+    ]
     worse = {one.name: one for one in residual_dependences(replace(found, sensors=tuple(off)))}
     shares = worse["pressure_x_a"].correlation_ratios
     assert (
@@ -494,10 +496,10 @@ def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     found = quiet(
         crane.calibrate, true, log, fit, columns=columns, train=(0.5, 3.0), span=(0.5, 4)
     )
-    (zero,) = found.fitted
+    (zero,) = found.parameters
     assert zero.start == 0.0 and abs(zero.value - 3e5) < 2 * zero.interval < 0.5e5
-    assert found.sensors[0].time[0] == 0.5 and found.sensors[0].time[-1] == pytest.approx(4.0)
-    assert found.sensors[0].train.sum() == 251
+    assert found.channels[0].time[0] == 0.5 and found.channels[0].time[-1] == pytest.approx(4.0)
+    assert found.channels[0].train_mask.sum() == 251
     again = crane.load(crane.write_machine(found.machine, tmp_path / "machine"))
     assert again.sensors["x"] == Sensor("s_mm - 7", "mm") and "hold" not in again.sensors
     assert again.sensors[name] == Sensor("pA", "bar", zero.value)

@@ -45,7 +45,7 @@ def by_hand(machine, chart, q):
             end = strength(machine, chart, joint, slope)
             found[joint] = chart.rule.hydraulic * max((end - none[joint]) / slope, 0.0)
     at = places(machine, q)
-    for cause in chart.causes:
+    for cause in chart.limiting_factors:
         if cause.reason != "tips":
             continue
         one, two = (at[name][:3, 3] for name in cause.element.split(" to "))

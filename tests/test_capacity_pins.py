@@ -38,14 +38,18 @@ def force(machine, q, load, name):
 
 
 def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
-    ends = {chart.causes[k].element for k in chart.ends if chart.causes[k].reason == "pin force"}
+    ends = {
+        chart.limiting_factors[k].element
+        for k in chart.active_factors
+        if chart.limiting_factors[k].reason == "pin force"
+    }
     assert ends == set(PINS)
     for cell in map(tuple, cells(chart, 25)):
         q = excavator.closure.solve(chart.q_a[cell])
-        for k, cause in enumerate(chart.causes):
+        for k, cause in enumerate(chart.limiting_factors):
             if cause.reason != "pin force":
                 continue
-            found = chart.each[cell][k] / 0.8
+            found = chart.values_by_factor[cell][k] / 0.8
             if not found:
                 assert force(excavator, q, 0.0, cause.element) >= PINS[cause.element]
                 continue

@@ -84,12 +84,12 @@ def test_the_table_has_the_cells_of_the_chart(chart):
     for height, row in zip(table.heights, rows, strict=True):
         b = int(np.flatnonzero(chart.heights == height)[0])
         cells = [
-            (chart.loads[s, b, a], chart.cause[s, b, a])
+            (chart.loads[s, b, a], chart.limiting_factor_index[s, b, a])
             for a in np.flatnonzero(np.isin(chart.radii, table.radii))
             for s in range(2)
         ]
         for text, (load, k) in zip(row, cells, strict=False):
-            star = "*" if k >= 0 and chart.causes[k].reason != "tips" else ""
+            star = "*" if k >= 0 and chart.limiting_factors[k].reason != "tips" else ""
             assert text == ("" if math.isnan(load) else f"{math.floor(load)}{star}")
             starred += bool(star)
     assert 10 < starred < 60
@@ -136,7 +136,7 @@ def test_pictures_name_all_causes(chart):
     figure = capacity_figure(chart)
     (legend,) = figure.legends
     named = {text.get_text() for text in legend.get_texts()}
-    assert named == {str(chart.causes[k]) for k in chart.ends}
+    assert named == {str(chart.limiting_factors[k]) for k in chart.active_factors}
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["front", "side"]
     sheet = capacity_sheet_figure(chart)
     words = {text.get_text() for text in sheet.texts}
@@ -234,9 +234,9 @@ def test_the_page_holds_the_chart(chart, tmp_path):
         for b, a in np.argwhere(np.isfinite(chart.loads[s]))[::7]:
             cell = cells[chart.radii[a], chart.heights[b]]
             assert cell[2] == pytest.approx(chart.loads[s, b, a], rel=1e-6)
-            assert cell[3] == chart.cause[s, b, a]
+            assert cell[3] == chart.limiting_factor_index[s, b, a]
             each = [math.inf if x is None else x for x in cell[4]]
-            assert each == pytest.approx(chart.each[s, b, a].tolist(), rel=1e-6)
+            assert each == pytest.approx(chart.values_by_factor[s, b, a].tolist(), rel=1e-6)
             assert cell[5][1] == pytest.approx(1e3 * chart.q_a[s, b, a, 1], abs=0.05 + 1e-9)
             assert all(x == round(x, 1) for x in cell[5])  # no rounding noise at limits
             assert cell[6][1][0] == pytest.approx(1e-5 * pressures["X_boom"][s, b, a, 0], rel=1e-4)
@@ -330,6 +330,8 @@ def test_the_page_shows_the_cell_under_the_cursor(chart, tmp_path, size):
                 page.mouse.move(x, y)
             load = float(page.inner_text("#load").split()[0])
             assert load <= chart.loads[s, b, a] < load + max(1.0, 1e-3 * load)
-            assert page.inner_text("#why") == str(chart.causes[chart.cause[s, b, a]])
+            assert page.inner_text("#why") == str(
+                chart.limiting_factors[chart.limiting_factor_index[s, b, a]]
+            )
         browser.close()
     assert not errors

@@ -58,11 +58,9 @@ def gids(drawn):
 def expected(hydraulics):
     """Names of the symbols that a circuit must have."""
     names = ["tank", *(["engine"] if hydraulics.engine else [])]
-    names += [f"pump {name}" for name in hydraulics.sources]
-    names += [
-        f"regulator {name}" for name, x in hydraulics.sources.items() if x.control != "fixed"
-    ]
-    names += [f"relief {name}" for name, x in hydraulics.sources.items() if x.relief]
+    names += [f"pump {name}" for name in hydraulics.pumps]
+    names += [f"regulator {name}" for name, x in hydraulics.pumps.items() if x.control != "fixed"]
+    names += [f"relief {name}" for name, x in hydraulics.pumps.items() if x.relief]
     names += [f"accumulator {name}" for name in hydraulics.accumulators]
     names += [f"element {name}" for name in hydraulics.elements]
     for joint, cylinder in hydraulics.cylinders.items():
@@ -108,7 +106,7 @@ def test_every_part_is_named_with_its_numbers(drawings):
                     assert said[f"label relief {joint}.{side}"] == [
                         format_pressure(cylinder.relief)
                     ]
-        for pump, supply in hydraulics.sources.items():
+        for pump, supply in hydraulics.pumps.items():
             assert pump.startswith(said[f"name pump {pump}"][0].rstrip("…"))
             told = said[f"label pump {pump}"]
             assert f"{format_flow(supply.flow)} l/min" in told or not supply.flow
@@ -151,8 +149,8 @@ def test_no_words_lie_on_wires_or_symbols(drawings):
 
 def crosses(one, other):
     """Whether two pieces of wires have more than one point in common."""
-    same = [p for p in (one.start, one.end) if other.holds(p)]
-    same += [p for p in (other.start, other.end) if one.holds(p)]
+    same = [p for p in (one.start, one.end) if other.contains(p)]
+    same += [p for p in (other.start, other.end) if one.contains(p)]
     return len({(round(x, 6), round(y, 6)) for x, y in same}) > 1
 
 
@@ -162,8 +160,8 @@ def test_wires_of_two_nets_touch_nowhere_but_where_they_cross(drawings):
         for one, other in itertools.combinations(ink.wires, 2):
             if one.net == other.net:
                 continue
-            touching = [p for p in (one.start, one.end) if other.holds(p)]
-            touching += [p for p in (other.start, other.end) if one.holds(p)]
+            touching = [p for p in (one.start, one.end) if other.contains(p)]
+            touching += [p for p in (other.start, other.end) if one.contains(p)]
             assert not [p for p in touching if not tapped(ink, p)], (name, one, other)
             assert not crosses(one, other), (name, one, other)
 
@@ -183,7 +181,7 @@ def pieces(ink, net):
             for wire in wires[0]:
                 ends = [p.at for p in ports[1]]
                 ends += [at for w in ports[0] for at in (w.start, w.end)]
-                if any(wire.holds(at) for at in ends):
+                if any(wire.contains(at) for at in ends):
                     return True
         return any(p.at == q.at for p in one[1] for q in other[1])
 
@@ -222,7 +220,7 @@ def test_wires_end_at_ports(drawings):
         ports = {(p.net, p.at) for p in ink.ports}
         for wire in ink.wires:
             for at in (wire.start, wire.end):
-                on = any(w is not wire and w.net == wire.net and w.holds(at) for w in ink.wires)
+                on = any(w is not wire and w.net == wire.net and w.contains(at) for w in ink.wires)
                 left = (
                     at[1] == wire.start[1] == wire.end[1] and at[0] < 160
                 )  # begins with its name
@@ -232,7 +230,7 @@ def test_wires_end_at_ports(drawings):
 def test_dots_are_where_wires_meet_and_not_where_they_cross(drawings):
     for name, (_, drawn, ink) in drawings.items():
         for dot in (x for x in drawn.axes[0].patches if (x.get_gid() or "").startswith("dot ")):
-            here = {w.net for w in ink.wires if w.holds(dot.center)}
+            here = {w.net for w in ink.wires if w.contains(dot.center)}
             assert here == {dot.get_gid().removeprefix("dot ")}, name
 
 

@@ -227,7 +227,7 @@ def on_a_stand(folder, kind, closed):
 
 def test_the_trunk_is_the_body_that_carries_all_others(machines, five_bar, tmp_path):
     def trunk(machine):
-        return machine.closure.compiled_closure.geometry.trunk
+        return machine.closure.compiled_closure.geometry.reference_body
 
     for name in ("mini", "loaded mini", "ur5_robot", "xarm7"):
         assert trunk(machines[name][0]) == 1, name
@@ -243,8 +243,8 @@ def test_the_trunk_is_the_body_that_carries_all_others(machines, five_bar, tmp_p
 @pytest.mark.parametrize("closed", [True, False])
 def test_an_oblique_trunk_agrees_with_pinocchio(tmp_path, kind, closed):
     machine = dressed(on_a_stand(tmp_path, kind, closed))
-    assert machine.closure.compiled_closure.geometry.trunk == 1
-    samples = draw(machine, 15)
+    assert machine.closure.compiled_closure.geometry.reference_body == 1
+    samples = draw(machine, 40)
     home, stand = machine.home[machine.closure.active], machine.active.index("stand")
     moved = samples["q"][:, stand].copy()
     samples["q"] = home + np.random.default_rng(1).uniform(-0.3, 0.3, samples["q"].shape)
@@ -284,7 +284,7 @@ def test_postures_equal_those_tracked_in_numpy(machines, name, share):
 def test_a_folded_region_is_told_apart_from_the_branch(five_bar):
     """Five-bar far apart: same verdict as the closure in numpy, and the same posture."""
     closure = five_bar.closure
-    branch = closure._branch
+    branch = closure._continuation
     home = np.array(five_bar.home[closure.active])
     closed = 0
     for target in home + np.random.default_rng(2).uniform(-2.5, 2.5, (80, 2)):

@@ -266,8 +266,11 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     closure, n = mini.closure, 3
     numbers, geometry = dynamics.formula_constants, closure.compiled_closure.geometry
     tape = Tape()
-    q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
-    constants, v_a = FormulaConstants(tape, 1, numbers), tape.load_vector(3, 0, n)
+    q, posture, loops = closure.compiled_closure.trace(tape, 0, 2)
+    constants, v_a = (
+        FormulaConstants(tape, 1, dynamics.formula_constants),
+        tape.load_vector(3, 0, n),
+    )
     sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
     rows = differentiate(sweep.passive_force, v_a)
     program = Program()
@@ -275,7 +278,9 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     program.compile()
     at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
     found = np.zeros(n * n)
-    program.call("f", geometry.constants, numbers, at, v, found)
+    program.call(
+        "f", closure.compiled_closure.geometry.constants, dynamics.formula_constants, at, v, found
+    )
     wanted = [
         oracles.derivative(
             lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2

@@ -147,7 +147,7 @@ def test_pumps_stay_below_their_hyperbola(cycles):
     """Shares are below power over flow and mean pressure, as late as the regulator is."""
     for name in ("excavator_ls", "excavator_two_pumps"):
         machine, run = cycles[name]
-        sources = machine.hydraulics.sources
+        sources = machine.hydraulics.pumps
         pressures = [run.channels[f"pressure_{one}"] for one in sources]
         mean = np.mean(pressures, axis=0) - machine.hydraulics.supply.tank
         for one, pump in sources.items():

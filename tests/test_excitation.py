@@ -109,7 +109,7 @@ def test_limits_hold_between_samples(mini, found):
     v, _, tau = keeps(found, mini)
     assert (v <= 0.95).all() and (tau <= 0.95).all()
     assert v.max() > 0.93  # and they are used
-    assert found.used.max() <= 1 and found.used.max() > 0.99
+    assert found.limit_usage.max() <= 1 and found.limit_usage.max() > 0.99
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def naive(excitation):
     table[0] = excitation.limits.middle
     for i in range(n):
         k = i % K + 1
-        table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half[i])
+        table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half_stroke[i])
     return FourierTrajectory(table, excitation.trajectory.period, excitation.trajectory.periods)
 
 
@@ -174,11 +174,22 @@ def information_of(excitation, path):
 def test_it_tells_more_than_random_and_naive_references(found):
     """Per parameter, the volume of the ellipsoid shrinks at least by a factor of two."""
     rank = found.base.rank
-    assert information_of(found, found.trajectory) == pytest.approx(found.after.logdet, rel=1e-3)
-    assert found.after.logdet - found.before.logdet > 2 * np.log(2) * rank
-    assert found.after.logdet - information_of(found, naive(found)) > 2 * np.log(2) * rank
-    assert found.after.condition < found.before.condition / 10
-    assert found.after.smallest > 10 * found.before.smallest
+    assert information_of(found, found.trajectory) == pytest.approx(
+        found.optimized_information.logdet, rel=1e-3
+    )
+    assert (
+        found.optimized_information.logdet - found.initial_information.logdet
+        > 2 * np.log(2) * rank
+    )
+    assert (
+        found.optimized_information.logdet - information_of(found, naive(found))
+        > 2 * np.log(2) * rank
+    )
+    assert found.optimized_information.condition < found.initial_information.condition / 10
+    assert (
+        found.optimized_information.smallest_singular_value
+        > 10 * found.initial_information.smallest_singular_value
+    )
 
 
 @pytest.mark.long
@@ -210,7 +221,7 @@ def test_predicted_deviations_are_those_of_least_squares(mini, found):
     norms = np.linalg.norm(W, axis=0)
     noise = np.random.default_rng(0).normal(size=(len(W), 600))
     errors = np.linalg.lstsq(W / norms, noise, rcond=0)[0] / norms[:, None]
-    assert errors.std(axis=1) == pytest.approx(found.after.std, rel=0.15)
+    assert errors.std(axis=1) == pytest.approx(found.optimized_information.std, rel=0.15)
 
 
 def test_with_a_prior_deviations_are_those_after_it(slider_crank):

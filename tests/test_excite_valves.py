@@ -93,7 +93,7 @@ def test_strokes_hold_though_a_number_is_off(machine, found, number, factor):
     q, _ = strokes(other, found.signals, found.run.time)
     span = machine.upper[0] - machine.lower[0]
     left = min(q.min() - machine.lower[0], machine.upper[0] - q.max()) / span
-    assert left >= found.doubted[0] - 1e-6 > 0
+    assert left >= found.worst_case_stroke_margins[0] - 1e-6 > 0
 
 
 @pytest.mark.slow
@@ -140,8 +140,8 @@ def test_the_information_is_that_of_derivatives_by_hand(machine, found):
 
 
 def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
-    assert found.after.logdet > found.before.logdet + np.log(2)
-    assert found.vague == ["oil.gas_exponent"]  # there is no gas
+    assert found.optimized_information.logdet > found.initial_information.logdet + np.log(2)
+    assert found.unidentifiable == ["oil.gas_exponent"]  # there is no gas
     assert found.std["oil.gas_exponent"] == np.inf
     text = found.to_text()
     assert "not told by these sensors in this time: oil.gas_exponent" in text

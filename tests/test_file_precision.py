@@ -58,9 +58,9 @@ def assert_closed(machine, least, most):
     assert least <= surplus.largest_gap * units[surplus.largest_row] <= most
     for reach in (0.0, 0.02, -0.03):
         q = closure.solve(machine.home[closure.active] + reach)
-        phi = closure.equations.scaled(q)[0]
+        phi = closure.equations.evaluate_scaled(q)[0]
         assert np.abs(phi[structure.rows]).max() < 2e-13
-        assert np.abs(phi).max() <= structure.surplus.allowed
+        assert np.abs(phi).max() <= structure.redundancy.tolerance
 
 
 @pytest.mark.parametrize("kind", PLANAR)

@@ -59,7 +59,7 @@ def found(mini):
 def same_forces(result, machine, q, v, a):
     """Mass matrix, bias and friction against the regressor and what it predicts."""
     dynamics = crane.Dynamics(machine)
-    inertial = InertialTerm(result.described)
+    inertial = InertialTerm(result.described_machine)
     bodies = result.parameters[: 10 * len(result.model.bodies)]
 
     def forces(q, v, a):

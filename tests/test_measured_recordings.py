@@ -258,7 +258,7 @@ def test_other_joints_with_forces_are_joints_too(path, columns, truth, tmp_path)
 def test_power_of_pressures_is_that_of_the_torques(machine, columns, truth, tmp_path):
     """F x' summed over the cylinders is tau q' summed over the booms, tau by (18), (19)."""
     recording = read_measured(machine, write(tmp_path, columns))
-    driven = machine.driven_by(["q1", "q2", "q3"])
+    driven = machine.with_active_joints(["q1", "q2", "q3"])
     lever = driven.closure.gamma(machine.closure.solve(recording.q))[:, machine.closure.active]
     torque = np.einsum("nij,ni->nj", lever, recording.tau)
     rates = np.column_stack([truth["v"][:, 0], truth["rates"]["q2"], truth["rates"]["q3"]])

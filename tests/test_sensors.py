@@ -118,7 +118,7 @@ def test_what_a_machine_knows_of_its_sensors_corrects_a_recording(machine, motio
     path = written(tmp_path, motion, ["q2"], X_lift=lambda x: 1.02 * x + 0.005)
     columns, _ = motion
     numbers = {"sensor.X_lift.zero": 0.005, "sensor.X_lift.scale": 1.02}
-    knowing = crane.load("patu655", changes=numbers, lock=dict(machine.locks))
+    knowing = crane.load("patu655", changes=numbers, lock=dict(machine.locked_joints))
     assert told(machine, path) and not told(knowing, path)
     found = crane.read_measured(knowing, path)
     np.testing.assert_allclose(found.q[:, 0], columns["X_lift"], atol=1e-15)

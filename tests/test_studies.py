@@ -65,9 +65,9 @@ def test_tasks_together(pins):
         squares = [row[f"rms_X1 {task}"] ** 2 for task in pins.tasks]
         assert row["rms_X1"] == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-12)
         assert row["energy"] == pytest.approx(sum(row[f"energy {task}"] for task in pins.tasks))
-    best = pins.best("peak_X2")
+    best = pins.best_row("peak_X2")
     assert best["peak_X2"] == min(row["peak_X2"] for row in rows)
-    assert pins.best("reach")["reach"] == np.nanmax(pins.columns["reach"])
+    assert pins.best_row("reach")["reach"] == np.nanmax(pins.columns["reach"])
 
 
 def test_a_variant_that_cannot_is_a_row_with_its_reason(pins):

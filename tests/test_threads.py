@@ -125,7 +125,7 @@ def stacked(dynamics, q_a, v_a, x):
     slopes = dynamics.derivatives if dynamics.backend == "compiled" else lambda *_: {}
     tip = {dynamics.machine.tip: np.arange(6.0)}
     parts = [np.ravel(part) for part in out]
-    return [*parts, *slopes("inverse", q_a, v_a, x).values(), dynamics.applied(q_a, tip)]
+    return [*parts, *slopes("inverse", q_a, v_a, x).values(), dynamics.project_wrenches(q_a, tip)]
 
 
 def held(machine):
@@ -170,7 +170,7 @@ def closed(closure, q_a, v_a, x):
         q,
         closure.gamma(q),
         closure.condition(q),
-        closure.follow(np.linspace(*q_a[:2], 9)),
+        closure.follow_motion(np.linspace(*q_a[:2], 9)),
     ]
 
 
@@ -183,7 +183,11 @@ def balanced(stability, q_a, v_a, x):
     out = []
     for a in q_a[:5]:
         q = stability.machine.closure.solve(a[None])
-        out += [*stability.static(a), stability.ground(q, q, q), stability.tip_over_load(a)[0]]
+        out += [
+            *stability.static_margins(a),
+            stability.ground(q, q, q),
+            stability.tipping_load(a)[0],
+        ]
     return out
 
 
@@ -194,7 +198,7 @@ def test_stability():
 
 def swayed(sway, q_a, v_a, x):
     """Where what is free hangs, and how it sways."""
-    q_a = sway.hanging(q_a[:6])
+    q_a = sway.hanging_equilibrium(q_a[:6])
     return [q_a, sway.stiffness(q_a), *(x for a in q_a for x in sway.modes(a))]
 
 

@@ -67,7 +67,7 @@ def test_the_direction_that_is_named_hardly_moves_the_forces(mini, plain):
     W = W[:, :, plain.base.independent] * plain.magnitude
     effect = np.sqrt(np.mean((W @ vectors[:, -1]) ** 2, axis=0)) / NOISE
     assert effect.max() < 1e-2 and values[-1] > 1e4
-    std, words = plain.undetermined[0]
+    std, words = plain.undetermined_directions[0]
     assert std == pytest.approx(np.sqrt(values[-1]), rel=1e-6)
     named = words.replace("- ", "+ ").split(" + ")
     assert {name.split()[1] for name in named} <= set(plain.names)
@@ -95,18 +95,18 @@ def test_a_combination_of_what_is_determined_is_named_without_a_warning(plain):
         values=np.zeros(len(plain.names)),
         covariance=alike * np.outer(plain.magnitude, plain.magnitude),
     )
-    assert not any(found.marks) and found.doubt == ""
-    ((std, words),) = found.undetermined
+    assert not any(found.marks) and found.warning == ""
+    ((std, words),) = found.undetermined_directions
     assert std > 5 and f"  +- {std:.2g}  {words}\n" in found.to_text()
     # as soon as one is not determined, the warning counts it
     vague = found.covariance.copy()
     vague[3] *= 2
     vague[:, 3] *= 2
     found = dataclasses.replace(found, covariance=vague)
-    assert found.doubt.startswith("this motion does not determine 1 of 75 base parameters, ")
+    assert found.warning.startswith("this motion does not determine 1 of 75 base parameters, ")
     assert "75 base parameters, 1 not determined, " in repr(found)
     # a motion last: excite may have found the best that the limits allow
-    assert re.search(": give a prior, ask for feasible bodies, or record one that ", found.doubt)
+    assert re.search(": give a prior, ask for feasible bodies, or record one that ", found.warning)
 
 
 def test_what_cannot_be_is_called_impossible(plain):
@@ -115,7 +115,7 @@ def test_what_cannot_be_is_called_impossible(plain):
     values[i] = 1e3 * plain.magnitude[i]
     found = dataclasses.replace(plain, values=values)
     assert found.marks[i] == "impossible" and plain.marks[i] == ""
-    assert f"{plain.names[i]} is beyond what such a machine can have" in found.doubt
+    assert f"{plain.names[i]} is beyond what such a machine can have" in found.warning
 
 
 @pytest.mark.parametrize("size", [1e-300, 1e-12, 1.0, 1e12, 1e300])

@@ -28,7 +28,7 @@ def grid(excavator):
     q_a = np.column_stack([np.zeros(len(strokes)), strokes])
     lip, pin = (crane.Kinematics(excavator, x).position(q_a) for x in ("bucket_lip", "bucket"))
     along, up = (lip - pin)[:, [0, 2]] / 1.47, np.array([[0.0, 1.0], [-1.0, 0.0]])
-    blade = np.array(excavator.external[0].blade)
+    blade = np.array(excavator.external_forces[0].blade)
     floor = blade[0] * along + blade[1] * along @ up  # by the bucket's x and y
     return q_a, lip[:, [0, 2]], pin[:, [0, 2]], floor
 
@@ -76,7 +76,7 @@ def test_the_level_bottom_ends_at_the_reach(excavator, found):
     assert one.value - 0.02 < max(windows) < one.value + 0.02
     ends = [-lip[np.abs(lip[:, 0] - u) < 0.02, 1].min() for u in one.place[0] + [0.0, 2.44]]
     assert ends == pytest.approx([one.value] * 2, abs=0.02)
-    assert found.level == 2.44
+    assert found.level_length == 2.44
 
 
 def test_the_front_slews_within_its_radius(excavator, found, grid):
