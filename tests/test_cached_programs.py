@@ -282,7 +282,7 @@ def test_a_changed_package_finds_nothing(place, tmp_path):
     assert run() == "built"  # just changed: who knows what was loaded
     assert not files(place, "note")
     assert run("late") == "built" and run("late") == "found"
-    file = copy / "dynamics" / "traced.py"
+    file = copy / "dynamics" / "dynamics_formulas.py"
     text, times = file.read_text(), file.stat()
     changed = text.replace("Dynamics", "dynamics", 1)
     assert len(changed) == len(text) and changed != text

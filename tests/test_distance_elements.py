@@ -100,7 +100,7 @@ def formula(dynamics, quantity, q, v_a, x):
         fast._equations, fast._structure, fast._active_columns, fast._passive_columns, posture
     )
     sweep = DynamicsFormulas(
-        posture, loops, Floats(dynamics.formula_constants), q.tolist(), v_a.tolist(),
+        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(),
         dynamics.formula_structure, quantity in STICK_SLIP_QUANTITIES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
@@ -264,13 +264,10 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     """As the Rosenbrock method takes it: of gamma^T f by v_A, by formulas."""
     dynamics = crane.Dynamics(clad(bare(mini), 3))
     closure, n = mini.closure, 3
-    numbers, geometry = dynamics.formula_constants, closure.compiled_closure.geometry
     tape = Tape()
-    q, posture, loops = closure.compiled_closure.trace(tape, 0, 2)
-    constants, v_a = (
-        FormulaConstants(tape, 1, dynamics.formula_constants),
-        tape.load_vector(3, 0, n),
-    )
+    q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
+    constants = FormulaConstants(tape, 1, dynamics.numbers)
+    v_a = tape.load_vector(3, 0, n)
     sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
     rows = differentiate(sweep.passive_force, v_a)
     program = Program()
@@ -278,9 +275,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     program.compile()
     at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
     found = np.zeros(n * n)
-    program.call(
-        "f", closure.compiled_closure.geometry.constants, dynamics.formula_constants, at, v, found
-    )
+    program.call("f", closure.compiled_closure.geometry.constants, dynamics.numbers, at, v, found)
     wanted = [
         oracles.derivative(
             lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2

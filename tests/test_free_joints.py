@@ -193,7 +193,7 @@ def states(machine, count, seed=0):
 
 def test_a_floating_closed_chain_is_that_of_constraint_dynamics(tmp_path):
     """Driven crank, free hull and load: Pinocchio's free-flyer with multipliers."""
-    machine = hanging.floating_series(tmp_path)
+    machine = hanging_loads.floating_series(tmp_path)
     assert machine.driven_joints == ("turn",) and len(machine.free) == 7
     closure, dynamics = machine.closure, crane.Dynamics(machine)
     for q_a, v_a, a_d in states(machine, 10):
@@ -211,7 +211,7 @@ def test_a_floating_closed_chain_is_that_of_constraint_dynamics(tmp_path):
 
 def test_momentum_is_kept_while_a_drive_moves_what_floats(tmp_path):
     """In weightlessness, under computed torque of the crank alone: both momenta stay."""
-    machine = hanging.floating_series(tmp_path)
+    machine = hanging_loads.floating_series(tmp_path)
     machine.model.gravity.linear = np.zeros(3)
     n, turn = len(machine.active), machine.active.index("turn")
     start, rates = np.array(machine.home[machine.closure.active]), np.zeros(n)
