@@ -202,10 +202,10 @@ def test_guesses_do_not_change_the_answer(mini):
     targets, guesses = strokes(60, seed=6), mini.closure.solve(strokes(60, seed=7))
     for target, guess in zip(targets, guesses, strict=True):
         alone = mini.closure.solve(target)
-        assert np.abs(mini.closure.solve(target, guess=guess) - alone).max() < 1e-12
-        near = mini.closure.solve(target, guess=alone + 1e-4)  # beside the answer
+        assert np.abs(mini.closure.solve(target, initial_guess=guess) - alone).max() < 1e-12
+        near = mini.closure.solve(target, initial_guess=alone + 1e-4)  # beside the answer
         assert np.abs(near - alone).max() < 1e-12
-    assert np.abs(mini.closure.solve(targets, guess=guesses[0]) - mini.closure.solve(targets)
+    assert np.abs(mini.closure.solve(targets, initial_guess=guesses[0]) - mini.closure.solve(targets)
                   ).max() < 1e-12  # fmt: skip
 
 
@@ -396,7 +396,7 @@ def test_guess_on_the_wrong_branch(slider_crank, edited):
     backwards = edited("slider_crank.yaml", "phi: -0.5, s: 0.37", f"phi: {psi - theta}, s: -0.1")
     assert backwards.closure.solve([theta]) == pytest.approx(guess, abs=1e-14)
     with pytest.raises(WrongBranchError):
-        backwards.closure.solve([theta], guess=slider_crank.home)
+        backwards.closure.solve([theta], initial_guess=slider_crank.home)
 
 
 def test_bad_arguments(mini):

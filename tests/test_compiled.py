@@ -331,7 +331,9 @@ def test_guesses_of_other_branches_are_refused(slider_crank):
         with pytest.raises(WrongBranchError):
             closure.solve([theta], initial_guess=guess + nudge)
     near = closure.solve([1.1])
-    assert np.abs(closure.solve([theta], guess=near) - closure.solve([theta])).max() < 1e-12
+    assert (
+        np.abs(closure.solve([theta], initial_guess=near) - closure.solve([theta])).max() < 1e-12
+    )
 
 
 def test_guesses_with_opposed_axes_are_refused(tmp_path):

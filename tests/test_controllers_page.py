@@ -96,7 +96,7 @@ def test_a_law_sees_the_weight_alone_in_numbers_and_traced(page):
     push = np.array([0.5, 40.0, -60.0])  # more than its friction
 
     class Weight(ControlLaw):
-        def begin(self, at):
+        def initial_state(self, at):
             return at.gravity()
 
         def law(self, at):
@@ -169,7 +169,7 @@ def test_states_begin_where_the_machine_stands(page):
     """`begin` receives the inverse dynamics at the start."""
 
     class Held(ControlLaw):
-        def begin(self, at):
+        def initial_state(self, at):
             return at.inverse([0.0, 0.0, 0.0], friction=False)
 
         def law(self, at):

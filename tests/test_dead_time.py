@@ -189,7 +189,7 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path):
         crane.simulate(machine, crane.ValvePD(machine, reference), backend="pinocchio")
 
     class Law(ValveCommand):
-        measured = True
+        has_measured_pressures = True
 
         def references(self, times):
             return np.full((len(times), 2), 1e6)

@@ -100,8 +100,9 @@ def formula(dynamics, quantity, q, v_a, x):
         fast._equations, fast._structure, fast._active_columns, fast._passive_columns, posture
     )
     sweep = DynamicsFormulas(
-        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(),
-        dynamics.formula_structure, quantity in STICK_SLIP_QUANTITIES,
+        posture, loops, Floats(dynamics.formula_constants), q.tolist(), v_a.tolist(),
+        dynamics.formula_structure,
+        quantity in STICK_SLIP_QUANTITIES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
 
@@ -266,8 +267,10 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     closure, n = mini.closure, 3
     tape = Tape()
     q, posture, loops = closure.compiled_closure.trace_kinematics(tape, 0, 2)
-    constants = FormulaConstants(tape, 1, dynamics.numbers)
-    v_a = tape.load_vector(3, 0, n)
+    constants, v_a = (
+        FormulaConstants(tape, 1, dynamics.formula_constants),
+        tape.load_vector(3, 0, n),
+    )
     sweep = DynamicsFormulas(posture, loops, constants, q, v_a, dynamics.formula_structure)
     rows = differentiate(sweep.passive_force, v_a)
     program = Program()

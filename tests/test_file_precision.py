@@ -59,7 +59,7 @@ def assert_closed(machine, least, most):
     for reach in (0.0, 0.02, -0.03):
         q = closure.solve(machine.home[closure.active] + reach)
         phi = closure.equations.evaluate_scaled(q)[0]
-        assert np.abs(phi[structure.rows]).max() < 2e-13
+        assert np.abs(phi[structure.independent_rows]).max() < 2e-13
         assert np.abs(phi).max() <= structure.redundancy.tolerance
 
 

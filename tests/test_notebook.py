@@ -295,7 +295,7 @@ def test_every_class_is_shown_in_one_line(mini, run):
         seen.add(name)
     public = {x for x in crane.__all__ if inspect.isclass(getattr(crane, x))}
     errors = {"CraneError", "CraneWarning", "InterruptedRun"}
-    protocols = {"Command", "Controller"}
+    protocols = {"ValveCommand", "Controller"}
     assert public - seen == errors | protocols | RESULTS
 
 
@@ -331,18 +331,18 @@ def test_only_the_outermost_call_tells_its_share(heard):
         tell = progress_reporter(None)
         tell(0.25)
         inner()
-        assert heard.of(sys._getframe()) == 0.25
+        assert heard.finished_share(sys._getframe()) == 0.25
         given = [].append
         assert progress_reporter(given) is given
 
     def inner():
         assert progress_reporter(None) is None
-        assert heard.of(sys._getframe()) == 0.25
+        assert heard.finished_share(sys._getframe()) == 0.25
 
     outer()
-    assert heard.of(sys._getframe()) is None  # it has returned
+    assert heard.finished_share(sys._getframe()) is None  # it has returned
     again = progress_reporter(None)
-    assert again is not None and heard.of(sys._getframe()) == 0.0
+    assert again is not None and heard.finished_share(sys._getframe()) == 0.0
 
 
 def test_nobody_is_told_where_nobody_listens():
@@ -351,7 +351,7 @@ def test_nobody_is_told_where_nobody_listens():
 
 def test_calls_tell_shares_to_who_listens(heard, mini, monkeypatch):
     shares = []
-    monkeypatch.setattr(heard, "_told", shares.append)
+    monkeypatch.setattr(heard, "_set_share", shares.append)
     crane.study("mini_forwarder", {"link7.mass": [0.1, 0.2]}, ["lift"], ["peak_X1"])
     assert shares == [0.5, 1.0]
     crane.simulate(mini, duration=0.01)

@@ -10,11 +10,11 @@ import sys
 import time
 from crane.cli import entry
 from crane.cli import waiting as terminal
-from crane.common import waiting
+from crane.common import progress
 from crane.cli.shared import app, progress_bar
-from crane.formats import loading
+from crane.formats import machine_loading
 
-waiting.AFTER, waiting.EVERY = float(sys.argv.pop()), 0.05
+progress.REPORT_DELAY, progress.REPORT_INTERVAL = float(sys.argv.pop()), 0.05
 
 @app.command()
 def wait(seconds: float, bar: bool = False, served: bool = False):

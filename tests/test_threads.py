@@ -149,7 +149,7 @@ def posed(kinematics, q_a, v_a, x):
         out += [kinematics.position(a), kinematics.rotation(a), kinematics.jacobian(a)]
         out += [kinematics.bias(a, v)]
     out += [kinematics.position(q_a), kinematics.jacobian(q_a), kinematics.bias(q_a, v_a)]
-    return [*out, kinematics.inverse(kinematics.position(q_a[:3]), guess=q_a[0])]
+    return [*out, kinematics.inverse(kinematics.position(q_a[:3]), initial_guess=q_a[0])]
 
 
 def test_kinematics(mini):
@@ -163,13 +163,13 @@ def closed(closure, q_a, v_a, x):
         q = closure.solve(a)
         gamma = closure.gamma(q)
         out += [q, gamma, closure.drift(q, gamma @ v), closure.residual(q)]
-        out += closure.motion(q, v)
+        out += closure.gamma_velocity_drift(q, v)
     q = closure.solve(q_a)
     return [
         *out,
         q,
         closure.gamma(q),
-        closure.condition(q),
+        closure.condition_number(q),
         closure.follow_motion(np.linspace(*q_a[:2], 9)),
     ]
 
@@ -185,7 +185,7 @@ def balanced(stability, q_a, v_a, x):
         q = stability.machine.closure.solve(a[None])
         out += [
             *stability.static_margins(a),
-            stability.ground(q, q, q),
+            stability.ground_wrench(q, q, q),
             stability.tipping_load(a)[0],
         ]
     return out

@@ -306,7 +306,7 @@ def test_a_reader_that_ends_costs_one_mesh(tmp_path, place, monkeypatch):
     """The reader process restarts after the file at which it ended."""
     source = Path(mesh_process.__file__).read_text()
     opened, imported = (
-        "            head, arrays = _read(file, left)\n",
+        "            header, arrays = _read_mesh(file, remaining)\n",
         "import trimesh  # noqa: F401",
     )
     assert opened in source and imported in source

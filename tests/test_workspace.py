@@ -96,13 +96,13 @@ def test_five_bar_ends_where_its_rods_are_in_line(five):
     assert np.abs(np.array(gap) - 0.5).max() < 1e-5
     # the tip in the middle of the stretched rods
     middle = [np.mean(oracles.five_bar_tips(a, b), axis=0) for a, b in q_a]
-    places = np.vstack([curve.places for curve in edges])
+    places = np.vstack([curve.section_positions for curve in edges])
     assert np.abs(places - middle).max() < 3e-3  # the root of what is short of the end
 
 
 def test_five_bar_tip_is_singular_where_crank_and_rod_are_in_line(five):
     """There the tip is as far from a crank's foot as it can be, or as near: 0.55 or 0.05 m."""
-    places = np.vstack([curve.places for curve in five.curves if curve.kind == "tip"])
+    places = np.vstack([curve.section_positions for curve in five.curves if curve.kind == "tip"])
     away = [np.linalg.norm(places - foot, axis=1) for foot in ([0, 0], [0.4, 0])]
     off = [np.minimum(np.abs(d - 0.55), np.abs(d - 0.05)) for d in away]
     assert len(places) > 200
@@ -142,12 +142,12 @@ def test_five_bar_share_by_counting_crank_angles_that_close(five, five_bar):
     angles += five_bar.home[five_bar.closure.active]
     one, two = (oracles.at_angle(angles[:, k] + turn, 0.3) for k, turn in enumerate((1.4, 1.9)))
     gap = np.hypot(two[0] + 0.4 - one[0], two[1] - one[1])
-    assert five.share == pytest.approx((gap < 0.5).mean(), abs=0.01)
+    assert five.closed_share == pytest.approx((gap < 0.5).mean(), abs=0.01)
 
 
 def test_all_postures_close_and_are_of_the_branch(five, five_bar):
     (patch,) = five.patches
-    q = patch.q[patch.closed]
+    q = patch.configurations[patch.is_closed]
     assert five_bar.closure.residual(q).max() < 1e-12
     a, b, c, d = q[::40, [five_bar.column(name) for name in "abcd"]].T
     wanted = np.array([oracles.five_bar(*angles) for angles in zip(a, b, strict=True)]).T

@@ -80,7 +80,7 @@ def test_arguments(arm, value):
     assert machine.joints == ("upper_joint", "lower_joint")
     assert machine.tree.links["lower"].inertial.mass == 2.5
     again = crane.formats.load_from_expression(machine.load_expression)
-    assert again.joints == machine.joints and again.call == machine.load_expression
+    assert again.joints == machine.joints and again.load_expression == machine.load_expression
 
 
 def test_argument_that_the_file_does_not_have(arm):

@@ -354,7 +354,10 @@ class DimensionFinder:
             ]
             constraint_violation = (signed_distances.max(axis=1) - signed_distances[:, k]) / size
             optimum = self._optimizer.maximize(
-                pin.goal(0, -sign), -signed_distances[:, k], constraints, constraint_violation
+                pin.coordinate_objective(0, -sign),
+                -signed_distances[:, k],
+                constraints,
+                constraint_violation,
             )
             if optimum is not None and (best_candidate is None or -optimum[0] < best_candidate[1]):
                 best_candidate = pin, -optimum[0], optimum[1]
