@@ -205,8 +205,8 @@ def test_guesses_do_not_change_the_answer(mini):
         assert np.abs(mini.closure.solve(target, initial_guess=guess) - alone).max() < 1e-12
         near = mini.closure.solve(target, initial_guess=alone + 1e-4)  # beside the answer
         assert np.abs(near - alone).max() < 1e-12
-    assert np.abs(mini.closure.solve(targets, initial_guess=guesses[0]) - mini.closure.solve(targets)
-                  ).max() < 1e-12  # fmt: skip
+    guessed = mini.closure.solve(targets, initial_guess=guesses[0])
+    assert np.abs(guessed - mini.closure.solve(targets)).max() < 1e-12
 
 
 def test_stacks_equal_single_samples(mini):

@@ -278,7 +278,9 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     program.compile()
     at, v = closure.solve(np.array([0.3, 0.012, 0.02])), np.array([0.4, 0.1, -0.2])
     found = np.zeros(n * n)
-    program.call("f", closure.compiled_closure.geometry.constants, dynamics.numbers, at, v, found)
+    program.call(
+        "f", closure.compiled_closure.geometry.constants, dynamics.formula_constants, at, v, found
+    )
     wanted = [
         oracles.derivative(
             lambda t, e=e: dynamics.evaluate_closed("passive", at, v + t * e, v), 1e-2
@@ -676,7 +678,7 @@ def test_operations_of_machines_without_elements_read_none():
         and dynamics.formula_structure.distance_bodies == ()
     )
     sizes = [
-        len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
+        len(crane.Dynamics(machine.replace(ropes=ropes)).formula_constants)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)
     ]
     assert [two - one for one, two in pairwise(sizes)] == [28, 28]

@@ -65,8 +65,11 @@ def test_it_weighs_and_digs_as_data_sheets_say(machine):
     assert (PRESSURE * ARM / (radius * np.abs(turn))).max() == pytest.approx(106e3, rel=0.02)
 
 
-def test_a_cycle_ends_where_it_began_and_keeps_the_balance(cycles):
-    _, run = cycles["excavator"]
+def test_a_cycle_ends_where_it_began_and_keeps_the_balance(machine):
+    task = machine.tasks["dig"]
+    under = machine.with_external_forces(*task.loads)
+    levers = crane.joystick(machine, "dig")
+    run = crane.simulate(under, levers, duration=task.duration, step=1e-2)
     seen = run.channels
     assert np.abs(run.q[-1] - run.q[0]).max() < 0.1
     assert np.ptp(run.q[:, 0]) == pytest.approx(np.pi / 2, abs=0.05)
