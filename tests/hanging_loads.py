@@ -96,7 +96,7 @@ FLOATING = (
 )
 
 
-def afloat(folder):
+def floating_series(folder):
     """A hull that floats, with a driven four-bar on it and a load that sways on its coupler."""
     (folder / "afloat.urdf").write_text(FLOATING)
     return crane.load(folder / "afloat.urdf", floating=True, active=["turn"], free=["sway"])
