@@ -55,7 +55,7 @@ def test_base_parameters_come_back_from_exact_forces(mini):
     assert (error / np.sqrt(base.grouping**2 @ scales(model) ** 2)).max() < 1e-8
 
 
-@pytest.mark.parametrize("method", ["ols", "wls", "huber"])
+@pytest.mark.parametrize("method", ["ols", "wls", pytest.param("huber", marks=pytest.mark.long)])
 def test_noise_is_all_that_is_left(mini, method):
     """Within 10 % of what the filter passes of it, on another motion too where a prior helps."""
     given, other = noisy(motion(mini), 1), noisy(motion(mini, seed=7), 2)
