@@ -18,8 +18,9 @@ from crane.common.plausible_ranges import (
     implausible_value_text,
     plausible_range,
 )
+from crane.description.circuit_schema import MOTOR
+from crane.description.key_types import component_name
 from crane.formats.check import check
-from crane.formats.machine_file.circuit_section import MOTOR_KEYS
 from crane.hydraulics.circuit_connectivity import (
     connected_nodes,
     nodes_draining_to_tank,
@@ -252,12 +253,8 @@ SHARES = {("valve", "dead_band"), ("valve", "hysteresis"), ("valve", "float_from
 
 
 def test_all_numbers_of_a_circuit_are_in_the_table():
-    names = {
-        (kind.__name__.removeprefix("Circuit").lower(), name)
-        for kind in KINDS
-        for name in parameter_names(kind)
-    }
-    names |= {("motor", name) for name in MOTOR_KEYS}
+    names = {(component_name(kind), name) for kind in KINDS for name in parameter_names(kind)}
+    names |= {("motor", name) for name in MOTOR.keys}
     lacking = {(kind, name) for kind, name in names if plausible_range(name, False, kind) is None}
     assert lacking == UNJUDGED | SHARES
     assert {kind for kind, _ in RANGES_BY_COMPONENT} <= {kind for kind, _ in names}
@@ -376,5 +373,5 @@ def test_the_note_on_a_bundled_circuit():
 
 
 def test_the_table_has_no_unknown_names():
-    names = {name for kind in KINDS for name in parameter_names(kind)} | set(MOTOR_KEYS)
+    names = {name for kind in KINDS for name in parameter_names(kind)} | set(MOTOR.keys)
     assert set(PLAUSIBLE_RANGES) - names <= {"meter_out", "bore", "rod", "stroke"}

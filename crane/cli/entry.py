@@ -34,6 +34,7 @@ _HOMES = {  # modules of this room, in the order of `crane --help`, and the comm
     "modes": "modes",
     "pictures": "sketch",
     "power": "power",
+    "schema": "schema",
     "sensitivities": "sensitivities",
     "simulate": "simulate",
     "stability": "stability",

@@ -6,19 +6,37 @@ from pathlib import Path
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.file_contents import read_plain_file
+from crane.description.key_types import (
+    Key,
+    MapKey,
+    NameListKey,
+    NumberKey,
+    SectionSchema,
+)
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
 from crane.formats.joint_series import joint_series
-from crane.formats.machine_file.home_section import read_home
+from crane.formats.machine_file.structure_sections import read_home
 from crane.formats.machine_file.tree_builder import TreeBuilder
-from crane.formats.machine_file.yaml_section import MAX_FILE_SIZE, YamlSection
+from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value
+from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.urdf.joint_graph import MOVABLE_TYPES
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
 from crane.formats.xml_file import XmlFile
 
 URDF_FILE, YAML_FILE = "robot.urdf", "robot.yaml"
 
-_KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type", "home")
+_ROBOT_FILE = SectionSchema(
+    "the machine file",
+    {
+        "closed_loop": Key("pairs of frames that coincide"),
+        "type": Key("3d or 6d, of each pair"),
+        "name_mot": NameListKey("driven joints"),
+        "joint_name": NameListKey("joints of another type than in the URDF"),
+        "joint_type": Key("their types"),
+        "home": MapKey("home configuration", NumberKey(), "joint"),
+    },
+)
 _CONVENTION_PATTERN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
 _MACHINE_FILE_PATTERN = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
 _LOOP_TYPES = {"3d": "spherical", "6d": "fixed"}
@@ -44,7 +62,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     Raises:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
-    top = YamlSection.read(path, _KEYS)
+    top = YamlSection.read(path, _ROBOT_FILE)
     file = next(
         (f for f in (path.with_suffix(".urdf"), path.parent / URDF_FILE) if f.is_file()), None
     )
@@ -72,7 +90,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     if not tree.joints:
         raise DescriptionError(f"{file.name}: no joint moves in this file, add one")
     loops = _read_loops(top, urdf, tree)
-    motors = top.names("name_mot") if "name_mot" in top else ()
+    motors = top.names("name_mot")
     for joint in motors:
         if joint not in tree.joints and joint in replaced_types:
             raise top.error_at(
@@ -107,10 +125,10 @@ def read_parallel_robot(path: Path) -> MachineSpec:
 
 def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
     """Types that joints of the URDF are replaced by, and where that was written."""
-    if "joint_name" not in top:
-        return {}
     names = top.names("joint_name")
-    types = top.texts("joint_type")
+    if not names:
+        return {}
+    types = _read_texts(top, "joint_type")
     if len(names) != len(types):
         raise top.error_at(
             "joint_type", f"{len(types)} joint types for {len(names)} joints, give one of each"
@@ -178,8 +196,8 @@ def _universal_joint_parts(joint: Joint, axes: tuple[str, str], tree: Tree) -> l
 
 def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Loops between the frames of `closed_loop`: points that coincide, or frames."""
-    pairs = top.pairs("closed_loop") if "closed_loop" in top else []
-    kinds = top.texts("type") if "type" in top else ("6d",) * len(pairs)
+    pairs = _read_pairs(top, "closed_loop") if "closed_loop" in top else []
+    kinds = _read_texts(top, "type") if "type" in top else ["6d"] * len(pairs)
     if len(kinds) != len(pairs):
         raise top.error_at(
             "type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one"
@@ -209,3 +227,26 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
         tree.check_loop(loop)
         loops[name] = loop
     return tuple(loops.values())
+
+
+def _read_texts(top: YamlSection, key: str) -> list[str]:
+    """A list of texts."""
+    return top.read_list(key, "give a list such as [a, b]", _is_text, "which is no text, quote it")
+
+
+def _read_pairs(top: YamlSection, key: str) -> list[list[str]]:
+    """A list of pairs of names."""
+    pairs = top.read_list(
+        key,
+        "give a list of pairs [[a, b]]",
+        lambda item: isinstance(item, list) and len(item) == 2,
+        "write pairs as [a, b]",
+    )
+    for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
+        problem = f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
+        raise top.error_at(key, problem)
+    return pairs
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and value.isprintable()

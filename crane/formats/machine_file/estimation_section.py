@@ -5,49 +5,32 @@ from typing import Any
 
 from crane.common.errors import InputError
 from crane.description.estimation_settings import EstimationSettings, ParameterPrior, TermValues
-from crane.description.findings import error_recovery
-from crane.formats.machine_file.yaml_section import YamlSection, as_boolean, as_float
+from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_values import as_boolean, as_float
 from crane.machine import Machine
 
 _TERM_HINT = "on, off, a number or a list of numbers"
 
 
 def read_estimation(top: YamlSection) -> EstimationSettings:
-    """Terms, prior and settings; that their names exist is for the identification to see."""
-    section = top.section("identification", "'identification'")
+    """Terms, prior knowledge and settings; an identification checks that the names exist."""
+    section = top.section("identification")
     if section is None:
         return EstimationSettings()
-    section.check_keys("terms", "prior", "bandwidth", "slow")
-    terms: dict[str, TermValues | None] = {}
-    inner = section.section("terms", "'terms'")
-    for name in inner or ():
-        assert inner is not None
-        with error_recovery():
-            terms[name] = _read_term(inner, name)
-    priors: dict[str, ParameterPrior] = {}
-    inner = section.section("prior", "'prior'")
-    for name in inner or ():
-        assert inner is not None
-        with error_recovery():
-            priors[name] = _read_prior(inner, name)
-    inner = section.section("slow", "'slow'")
-    slow = {name: inner.number(name, minimum=0.0) for name in inner or () if inner is not None}
-    bandwidth = None
-    if "bandwidth" in section:
-        bandwidth = section.number("bandwidth", minimum=0.0)
-        if bandwidth == 0:
-            raise section.error_at("bandwidth", "'bandwidth' is 0, give one in Hz")
-    return EstimationSettings(terms, priors, bandwidth, slow)
+    return EstimationSettings(
+        section.value_map("terms", _read_term),
+        section.value_map("prior", _read_prior),
+        section.number("bandwidth") if "bandwidth" in section else None,
+        section.value_map("slow", YamlSection.number),
+    )
 
 
 def estimation_data(machine: Machine) -> dict[str, Any]:
     """The section as it is written."""
     settings = machine.estimation
-    terms = {name: _term_data(numbers) for name, numbers in settings.terms.items()}
-    prior = {name: str(known) for name, known in settings.prior.items()}
     data = {
-        "terms": terms,
-        "prior": prior,
+        "terms": {name: _term_data(numbers) for name, numbers in settings.terms.items()},
+        "prior": {name: str(known) for name, known in settings.prior.items()},
         "bandwidth": settings.bandwidth,
         "slow": dict(settings.slow),
     }

@@ -1,54 +1,46 @@
-"""The sections of a machine file on what acts from outside: loads, ground, contacts, soil."""
+"""The sections of a machine file on external forces: loads, ground, contacts, soil, cutters."""
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 from crane.common.errors import InputError, suggest_names
+from crane.description.external_force_schema import CONTACT, CONTACT_LAW_KEYS, CUTTER, GROUND, LOAD
 from crane.description.external_forces import ExternalForce, PhasedWrench, Wrench
-from crane.description.findings import error_recovery
-from crane.description.ground_contact import (
-    DEFAULT_DAMPING,
-    DEFAULT_FRICTION,
-    DEFAULT_SMOOTHING,
-    DEFAULT_STIFFNESS,
-    Contact,
-    Ground,
-)
+from crane.description.findings import FollowUpError, error_recovery
+from crane.description.ground_contact import Contact, Ground
 from crane.description.soil_cutting import SOILS, Soil, SoilCutting
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
-
-_SURFACE_KEYS = ("height", "normal", "profile")
-_CONTACT_DEFAULTS = {
-    "stiffness": DEFAULT_STIFFNESS,
-    "damping": DEFAULT_DAMPING,
-    "friction": DEFAULT_FRICTION,
-    "smoothing": DEFAULT_SMOOTHING,
-}
-_OPTIONAL_CONTACT_KEYS = ("radius", "area", "lateral_stiffness", "lateral_damping")
-_SOIL_KEYS = tuple(field.name for field in dataclasses.fields(Soil))
-_BLADE_KEYS = ("width", "length", "thickness", "smoothing")
 
 
 def read_external_forces(
     top: YamlSection, tree: TreeBuilder
 ) -> tuple[Wrench | Contact | SoilCutting, ...]:
-    """Forces from outside."""
-    section = top.section("ground", "'ground'")
-    ground, contact_defaults = None, _CONTACT_DEFAULTS
+    """External forces of a machine file."""
+    section, ground = top.section("ground"), None
+    contact_law = {key: GROUND.keys[key].default for key in CONTACT_LAW_KEYS}
     if section is not None:
         with error_recovery():
-            ground, contact_defaults = _read_ground(section)
+            values = section.values()
+            contact_law |= {key: values.pop(key) for key in CONTACT_LAW_KEYS if key in values}
+            if "profile" in section:
+                values["profile"] = tuple(map(tuple, section.rows("profile")))
+            ground = section.create(Ground, **values)
+
+    def read_contact(item: YamlSection) -> Contact:
+        frame = _read_moving_frame(item, tree)
+        _check_section(top, item, "contacts without a ground", "ground", "{height: 0}")
+        return item.create(Contact, frame, ground, **(contact_law | item.values("frame")))
+
     return (
         *read_loads(top, tree),
-        *_read_contacts(top, tree, ground, contact_defaults),
+        *top.read_items("contacts", read_contact),
         *_read_cutters(top, tree, ground),
     )
 
 
 def _read_moving_frame(item: YamlSection, tree: TreeBuilder) -> str:
-    frame = item.text("frame")
+    frame: str = item.text("frame")
     tree.check_link(frame, item.source_location("frame"), "the frame")
     if not tree.is_movable(frame):
         problem = f"'{frame}' does not move, a load on it does nothing"
@@ -56,130 +48,71 @@ def _read_moving_frame(item: YamlSection, tree: TreeBuilder) -> str:
     return frame
 
 
+def _check_section(
+    top: YamlSection, item: YamlSection, problem: str, key: str, example: str
+) -> None:
+    """Raise where a section that an item needs is absent."""
+    if key not in top:
+        raise item.error_at(None, f"{problem}, add '{key}: {example}'")
+
+
 def read_loads(
     top: YamlSection, tree: TreeBuilder, allows_phases: bool = False
-) -> Iterator[Wrench]:
+) -> tuple[Wrench, ...]:
     """The section `loads` of a machine or of a task, which may have phases."""
-    time_keys = ("times", *["phases"] * allows_phases)
-    for item in top.sections("loads", "load of", "frame", "force", "moment", *time_keys, "axes",
-                             "name"):  # fmt: skip
-        with error_recovery():
-            yield _read_wrench(item, _read_moving_frame(item, tree))
 
+    def read_wrench(item: YamlSection) -> Wrench:
+        if not allows_phases:
+            item.check_keys(LOAD.keys)
+        frame = _read_moving_frame(item, tree)
+        if "force" not in item and "moment" not in item:
+            raise item.error_at(None, f"the load on '{frame}' does nothing, give force or moment")
+        values = item.values("frame")
+        for key in ("force", "moment"):
+            rows = item.rows(key) if key in item else [[0.0, 0.0, 0.0]]
+            values[key] = rows[0] if len(rows) == 1 else rows
+        return item.create(PhasedWrench if "phases" in item else Wrench, frame, **values)
 
-def _read_wrench(item: YamlSection, frame: str) -> Wrench:
-    if "force" not in item and "moment" not in item:
-        raise item.error_at(None, f"the load on '{frame}' does nothing, give force or moment")
-    rows = (item.rows(key, (0.0, 0.0, 0.0)) for key in ("force", "moment"))
-    force, moment = (part[0] if len(part) == 1 else part for part in rows)
-    if "times" in item and "phases" in item:
-        raise item.error_at(
-            "phases", f"the load on '{frame}' has times and phases, give one of both"
-        )
-    time_key = next((key for key in ("times", "phases") if key in item), None)
-    kind = PhasedWrench if time_key == "phases" else Wrench
-    axes, name = item.text("axes", "world"), item.text("name", "")
-    try:
-        return kind(frame, force, moment, time_key and item.numbers(time_key), axes, name)
-    except InputError as error:
-        raise item.error_at(None, str(error)) from None
-
-
-def _read_contacts(
-    top: YamlSection, tree: TreeBuilder, ground: Ground | None, contact_defaults: dict[str, float]
-) -> Iterator[Contact]:
-    for item in top.sections(
-        "contacts", "contact of", "frame", "name", *_OPTIONAL_CONTACT_KEYS, *_CONTACT_DEFAULTS
-    ):
-        with error_recovery():
-            frame = _read_moving_frame(item, tree)
-            if "ground" not in top:
-                raise item.error_at(None, "contacts without a ground, add 'ground: {height: 0}'")
-            numbers = {key: item.number(key, value) for key, value in contact_defaults.items()}
-            numbers |= {key: item.number(key, 0.0) for key in _OPTIONAL_CONTACT_KEYS}
-            try:
-                yield Contact(frame, ground, **numbers, name=item.text("name", ""))
-            except InputError as error:
-                raise item.error_at(None, str(error)) from None
+    return top.read_items("loads", read_wrench)
 
 
 def _read_cutters(
     top: YamlSection, tree: TreeBuilder, ground: Ground | None
-) -> Iterator[SoilCutting]:
-    section = top.section("soil", "'soil'")
-    soil = None
+) -> tuple[SoilCutting, ...]:
+    section, soil = top.section("soil"), None
     if section is not None:
         with error_recovery():
             soil = _read_soil(section)
-    keys = ("frame", "blade", "cutting", "name", *_BLADE_KEYS)
-    for item in top.sections("cutters", "cutter of", *keys):
-        with error_recovery():
-            frame = _read_moving_frame(item, tree)
-            for key, hint in (("ground", "{height: 0}"), ("soil", "{kind: sandy loam}")):
-                if key not in top:
-                    raise item.error_at(None, f"cutters without {key}, add '{key}: {hint}'")
-            if soil is None:  # told above
-                continue
-            width, length = item.number("width"), item.number("length")
-            blade, cutting = item.numbers("blade"), item.numbers("cutting")
-            thickness, smoothing = (
-                item.number("thickness", 0.0),
-                item.number("smoothing", DEFAULT_SMOOTHING),
-            )
-            try:
-                yield SoilCutting(
-                    frame, soil, width, length, blade, cutting, ground, thickness, smoothing,
-                    item.text("name", ""),
-                )  # fmt: skip
-            except InputError as error:
-                raise item.error_at(None, str(error)) from None
+
+    def read_cutter(item: YamlSection) -> SoilCutting:
+        frame = _read_moving_frame(item, tree)
+        _check_section(top, item, "cutters without ground", "ground", "{height: 0}")
+        _check_section(top, item, "cutters without soil", "soil", "{kind: sandy loam}")
+        if soil is None:
+            raise FollowUpError("the soil is refused")
+        return item.create(SoilCutting, frame, soil, ground=ground, **item.values("frame"))
+
+    return top.read_items("cutters", read_cutter)
 
 
 def _read_soil(section: YamlSection) -> Soil:
-    """A soil of the table, or numbers, or one with other numbers."""
-    section.check_keys("kind", *_SOIL_KEYS)
-    defaults: dict[str, float] = {}
-    if "kind" in section:
-        kind = section.text("kind")
-        if kind not in SOILS:
-            raise section.error_at("kind", f"unknown soil '{kind}', {suggest_names(SOILS, kind)}")
-        defaults = dataclasses.asdict(SOILS[kind])
-    else:
-        defaults = dict.fromkeys(("tool_friction", "adhesion", "surcharge"), 0.0)
-    numbers = {
-        key: section.number(key, defaults[key]) if key in defaults else section.number(key)
-        for key in _SOIL_KEYS
-    }
-    try:
-        return Soil(**numbers)
-    except InputError as error:
-        raise section.error_at(None, str(error)) from None
-
-
-def _read_ground(section: YamlSection) -> tuple[Ground, dict[str, float]]:
-    """The surface, and its law."""
-    section.check_keys(*_SURFACE_KEYS, *_CONTACT_DEFAULTS)
-    contact_defaults = {
-        key: section.number(key, value) for key, value in _CONTACT_DEFAULTS.items()
-    }
-    data: dict[str, Any] = {}
-    if "height" in section:
-        data["height"] = section.number("height")
-    if "normal" in section:
-        data["normal"] = section.numbers("normal")
-    if "profile" in section:
-        data["profile"] = tuple(map(tuple, section.rows("profile")))
-    try:
-        return Ground(**data), contact_defaults
-    except InputError as error:
-        raise section.error_at(None, str(error)) from None
+    """A soil of the table, or one of other parameters, or one of the table with some others."""
+    values = section.values()
+    kind = values.pop("kind", None)
+    if kind is None:
+        for key in ("unit_weight", "cohesion", "friction"):
+            values[key] = section.number(key)
+        return section.create(Soil, **values)
+    if kind not in SOILS:
+        raise section.error_at("kind", f"unknown soil '{kind}', {suggest_names(SOILS, kind)}")
+    return section.create(dataclasses.replace, SOILS[kind], **values)
 
 
 def external_force_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
-    """The sections of forces from outside.
+    """The sections of external forces.
 
     Raises:
-        InputError: One is a program, not numbers, or there are several grounds or soils.
+        InputError: One is a function, or there are several grounds or soils.
     """
     data: dict[str, Any] = {
         "loads": [], "ground": None, "contacts": [], "soil": None, "cutters": []
@@ -193,24 +126,16 @@ def external_force_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
     for soil in soils:
         data["soil"] = dataclasses.asdict(soil)
     for ground in grounds:
-        data["ground"] = {"height": ground.height} | {
-            key: [list(x) for x in value] if key == "profile" else list(value)
-            for key, value in dataclasses.asdict(ground).items()
-            if key != "height" and value
-        }
+        data["ground"] = GROUND.values_of(ground) or {"height": 0.0}
     for force in forces:
         if type(force) is Wrench:
             data["loads"].append(load_data(force))
         elif type(force) is Contact:
-            item: dict[str, Any] = {"frame": force.frame}
-            item |= {
-                key: getattr(force, key) for key in (*_CONTACT_DEFAULTS, *_OPTIONAL_CONTACT_KEYS)
-            }
+            law = {key: getattr(force, key) for key in CONTACT_LAW_KEYS}
+            item = CONTACT.values_of(force, "name") | law
             data["contacts"].append(item | _name_data(force))
         elif type(force) is SoilCutting:
-            item = {"frame": force.frame, "blade": force.blade, "cutting": force.cutting}
-            item |= {key: getattr(force, key) for key in _BLADE_KEYS}
-            data["cutters"].append(item | _name_data(force))
+            data["cutters"].append(CUTTER.values_of(force, "name") | _name_data(force))
         else:
             raise InputError(
                 f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave "

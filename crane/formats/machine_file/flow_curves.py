@@ -7,11 +7,9 @@ from pathlib import Path
 
 from crane.common.errors import InputError
 from crane.common.file_contents import read_plain_file
-from crane.formats.machine_file.yaml_section import MAX_FILE_SIZE, YamlSection
+from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE
+from crane.formats.machine_file.yaml_section import YamlSection
 from crane.hydraulics.opening_curve import OpeningCurve
-
-_KEYS = ("coefficient", "shape", "flow", "drop", "area", "discharge", "density", "file")
-_DEFAULT_DISCHARGE, _DEFAULT_DENSITY = 0.7, 870.0  # of an orifice; of oil [kg/m3]
 
 
 def read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | None:
@@ -33,11 +31,8 @@ def read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | None
             return _normalize_curve(_read_pairs(item, key))
         inner = item.section(key, f"'{key}' of {item.title}")
         assert inner is not None
-        inner.check_keys(*_KEYS)
         if "shape" in inner:
-            return inner.number("coefficient", minimum=0.0), OpeningCurve(
-                _read_pairs(inner, "shape")
-            )
+            return inner.number("coefficient"), OpeningCurve(_read_pairs(inner, "shape"))
         quantity, points = _read_table(inner)
         return _normalize_curve([(u, x * _coefficient_factor(inner, quantity)) for u, x in points])
     except InputError as error:
@@ -103,9 +98,9 @@ def _coefficient_factor(section: YamlSection, quantity: str) -> float:
     if quantity == "coefficient":
         return 1.0
     if quantity == "flow":
-        drop = section.number("drop", minimum=0.0)
+        drop = section.number("drop")
         if not drop > 0:
             raise InputError("'drop' is 0, give the pressure drop that the flows were measured at")
         return 1.0 / math.sqrt(drop)
-    discharge = section.number("discharge", _DEFAULT_DISCHARGE, minimum=0.0)
-    return discharge * math.sqrt(2.0 / section.number("density", _DEFAULT_DENSITY, minimum=1.0))
+    discharge = section.number("discharge")
+    return discharge * math.sqrt(2.0 / section.number("density"))

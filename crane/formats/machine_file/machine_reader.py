@@ -8,26 +8,19 @@ from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import load_options
 from crane.description.estimation_settings import EstimationSettings
 from crane.description.external_forces import ExternalForce
-from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
-from crane.description.floating_bases import FLOATING_FREEDOMS, check_freedoms
+from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.ground_contact import Contact
 from crane.description.kinematic_tree import with_rotor_inertias
 from crane.description.machine_lookup import find_machine_file
+from crane.description.machine_schema import MACHINE
 from crane.description.specification import (
-    AXISLESS_TYPES,
-    LOOP_TYPES,
     Chain,
-    Coupling,
-    Drive,
-    ForceElement,
-    Friction,
     LoopSpec,
     MachineSpec,
     PayloadSpec,
     PIGains,
     Task,
     source_locations,
-    unit_vector,
 )
 from crane.formats.machine_file.circuit_section import (
     check_active_joint,
@@ -42,53 +35,24 @@ from crane.formats.machine_file.force_sections import (
     read_friction,
     read_gas_springs,
     read_ropes,
-    read_rotor_inertias,
 )
-from crane.formats.machine_file.home_section import read_home
 from crane.formats.machine_file.open_loop_warning import warn_about_open_loops
 from crane.formats.machine_file.sensor_section import read_sensors
+from crane.formats.machine_file.structure_sections import (
+    read_chains,
+    read_couplings,
+    read_drives,
+    read_home,
+    read_loops,
+)
 from crane.formats.machine_file.task_section import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
-from crane.formats.machine_file.yaml_section import EXTENDS_KEY, YamlSection
+from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.formats.robot_files import is_robot_file
-from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
+from crane.formats.urdf.urdf_reader import read_urdf
 
 SectionContent = TypeVar("SectionContent")
-
-_KEYS = (
-    EXTENDS_KEY,
-    "name",
-    "source",
-    "chains",
-    "floating",
-    "loops",
-    "active",
-    "free",
-    "drives",
-    "home",
-    "friction",
-    "forces",
-    "gas_springs",
-    "ropes",
-    "loads",
-    "ground",
-    "contacts",
-    "soil",
-    "cutters",
-    "supports",
-    "pins",
-    "end_stops",
-    "rotor_inertia",
-    "couplings",
-    "tip",
-    "payload",
-    "tasks",
-    "control",
-    "hydraulics",
-    "sensors",
-    "identification",
-)
 
 
 def read_machine_spec(name: str | Path) -> MachineSpec:
@@ -151,18 +115,18 @@ def read_plain_data(path: Path) -> dict[str, Any]:
     Raises:
         DescriptionError: As `read_machine_spec`.
     """
-    return YamlSection.read(path, _KEYS).to_plain_data()
+    return YamlSection.read(path, MACHINE).to_plain_data()
 
 
 def _read_machine(path: Path) -> MachineSpec:
-    top = YamlSection.read(path, _KEYS)
-    name, source = top.text("name"), top.text("source", "")
-    chains, tree, friction, couplings, springs = _read_chains(top, path)
-    loops = _read_loops(top, tree)
-    couplings += _read_couplings(top, tree)
+    top = YamlSection.read(path, MACHINE)
+    name, source = top.text("name"), top.text("source")
+    chains, tree, friction, couplings, springs = read_chains(top, path)
+    loops = read_loops(top, tree)
+    couplings += read_couplings(top, tree)
     active: tuple[str, ...] = UnknownNames()
     with error_recovery():
-        active = top.names("active") if "active" in top else ()
+        active = top.names("active")
     for joint in active:
         with error_recovery():
             tree.check_joint(joint, top.source_location("active"))
@@ -170,9 +134,11 @@ def _read_machine(path: Path) -> MachineSpec:
         active = UnknownNames()
     free = _read_free_joints(top, tree, active)
     locations = {key: top.source_location(key) for key in top} | source_locations(loops, couplings)
-    home, home_lines = read_home(top, tree)
-    locations |= {f"home {joint}": place for joint, place in home_lines.items()}
-    rotor_inertias = _read_or_default(read_rotor_inertias, {}, top, tree)
+    home, home_locations = read_home(top, tree)
+    locations |= home_locations
+    rotor_inertias = _read_or_default(
+        top.value_map, {}, "rotor_inertia", YamlSection.number, tree.check_joint
+    )
     friction |= _read_or_default(read_friction, {}, top, tree)
     forces = springs + _read_or_default(read_forces, (), top, tree)
     gas_springs = _read_or_default(read_gas_springs, (), top, tree)
@@ -214,7 +180,7 @@ def _read_machine(path: Path) -> MachineSpec:
         locations,
         payload,
         free,
-        _read_or_default(_read_drives, (), top, tree),
+        _read_or_default(read_drives, (), top, tree),
         _read_or_default(read_ropes, (), top, tree),
         _read_or_default(read_sensors, {}, top, tree),
         _read_or_default(read_estimation, EstimationSettings(), top),
@@ -224,26 +190,11 @@ def _read_machine(path: Path) -> MachineSpec:
     )
 
 
-def _read_floating(top: YamlSection) -> tuple[str, ...]:
-    """Freedoms of the first chain's root."""
-    if "floating" not in top:
-        return ()
-    names = top.names("floating")
-    for name in names:
-        if name not in FLOATING_FREEDOMS:
-            raise top.error_at(
-                "floating",
-                f"freedom '{name}' of the root is unknown, "
-                f"{suggest_names(FLOATING_FREEDOMS, name)}",
-            )
-    return check_freedoms(names)
-
-
 def _read_supports(
     top: YamlSection, tree: TreeBuilder, external_forces: Sequence[ExternalForce]
 ) -> tuple[str, ...]:
     """Links that the machine stands on."""
-    names = top.names("supports") if "supports" in top else ()
+    names = top.names("supports")
     contacts = {force.frame for force in external_forces if isinstance(force, Contact)}
     for link in names:
         tree.check_link(link, top.source_location("supports"), "the support")
@@ -257,24 +208,15 @@ def _read_supports(
 
 def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -> dict[str, float]:
     """The largest force that pins bear, by joint or loop [N]."""
-    found: dict[str, float] = {}
-    section = top.section("pins", "'pins'")
     names = [*tree.joints, *(loop.name for loop in loops)]
-    for name in section or ():
-        assert section is not None
-        with error_recovery(harmless=True):
-            if name not in names:
-                problem = (
-                    f"'{name}' under 'pins' is no joint or loop, {suggest_names(names, name)}"
-                )
-                raise tree.unknown_name_error(str(section.error_at(name, problem)))
-            force = section.number(name)
-            if force <= 0:
-                raise section.error_at(
-                    name, f"the pin '{name}' bears {force:g} N, give a force above 0"
-                )
-            found[name] = force
-    return found
+
+    def check_name(name: str, location: str) -> None:
+        if name not in names:
+            known = suggest_names(names, name)
+            problem = f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
+            raise tree.unknown_name_error(problem)
+
+    return top.value_map("pins", YamlSection.number, check_name)
 
 
 def _read_free_joints(
@@ -283,7 +225,7 @@ def _read_free_joints(
     """Independent coordinates that nothing drives."""
     free: tuple[str, ...] = ()
     with error_recovery(harmless=True):
-        free = top.names("free") if "free" in top else ()
+        free = top.names("free")
     for joint in free:
         with error_recovery(harmless=True):
             tree.check_joint(joint, top.source_location("free"))
@@ -303,7 +245,7 @@ def _read_or_default(
 
 def _read_tip(top: YamlSection, tree: TreeBuilder) -> str | None:
     """The name of the tip frame, also where it has been noted as wrong."""
-    tip = top.text("tip", None)
+    tip = top.text("tip")
     if tip is None:
         return None
     with error_recovery(harmless=True):
@@ -314,164 +256,11 @@ def _read_tip(top: YamlSection, tree: TreeBuilder) -> str | None:
     return tip
 
 
-def _read_chains(
-    top: YamlSection, path: Path
-) -> tuple[
-    tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...],
-    tuple[ForceElement, ...],
-]:  # fmt: skip
-    chains: list[Chain] = []
-    tree = TreeBuilder()
-    friction: dict[str, Friction] = {}
-    couplings: tuple[Coupling, ...] = ()
-    springs: tuple[ForceElement, ...] = ()
-    for item in top.sections("chains", "chain", "name", "urdf", "parent"):
-        tree.is_complete &= top.is_complete
-        was_complete = tree.is_complete
-        tree.is_complete = False
-        with error_recovery():
-            chain, urdf = _read_chain(item, chains, was_complete, path)
-            tree.is_complete = was_complete
-            tree.add_chain(chain, urdf)
-            chains.append(chain)
-            friction |= urdf.friction
-            couplings += urdf.couplings
-            springs += urdf.springs
-    tree.is_complete &= top.is_complete
-    if not chains and tree.is_complete:
-        report_error(top.error_at("chains", "there are no chains, add one under 'chains:'"))
-        tree.is_complete = False
-    with error_recovery(harmless=True):
-        tree.add_floating_base(_read_floating(top))
-    if not tree.joints and tree.is_complete:
-        report_error(top.error_at("chains", "no joint of these chains moves, add one"))
-    return tuple(chains), tree, friction, couplings, springs
-
-
-def _read_chain(
-    item: YamlSection, earlier_chains: list[Chain], are_all_read: bool, path: Path
-) -> tuple[Chain, UrdfModel]:
-    """A chain and its file.
-
-    Args:
-        item: Where it is written.
-        earlier_chains: The chains before it.
-        are_all_read: Whether these are all that were written before it.
-        path: The machine file.
-    """
-    name, parent = item.text("name"), item.text("parent", None)
-    file = item.file("urdf")
-    if any(chain.name == name for chain in earlier_chains):
-        report_error(item.error_at("name", f"two chains are named '{name}', rename one"))
-    elif (earlier_chains or not are_all_read) and parent is None:
-        problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
-        report_error(item.error_at(None, problem))
-    elif not earlier_chains and are_all_read and parent is not None:
-        problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
-        report_error(item.error_at("parent", problem))
-        parent = None
-    urdf = read_urdf(file)
-    for loop in urdf.loops[:1]:
-        problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
-        report_error(DescriptionError(f"{loop.source_location}: {problem}"))
-    return Chain(name, file, parent, item.source_location("parent"), urdf.moving_joints), urdf
-
-
-def _read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
-    loops: dict[str, LoopSpec] = {}
-    for item in top.sections("loops", "loop", "name", "type", "predecessor", "successor", "axis"):
-        with error_recovery():
-            loop = _read_loop(item, tree, loops)
-            loops[loop.name] = loop
-    return tuple(loops.values())
-
-
-def _read_loop(section: YamlSection, tree: TreeBuilder, earlier_names: Container[str]) -> LoopSpec:
-    name, kind = section.text("name"), section.text("type")
-    label = f"loop '{name}'" if name else "a loop"
-    if kind and kind not in LOOP_TYPES:
-        problem = f"{label} has the unknown type '{kind}', {suggest_names(LOOP_TYPES, kind)}"
-        report_error(section.error_at("type", problem))
-    frames = []
-    for end in ("predecessor", "successor"):
-        frame = section.text(end)
-        if frame and frame not in tree.links and tree.is_complete:
-            problem = (
-                f"{label} has the unknown {end} '{frame}', {suggest_names(tree.links, frame)}"
-            )
-            report_error(section.error_at(end, problem))
-        frames.append(frame)
-    axis = None
-    with error_recovery():
-        axis = unit_vector(section.numbers("axis", (0.0, 0.0, 1.0)))
-        if axis is None and kind in AXISLESS_TYPES:
-            axis = (0.0, 0.0, 1.0)
-        if axis is None:
-            problem = f"the axis of {label} is no direction"
-            raise section.error_at("axis", f"{problem}, give three numbers, not all zero")
-    if axis is None or kind not in LOOP_TYPES or not all(end in tree.links for end in frames):
-        raise FollowUpError(f"{label} is not complete")
-    loop = LoopSpec(name, kind, frames[0], frames[1], axis, section.source_location())
-    tree.check_loop(loop)
-    if name in earlier_names:
-        raise section.error_at("name", f"two loops are named '{name}', rename one")
-    return loop
-
-
-def _read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
-    found: dict[str, Coupling] = {}
-    for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
-        with error_recovery():
-            coupling = _read_coupling(item, tree, found)
-            found[coupling.name] = coupling
-    return tuple(found.values())
-
-
-def _read_coupling(
-    item: YamlSection, tree: TreeBuilder, earlier_names: Container[str]
-) -> Coupling:
-    name, joints = item.text("name"), item.section("joints", "'joints'")
-    if name in earlier_names:
-        raise item.error_at("name", f"two couplings are named '{name}', rename one")
-    if joints is None or len(list(joints)) < 2:
-        raise item.error_at("joints", f"coupling '{name}' joins less than two joints, add some")
-    factors = {}
-    for joint in joints:
-        with error_recovery():
-            tree.check_joint(joint, joints.source_location(joint))
-            factors[joint] = _read_factor(joints, joint)
-    return Coupling(name, factors, item.number("offset", 0.0), item.source_location())
-
-
-def _read_factor(joints: YamlSection, joint: str) -> float:
-    factor = joints.number(joint)
-    if factor == 0:
-        report_error(joints.error_at(joint, f"the factor of '{joint}' is 0, leave it out"))
-    return factor
-
-
-def _read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:
-    """What motors act along, where that is not the active joints one by one."""
-    found = []
-    section = top.section("drives", "'drives'")
-    for name in section or ():
-        assert section is not None
-        with error_recovery():
-            joints = section.section(name, f"drive '{name}'")
-            if joints is None or not list(joints):
-                raise section.error_at(name, f"drive '{name}' moves no joint, name some")
-            for joint in joints:
-                tree.check_joint(joint, joints.source_location(joint))
-            found.append(Drive(name, {joint: _read_factor(joints, joint) for joint in joints}))
-    return tuple(found)
-
-
 def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> PayloadSpec | None:
     """The load that payload.mass hangs on the tip, a chain without moving joints."""
-    section = top.section("payload", "'payload'")
+    section = top.section("payload")
     if section is None:
         return None
-    section.check_keys("urdf")
     if tip is None:
         raise section.error_at(None, "a payload hangs on the tip, name its frame under 'tip:'")
     urdf = read_urdf(section.file("urdf"))
@@ -494,14 +283,14 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
 
 
 def _read_control(top: YamlSection, active: tuple[str, ...]) -> dict[str, PIGains]:
-    gains, named_joints = {}, []
-    for joint, item in top.mappings("control", "control of", "kp", "ki"):
+    def read_gains(joint: str, item: YamlSection) -> PIGains:
         named_joints.append(joint)
         with error_recovery():
             check_active_joint(joint, item, active)
-        with error_recovery():
-            kp, ki = (item.number(key, minimum=0.0) for key in ("kp", "ki"))
-            gains[joint] = PIGains(kp, ki)
+        return PIGains(**item.values())
+
+    named_joints: list[str] = []
+    gains = top.read_map("control", read_gains)
     missing = [joint for joint in active if named_joints and joint not in named_joints]
     if missing:
         raise top.error_at("control", f"no gains for {', '.join(missing)}, give kp and ki of each")

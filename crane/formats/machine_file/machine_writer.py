@@ -1,6 +1,5 @@
 """A machine file with a URDF per sub-chain."""
 
-import dataclasses
 import math
 import warnings
 from collections.abc import Mapping
@@ -11,10 +10,27 @@ from lxml import etree
 
 from crane.common.atomic_output import portable_file_name, replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, format_one_line
+from crane.description.circuit_schema import (
+    BORE_KEYS,
+    CYLINDER,
+    HYDRAULICS,
+    MOTOR,
+    ORIFICE_KEYS,
+    SPOOL,
+    VALVE,
+)
+from crane.description.key_types import REQUIRED
+from crane.description.machine_schema import (
+    COUPLING,
+    FRICTION,
+    LOOP,
+    MACHINE,
+    SENSOR,
+    TASK,
+    VIA_POINT,
+)
 from crane.description.sensors import quantity_unit
-from crane.description.specification import Friction, Task, ViaPoint
-from crane.description.task_phases import Phase
-from crane.formats.machine_file.circuit_section import MOTOR_KEYS
+from crane.description.specification import Friction, Task
 from crane.formats.machine_file.estimation_section import estimation_data
 from crane.formats.machine_file.external_force_sections import external_force_data, load_data
 from crane.formats.machine_file.flow_curves import curve_data
@@ -35,9 +51,7 @@ from crane.formats.urdf_output import (
     rotor_inertias,
     with_floating_joints,
 )
-from crane.hydraulics import CircuitElement, Cylinder, Hydraulics, Supply, Valve
-from crane.hydraulics.components import COUNTERBALANCE_KEYS
-from crane.hydraulics.parameter_checks import parameter_names
+from crane.hydraulics import Cylinder, Hydraulics, Valve
 from crane.machine import Machine
 
 
@@ -148,11 +162,10 @@ class MachineDraft:
                 return False
             parent = parent[key]
         circuit = self._machine.hydraulics
-        is_valve_value = key_path[:2] == ("hydraulics", "valves") and len(key_path) == 4
-        if circuit is not None and is_valve_value and key_path[-1] not in parent:
-            valve_data = _valve_data(circuit.valves[str(key_path[2])], allow_flow=False)
-            parent.clear()
-            parent.update(valve_data)
+        if circuit is not None and key_path[-1] in ORIFICE_KEYS and "flow" in parent:
+            del parent["flow"], parent["meter_out"]
+            valve = circuit.valves[str(key_path[2])]
+            parent.update({key: getattr(valve, key) for key in ORIFICE_KEYS})
         return bool(parent.setdefault(key_path[-1], value) == value)
 
     def _find_element(self, location: UrdfLocation) -> etree._Element | None:
@@ -189,6 +202,9 @@ class MachineDraft:
         if self._payload_file is not None:
             (folder / self.data["payload"]["urdf"]).write_bytes(self._payload_file[1])
         nonempty = {key: value for key, value in self.data.items() if value not in (None, [], {})}
+        circuit = nonempty.get("hydraulics", {})
+        if not circuit.get("oil", True):
+            nonempty["hydraulics"] = {k: value for k, value in circuit.items() if k != "oil"}
         header = "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
         (folder / file).write_text(
             header + format_yaml(nonempty, self._line_notes), encoding="utf-8"
@@ -237,59 +253,39 @@ class _ChainDivision:
 
 
 def _machine_data(machine: Machine) -> dict[str, Any]:
-    """The machine file, without chains and payload."""
-    data: dict[str, Any] = {"name": machine.name}
-    if machine.source:
-        data["source"] = machine.source
-    data["chains"] = []
+    """The machine file, with empty chains and without payload."""
     equations = machine.closure.equations
-    data["loops"] = [
-        {
-            "name": loop.name, "type": loop.type, "predecessor": loop.predecessor,
-            "successor": loop.successor, "axis": [float(x) for x in loop.axis],
-        }
-        for loop in equations.loops
-    ]  # fmt: skip
-    data["couplings"] = []
     for coupling in equations.couplings:
         if len(coupling.factors) < 2:
             raise InputError(
                 f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
                 "that joint instead"
             )
-        item = {"name": coupling.name, "joints": dict(coupling.factors)}
-        data["couplings"].append(item | ({"offset": coupling.offset} if coupling.offset else {}))
-    data["active"] = _active_data(machine)
-    data["free"] = list(machine.free)
-    data["home"] = dict(zip(machine.joints, machine.home.tolist(), strict=True))
-    data["friction"] = {joint: friction_data(law) for joint, law in machine.friction.items()}
-    data["forces"] = [_nondefault_values(item) for item in machine.forces]
-    data["gas_springs"] = {
-        item.joint: _nondefault_values(item, "joint") for item in machine.gas_springs
+    data: dict[str, Any] = {
+        "chains": [],
+        "loops": [
+            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]}
+            for loop in equations.loops
+        ],
+        "couplings": [COUPLING.values_of(coupling) for coupling in equations.couplings],
+        "active": _active_data(machine),
+        "drives": compound_drive_factors(machine),
+        "home": dict(zip(machine.joints, machine.home.tolist(), strict=True)),
+        "friction": {joint: friction_data(law) for joint, law in machine.friction.items()},
+        **external_force_data(machine.external_forces),
+        "rotor_inertia": rotor_inertias(machine),
+        "payload": None,
+        "tasks": {name: _task_data(task) for name, task in machine.tasks.items()},
+        "hydraulics": machine.hydraulics and _hydraulics_data(machine.hydraulics),
+        "sensors": {
+            name: SENSOR.values_of(sensor) or {"zero": 0.0}
+            for name, sensor in machine.sensors.items()
+            if quantity_unit(machine.tree, name) is not None  # a joint that is locked has none
+        },
+        "identification": estimation_data(machine),
     }
-    data["ropes"] = [_nondefault_values(item) for item in machine.ropes]
-    data |= external_force_data(machine.external_forces)
-    data["supports"] = list(machine.supports)
-    data["pins"] = dict(machine.pin_capacities)
-    data["end_stops"] = {
-        item.joint: _nondefault_values(item, "joint") for item in machine.end_stops
-    }
-    data["rotor_inertia"] = rotor_inertias(machine)
-    data["drives"] = compound_drive_factors(machine)
-    data["tip"] = machine.tip
-    data["tasks"] = {name: _task_data(task) for name, task in machine.tasks.items()}
-    data["control"] = {
-        joint: _nondefault_values(gains) for joint, gains in machine.control.items()
-    }
-    data["identification"] = estimation_data(machine)
-    if machine.hydraulics is not None:
-        data["hydraulics"] = _hydraulics_data(machine.hydraulics)
-    data["sensors"] = {
-        name: _nondefault_values(sensor) or {"zero": 0.0}
-        for name, sensor in machine.sensors.items()
-        if quantity_unit(machine.tree, name) is not None  # a joint that is locked has none
-    }
-    return data
+    data |= MACHINE.values_of(machine, *data)
+    return {key: data[key] for key in MACHINE.keys if key in data}
 
 
 def _active_data(machine: Machine) -> list[str]:
@@ -301,158 +297,75 @@ def _active_data(machine: Machine) -> list[str]:
     return list(machine.driven_joints)
 
 
-def _nondefault_values(item: Any, *excluded: str) -> dict[str, Any]:
-    """What of a dataclass is not as by default."""
-    return {
-        field.name: getattr(item, field.name)
-        for field in dataclasses.fields(item)
-        if field.name not in excluded and getattr(item, field.name) != field.default
-    }
-
-
 def friction_data(law: Friction) -> dict[str, Any]:
-    """What a machine file says of friction; that it drives was told where it comes from."""
-    return (_nondefault_values(law) or {"viscous": 0.0}) | (
-        {"drives": True} if law.is_driving else {}
-    )
+    """The keys of a friction law in a machine file."""
+    return FRICTION.values_of(law) or {"viscous": 0.0}
 
 
 def _task_data(task: Task) -> dict[str, Any]:
-    data: dict[str, Any] = {"description": task.description} if task.description else {}
-    if not task.phases:
-        data["duration"] = task.duration
+    data = TASK.values_of(task, "via", "loads")
+    if task.via or task.phases:
+        del data["duration"]
     if task.loads:
         data["loads"] = [load_data(load) for load in task.loads]
-    if task.space == "joystick":
-        lever_data = {
+    if task.via:
+        data["via"] = [VIA_POINT.values_of(via) | dict(via.point) for via in task.via]
+    elif task.coefficients:
+        data[task.space] = {key: list(row) for key, row in task.coefficients.items()}
+    elif not task.phases:
+        data["joystick"] = {
             joint: [x for point in polygon for x in point]
             for joint, polygon in task.levers.items()
         }
-        start = {"start": dict(task.start)} if task.start else {}
-        if task.phases:
-            return (
-                data | {"phases": [_phase_data(x) for x in task.phases], "ramp": task.ramp} | start
-            )
-        return data | {"joystick": lever_data} | start
-    if task.via:
-        del data["duration"]
-        return data | {"via": [_via_data(via) for via in task.via]}
-    return data | {task.space: {key: list(row) for key, row in task.coefficients.items()}}
-
-
-def _phase_data(phase: Phase) -> dict[str, Any]:
-    data = {"name": phase.name, "levers": dict(phase.levers), "until": dict(phase.until)}
-    return data | {"within": phase.within}
-
-
-def _via_data(via: ViaPoint) -> dict[str, Any]:
-    rates = {"rates": dict(via.rates)} if via.rates else {}
-    return {"time": via.time, **via.point, **rates}
-
-
-def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
-    data = {
-        "supply": _supply_data(circuit.supply) | {"tank": circuit.supply.tank},
-        "oil": _all_values(circuit.oil),
-        "cylinders": {joint: _cylinder_data(item) for joint, item in circuit.cylinders.items()},
-        "valves": {joint: _valve_data(valve) for joint, valve in circuit.valves.items()},
-    }
-    motors = [joint for joint, item in circuit.cylinders.items() if item.motor]
-    if motors:
-        data["motors"] = {x: _motor_data(x, data["cylinders"].pop(x)) for x in motors}
-    if circuit.engine is not None:
-        data["engine"] = _all_values(circuit.engine)
-    data |= {
-        key: found
-        for key, found in {
-            "supplies": {x: _supply_data(part) for x, part in circuit.supplies.items()},
-            "lines": {x: _all_values(part) for x, part in circuit.lines.items()},
-            "accumulators": {x: _all_values(part) for x, part in circuit.accumulators.items()},
-            "elements": {x: _element_data(part) for x, part in circuit.elements.items()},
-        }.items()
-        if found
-    }
-    if circuit.control:
-        data["control"] = {joint: _all_values(gains) for joint, gains in circuit.control.items()}
     return data
 
 
-def _all_values(part: Any) -> dict[str, Any]:
-    return {name: getattr(part, name) for name in parameter_names(type(part))}
+def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
+    drives: dict[str, dict[str, Any]] = {"cylinders": {}, "motors": {}}
+    for joint, item in circuit.cylinders.items():
+        if item.motor:
+            drives["motors"][joint] = _motor_data(item)
+        else:
+            drives["cylinders"][joint] = CYLINDER.values_of(item, *BORE_KEYS)
+    data = HYDRAULICS.values_of(circuit, "cylinders", "valves") | {
+        **{key: value for key, value in drives.items() if value},
+        "valves": {joint: _valve_data(valve) for joint, valve in circuit.valves.items()},
+    }
+    return {key: data[key] for key in HYDRAULICS.keys if key in data}
 
 
-def _supply_data(supply: Supply) -> dict[str, Any]:
-    data = _all_values(supply)
-    del data["tank"]
-    if supply.control != "pressure":
-        data["control"] = supply.control
-    return data | ({"summed": list(supply.summed)} if supply.summed else {})
-
-
-def _element_data(element: CircuitElement) -> dict[str, Any]:
-    data: dict[str, Any] = {"type": element.kind, "from": element.source, "to": element.target}
-    data |= _all_values(element)
-    return data | ({"joints": [*element.joints], "side": element.side} if element.joints else {})
-
-
-def _motor_data(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
-    """A motor from what it is as a cylinder."""
-    motor_values = {"displacement": cylinder["area_a"], "volume": cylinder["hose_a"]}
-    motor_values |= {key: cylinder[name] for key, name in MOTOR_KEYS.items() if name is not None}
-    defaults = _all_values(
-        Cylinder(joint, *2 * [motor_values["displacement"]], *2 * [motor_values["volume"]])
-    )
-    defaults["count"] = 1
-    for name in cylinder.keys() - motor_values.keys():
-        if cylinder[name] != defaults[name]:
+def _motor_data(motor: Cylinder) -> dict[str, Any]:
+    """A motor from its values as a cylinder."""
+    expected = {"area_b": motor.area_a, "hose_b": motor.hose_a}
+    expected |= {
+        name: key.default
+        for name, key in CYLINDER.keys.items()
+        if name not in {*MOTOR.keys, *BORE_KEYS} and key.default not in (REQUIRED, None)
+    }
+    for name, value in expected.items():
+        if getattr(motor, name) != value:
             raise InputError(
-                f"{name} of the motor of '{joint}' is {cylinder[name]:g}, which a machine file "
-                f"has no motor with, leave it at {defaults[name]:g}"
+                f"{name} of the motor of '{motor.joint}' is {getattr(motor, name):g}, which a "
+                f"machine file has no motor with, leave it at {value:g}"
             )
-    return motor_values
+    size = {"displacement": motor.area_a, "volume": motor.hose_a}
+    return size | MOTOR.values_of(motor, "displacement", "gear", "volume")
 
 
-def _cylinder_data(cylinder: Cylinder) -> dict[str, Any]:
-    counterbalance_valves = {
-        key: getattr(cylinder, key)
-        for key in COUNTERBALANCE_KEYS
-        if getattr(cylinder, key) is not None
-    }
-    data = _all_values(cylinder) | {
-        key: _all_values(valve) for key, valve in counterbalance_valves.items()
-    }
-    return data | ({"count": cylinder.count} if cylinder.count > 1 else {})
-
-
-def _valve_data(valve: Valve, allow_flow: bool = True) -> dict[str, Any]:
-    edges = ("c1", "c2", "c3", "c4")
-    other_values = {
-        name: getattr(valve, name)
-        for name in parameter_names(Valve)
-        if name not in (*edges, "margin")
-    }
-    orifice_values: dict[str, Any] = {name: getattr(valve, name) for name in edges}
-    defaults = Valve(valve.joint, 1.0, 1.0, 1.0, 1.0)
-    for name in ("supply", "return_a", "return_b"):
-        if getattr(valve, name) != getattr(defaults, name):
-            other_values[name] = getattr(valve, name)
-    if valve.priority:
-        other_values["priority"] = True
+def _valve_data(valve: Valve) -> dict[str, Any]:
+    values = VALVE.values_of(valve, "margin", "spool_b")
     if valve.spool_b:
-        other_values["spool_b"] = _all_values(valve.spool_b)
+        values["spool_b"] = {name: getattr(valve.spool_b, name) for name in SPOOL.keys}
     for name, curve in valve.curves.items():
-        target = other_values if name == "centre" else orifice_values
-        target[name] = curve_data(getattr(valve, name), curve)
+        values[name] = curve_data(getattr(valve, name), curve)
     if not valve.margin:
-        return {
-            "type": "sharing" if valve.sharing else "orifice",
-            **orifice_values,
-            **other_values,
-        }
-    allow_flow = allow_flow and not valve.curves.keys() & {*edges}
-    flow = _exact_flow(valve) if allow_flow else None
-    size_values = orifice_values if flow is None else {"flow": flow, "meter_out": valve.c2}
-    return {"type": "compensated", "margin": valve.margin, **size_values, **other_values}
+        return {"type": "sharing" if valve.sharing else "orifice"} | values
+    flow = None if valve.curves.keys() & {*ORIFICE_KEYS} else _exact_flow(valve)
+    size = {"type": "compensated", "margin": valve.margin}
+    if flow is not None:
+        size |= {"flow": flow, "meter_out": valve.c2}
+        values = {name: value for name, value in values.items() if name not in ORIFICE_KEYS}
+    return size | values
 
 
 def _exact_flow(valve: Valve) -> float | None:

@@ -3,14 +3,13 @@
 import dataclasses
 from collections.abc import Sequence
 
-from crane.description.findings import UnknownNames, error_recovery, report_error
+from crane.description.findings import UnknownNames, error_recovery
+from crane.description.machine_schema import MOTIONS
 from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES, Task, ViaPoint
+from crane.description.task_phases import Phase
 from crane.formats.machine_file.external_force_sections import read_loads
-from crane.formats.machine_file.phase_section import read_phased_task
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
-
-_MOTION_KEYS = "'tip', 'active', 'via', 'joystick', 'phases'"
 
 
 def read_tasks(
@@ -26,66 +25,53 @@ def read_tasks(
     Raises:
         DescriptionError: With file, line, and what is wrong.
     """
-    tasks = {}
-    keys = (
-        "description", "duration", "tip", "active", "via", "joystick", "phases", "ramp", "start",
-        "loads",
-    )  # fmt: skip
-    for name, item in top.mappings("tasks", "task", *keys):
-        with error_recovery():
-            spaces = {"tip": TIP_COORDINATES, "active": active, "joystick": valves}
-            has_phases = "phases" in item
-            lever_key = "phases" if has_phases else "joystick"
-            if lever_key in item and not valves:
-                problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
-                raise item.error_at(lever_key, problem)
-            if has_phases:
-                task = read_phased_task(
-                    name, item, _read_start(name, item, active), valves, tree, home
-                )
-            else:
-                task = _read_task(name, item, spaces, tip)
-            tasks[name] = dataclasses.replace(
-                task, loads=tuple(read_loads(item, tree, has_phases))
-            )
-    return tasks
+    spaces = {"tip": TIP_COORDINATES, "active": active, "joystick": valves}
+
+    def read_task(name: str, item: YamlSection) -> Task:
+        has_phases = "phases" in item
+        item.check_exclusive_keys()
+        lever_key = "phases" if has_phases else "joystick"
+        if lever_key in item and not valves:
+            problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
+            raise item.error_at(lever_key, problem)
+        if has_phases:
+            task = _read_phased_task(name, item, spaces, tree, home)
+        else:
+            read = _read_via_task if "via" in item else _read_task
+            task = read(name, item, spaces, tip)
+        description = item.text("description")
+        loads = read_loads(item, tree, has_phases)
+        return dataclasses.replace(task, description=description, loads=loads)
+
+    return top.read_map("tasks", read_task)
 
 
 def _read_task(
     name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
 ) -> Task:
     """A task of one of the spaces, each of which is given with the names of its coordinates."""
-    if "ramp" in item:
-        raise item.error_at("ramp", f"task '{name}' has no phases, leave 'ramp' to these")
-    if "via" in item:
-        return _read_via_task(name, item, spaces, tip)
-    duration = item.number("duration", minimum=0.0)
-    if duration == 0:
-        report_error(item.error_at("duration", f"task '{name}' takes no time, give a duration"))
-    given_motions = [
-        (space, section)
+    duration = item.number("duration")
+    motions = {
+        space: section
         for space in spaces
         if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
-    ]
-    if len(given_motions) != 1:
-        count = "more than one" if given_motions else "none"
-        raise item.error_at(None, f"task '{name}' has {count} of {_MOTION_KEYS}, give one")
-    space, motion = given_motions[0]
+    }
+    if not motions:
+        raise item.error_at(None, f"task '{name}' has none of {MOTIONS}, give one")
+    ((space, motion),) = motions.items()
     if space == "tip":
         _check_has_tip(name, item, "tip", tip)
     if not isinstance(spaces[space], UnknownNames):
-        motion.check_keys(*spaces[space])
-    description = item.text("description", "")
+        motion.check_keys(spaces[space])
     if space == "joystick":
+        levers = item.value_map(space, lambda part, joint: _read_lever(part, joint, duration))
         start = _read_start(name, item, spaces["active"])
-        return Task(
-            name, description, duration, space, {}, _read_levers(motion, duration), start=start
-        )
-    if "start" in item:
-        raise item.error_at(
-            "start", f"task '{name}' starts where its motion does, leave 'start' to levers"
-        )
-    return Task(name, description, duration, space, _read_polynomials(motion, spaces[space]))
+        return Task(name, "", duration, space, {}, levers, start=start)
+    coefficients = {}
+    for coordinate in spaces[space]:
+        with error_recovery():
+            coefficients[coordinate] = motion.numbers(coordinate)
+    return Task(name, "", duration, space, coefficients)
 
 
 def _check_has_tip(name: str, item: YamlSection, key: str, tip: str | None) -> None:
@@ -95,26 +81,17 @@ def _check_has_tip(name: str, item: YamlSection, key: str, tip: str | None) -> N
 
 def _read_start(name: str, item: YamlSection, active: tuple[str, ...]) -> dict[str, float]:
     """Active coordinates where levers begin."""
-    section = item.section("start", f"'start' of task '{name}'")
-    if section is None:
-        return {}
-    if not isinstance(active, UnknownNames):
-        section.check_keys(*active)
-    return {joint: section.number(joint) for joint in section}
+    title = f"'start' of task '{name}'"
+    section = item.section("start", title)
+    if section is not None and not isinstance(active, UnknownNames):
+        section.check_keys(active)
+    return item.value_map("start", YamlSection.number, title=title)
 
 
 def _read_via_task(
     name: str, item: YamlSection, spaces: dict[str, tuple[str, ...]], tip: str | None
 ) -> Task:
     """A task through points, in the space of the coordinates that these name."""
-    for key in ("tip", "active", "joystick"):
-        if key in item:
-            raise item.error_at(
-                key, f"task '{name}' has more than one of {_MOTION_KEYS}, give one"
-            )
-    for key, why in {"duration": "ends at its last point", "start": "starts at its first"}.items():
-        if key in item:
-            raise item.error_at(key, f"task '{name}' {why}, leave '{key}' out")
     active, attitude = spaces["active"], tuple(x for group in ATTITUDE_COORDINATES for x in group)
     coordinate_names = active
     if not isinstance(active, UnknownNames):
@@ -123,8 +100,10 @@ def _read_via_task(
             *(x for x in (*TIP_COORDINATES, *attitude) if x not in active),
         )
     title = f"via point of task '{name}'"
-    keys = () if isinstance(active, UnknownNames) else ("time", "rates", *coordinate_names)
-    points = list(item.sections("via", title, *keys))
+    points = list(item.list_items("via", title))
+    for point in points:
+        if not isinstance(active, UnknownNames):
+            point.check_keys(("time", "rates", *coordinate_names))
     if len(points) < 2:
         raise item.error_at(
             "via", f"task '{name}' has {len(points)} via points, give two at least"
@@ -168,12 +147,12 @@ def _read_via_task(
         ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
         for one in via_points
     )
-    return Task(name, item.text("description", ""), via_points[-1].time, space, {}, via=ordered)
+    return Task(name, "", via_points[-1].time, space, {}, via=ordered)
 
 
 def _read_via_point(point: YamlSection, title: str, coordinate_names: tuple[str, ...]) -> ViaPoint:
     """A via point with the coordinates that it names."""
-    time = point.number("time", minimum=0.0)
+    time = point.number("time")
     coordinates = {x: point.number(x) for x in point if x not in ("time", "rates")}
     if not coordinates:
         raise point.error_at(None, f"a {title} has no coordinate, name some")
@@ -181,7 +160,7 @@ def _read_via_point(point: YamlSection, title: str, coordinate_names: tuple[str,
     if rates is None:
         return ViaPoint(time, coordinates)
     if not isinstance(coordinate_names, UnknownNames):
-        rates.check_keys(*(x for x in coordinate_names if x in coordinates))
+        rates.check_keys(x for x in coordinate_names if x in coordinates)
     return ViaPoint(time, coordinates, {x: rates.number(x) for x in rates})
 
 
@@ -208,26 +187,6 @@ def _attitude_coordinates(
     return groups[0]
 
 
-def _read_polynomials(
-    section: YamlSection, names: tuple[str, ...]
-) -> dict[str, tuple[float, ...]]:
-    found = {}
-    for name in names:
-        with error_recovery():
-            found[name] = section.numbers(name)
-    return found
-
-
-def _read_levers(
-    section: YamlSection, duration: float
-) -> dict[str, tuple[tuple[float, float], ...]]:
-    found = {}
-    for joint in section:
-        with error_recovery():
-            found[joint] = _read_lever(section, joint, duration)
-    return found
-
-
 def _read_lever(
     section: YamlSection, joint: str, duration: float
 ) -> tuple[tuple[float, float], ...]:
@@ -248,3 +207,47 @@ def _read_lever(
             joint, f"a lever of '{joint}' is beyond -1 to 1, the valve's whole flow"
         )
     return tuple(zip(times, levers, strict=True))
+
+
+def _read_phased_task(
+    name: str,
+    item: YamlSection,
+    spaces: dict[str, tuple[str, ...]],
+    tree: TreeBuilder,
+    home: dict[str, float],
+) -> Task:
+    """A task of levers that are held until joints have reached their positions."""
+    start_positions = _read_start(name, item, spaces["active"])
+    valves = spaces["joystick"]
+    limits = {x: (joint.limits.lower, joint.limits.upper) for x, joint in tree.joints.items()}
+    positions = {  # what is beyond the limits is told at home
+        joint: position
+        for joint, position in (home | start_positions).items()
+        if joint not in limits or limits[joint][0] <= position <= limits[joint][1]
+    }
+    phases: list[Phase] = []
+    for section in item.list_items("phases"):
+        with error_recovery():
+            phase = _read_phase(section)
+            if not isinstance(valves, UnknownNames):
+                for part, joint, problem in phase.find_problems(valves, limits, positions):
+                    inner = section.section(part, part) if joint else None
+                    raise (inner or section).error_at(joint or part, problem)
+            positions |= phase.until
+            phases.append(phase)
+    if not phases and not item.raw_value("phases"):
+        raise item.error_at("phases", f"task '{name}' has no phases, give one at least")
+    max_duration = sum(phase.within for phase in phases)
+    return Task(
+        name, "", max_duration, "joystick", {}, start=start_positions,
+        phases=tuple(phases), ramp=item.number("ramp"),
+    )  # fmt: skip
+
+
+def _read_phase(section: YamlSection) -> Phase:
+    name, within = section.text("name"), section.number("within")
+    levers, until = (
+        section.value_map(key, YamlSection.number, title=f"'{key}' of phase '{name}'")
+        for key in ("levers", "until")
+    )
+    return Phase(name, levers, until, within)

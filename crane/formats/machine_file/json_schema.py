@@ -1,0 +1,153 @@
+"""The JSON Schema of machine files, by which editors complete and check them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from crane.description.key_types import (
+    REQUIRED,
+    FlagKey,
+    Key,
+    ListKey,
+    MapKey,
+    NameListKey,
+    NumberKey,
+    NumberListKey,
+    RowListKey,
+    SectionKey,
+    SectionSchema,
+    VariantKey,
+)
+from crane.description.machine_schema import EXTENDS_KEY, MACHINE
+
+SCHEMA_PATH = Path(__file__).with_name("machine_file.schema.json")  # shipped with the package
+_NUMBER_PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*$"  # YAML 1.1 reads 2e5 as text
+
+
+def schema_text() -> str:
+    """The JSON Schema (draft 2020-12) of machine files.
+
+    A file with the key `extends` needs no other key, and may remove keys by empty values.
+    """
+    definitions = _Definitions()
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "machine file of crane",
+        "type": "object",
+        "if": {"type": "object", "required": [EXTENDS_KEY]},
+        "then": definitions.section("variant", MACHINE, is_partial=True),
+        "else": definitions.section("machine", MACHINE, is_partial=False),
+        "$defs": definitions.schemas,
+    }
+    return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
+
+
+class _Definitions:
+    """Schemas of sections, each once.
+
+    Attributes:
+        schemas: By name.
+    """
+
+    def __init__(self) -> None:
+        self.schemas: dict[str, Any] = {
+            "number": {"type": ["number", "string"], "pattern": _NUMBER_PATTERN},
+            "number_or_none": {"type": ["number", "string", "null"], "pattern": _NUMBER_PATTERN},
+        }
+        self._names: dict[tuple[int, bool], str] = {}
+
+    def section(self, name: str, section: SectionSchema, is_partial: bool) -> dict[str, Any]:
+        """A reference to the schema of a section; a partial one requires no key."""
+        place = (id(section), is_partial)
+        if place not in self._names:
+            name += "_variant" * (is_partial and name != "variant")
+            while name in self.schemas:
+                name += "_"
+            self._names[place], self.schemas[name] = name, {}
+            self.schemas[name] = self._section(section, is_partial)
+        return {"$ref": f"#/$defs/{self._names[place]}"}
+
+    def _section(self, section: SectionSchema, is_partial: bool) -> dict[str, Any]:
+        exclusive = {x for pair in section.exclusive for group in pair[:2] for x in group}
+        required = [
+            name
+            for name, key in section.keys.items()
+            if key.default is REQUIRED and name not in exclusive and not is_partial
+        ]
+        others = section.others and self._value("", section.others, is_partial)
+        excluded: dict[str, list[dict[str, Any]]] = {}
+        for first, second, _ in section.exclusive:
+            for key in first:
+                others_of_key = [{"required": [x]} for x in second if x != key]
+                excluded.setdefault(key, []).extend(others_of_key)
+        return {
+            "type": ["object", "null"],
+            "properties": {
+                name: self._described(name, key, is_partial) for name, key in section.keys.items()
+            },
+            "additionalProperties": others or False,
+            "required": required,
+            "dependentSchemas": {key: {"not": {"anyOf": x}} for key, x in excluded.items()},
+        }
+
+    def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
+        """The value of a key with its text, unit, usual range and default."""
+        text = key.text
+        if isinstance(key, NumberKey) and key.units:
+            text += f" [{key.units}]"
+        if isinstance(key, NumberKey) and key.plausible is not None:
+            text += f", usual: {key.plausible.lower:g} to {key.plausible.upper:g}"
+        is_structure = isinstance(key, SectionKey | MapKey | ListKey)
+        value = self._value(name, key, is_partial)
+        if is_partial or (is_structure and key.default is None):
+            value = _nullable(value)
+        has_default = isinstance(key.default, str | float) and key.default != ""
+        return {"description": text, **value} | ({"default": key.default} if has_default else {})
+
+    def _value(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
+        """The values that a key may have."""
+        match key:
+            case SectionKey():
+                return self.section(name, key.section, is_partial) | {"type": "object"}
+            case MapKey():
+                item = self._value(name, key.item, is_partial or key.has_common_item)
+                item = _nullable(item) if is_partial else item
+                return {"type": "object", "additionalProperties": item}
+            case ListKey():
+                return {"type": "array", "items": self._value(name, key.item, False)}
+            case VariantKey():
+                return {"anyOf": [self._value(name, x, False) for x in key.types]}
+            case FlagKey():
+                return {"enum": [True, False, "yes", "no", "on", "off", "true", "false"]}
+            case NameListKey():
+                return _array({"type": "string"}, key.size) | {"uniqueItems": True}
+            case NumberListKey():
+                return _array(_number(key), key.size)
+            case RowListKey():
+                return _array(_array(_number(key), key.size), None)
+            case NumberKey():
+                return _number(key)
+        return {"enum": [*key.choices]} if key.choices else {"type": "string", "minLength": 1}
+
+
+def _nullable(value: dict[str, Any]) -> dict[str, Any]:
+    """The same values, or none at all; in the terms of the type, for clear errors."""
+    if "type" in value:
+        return value | {"type": [value["type"], "null"]}
+    if "enum" in value:
+        return value | {"enum": [*value["enum"], None]}
+    if "anyOf" in value:
+        return value | {"anyOf": [*value["anyOf"], {"type": "null"}]}
+    return value | {"$ref": "#/$defs/number_or_none"}
+
+
+def _number(key: NumberKey) -> dict[str, Any]:
+    bounds: dict[str, Any] = {} if key.minimum is None else {"minimum": key.minimum}
+    if key.is_positive or (key.zero_error and key.minimum == 0):
+        bounds = {"exclusiveMinimum": 0}
+    return {"$ref": "#/$defs/number", **bounds}
+
+
+def _array(items: dict[str, Any], size: int | None) -> dict[str, Any]:
+    bounds = {} if size is None else {"minItems": size, "maxItems": size}
+    return {"type": "array", "items": items, **bounds}

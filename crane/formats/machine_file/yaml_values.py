@@ -1,0 +1,310 @@
+"""Values of a machine file, read as their schema says, every error with its file and line."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from crane.common.errors import DescriptionError, suggest_names
+from crane.description.findings import report_error
+from crane.description.key_types import (
+    REQUIRED,
+    FileKey,
+    FlagKey,
+    Key,
+    NameListKey,
+    NumberKey,
+    NumberListKey,
+    SectionSchema,
+    TextKey,
+)
+from crane.formats.machine_file.yaml_parser import LocatedMapping, format_value
+
+_BOOLEAN_WORDS = {"on": True, "yes": True, "true": True, "off": False, "no": False, "false": False}
+
+
+def as_float(value: Any) -> float:
+    """A value as a number, NaN where it is none; PyYAML reads 2e5 as text."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return math.nan
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return math.nan
+
+
+def as_boolean(value: Any) -> bool | None:
+    """A value as true or false, None where it is neither; words of YAML may be quoted."""
+    if isinstance(value, str):
+        return _BOOLEAN_WORDS.get(value.strip().lower())
+    return value if isinstance(value, bool) else None
+
+
+def _to_plain_data(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _to_plain_data(item) for key, item in value.items()}
+    return [_to_plain_data(item) for item in value] if isinstance(value, list) else value
+
+
+class YamlValues:
+    """A mapping of a machine file, and its values that are no mappings.
+
+    Args:
+        data: The mapping.
+        schema: Its keys.
+        title: What errors call it; "": the title of the schema.
+        location: File and line, if not the mapping's own.
+
+    Attributes:
+        schema: See above.
+        title: See above.
+        is_complete: Whether no item of its lists had to be left out.
+    """
+
+    def __init__(
+        self,
+        data: LocatedMapping,
+        schema: SectionSchema,
+        title: str = "",
+        location: tuple[Path, int] | None = None,
+    ):
+        self._data, self.schema = data, schema
+        self.title = title or schema.title
+        self.is_complete = True
+        self._location = (data.file, data.line) if location is None else location
+
+    def to_plain_data(self) -> dict[str, Any]:
+        """All keys and values, without locations."""
+        plain: dict[str, Any] = _to_plain_data(self._data)
+        return plain
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._data)
+
+    def check_keys(self, names: Iterable[str]) -> None:
+        """Raise for a key that is not among these.
+
+        Raises:
+            DescriptionError: The nearest known key is named. Where findings are collected, the
+                value is read as if it had that name.
+        """
+        names = tuple(names)
+        for key in [key for key in self._data if key not in names]:
+            near = get_close_matches(key, names, 1, 0.75)
+            near = near or [name for name in names if name.lower() == key.lower()]
+            is_meant = bool(near) and near[0] not in self._data
+            problem = f"unknown key '{key}' in {self.title}, {suggest_names(names, key)}"
+            report_error(self.error_at(key, problem), harmless=True)
+            if is_meant:
+                self._data[near[0]] = self._data[key]
+                self._data.locations[near[0]] = self._data.locations[key]
+
+    def source_location(self, key: str | None = None) -> str:
+        """File and line of the section or of one of its keys."""
+        file, line = self._data.locations.get(key, self._location) if key else self._location
+        return f"{file.name}:{line}"
+
+    def error_at(self, key: str | None, problem: str) -> DescriptionError:
+        """An error that points at a key."""
+        return DescriptionError(f"{self.source_location(key)}: {problem}")
+
+    def _value_error(self, key: str, value_text: str, hint: str) -> DescriptionError:
+        """An error about the value of a key."""
+        return self.error_at(key, f"'{key}' of {self.title} is {value_text}, {hint}")
+
+    def _key(self, name: str) -> Key:
+        """Type of the value of a key."""
+        return self.schema.keys.get(name) or self.schema.others or Key()
+
+    def _get_value(self, key: str) -> Any:
+        """The value of a key, or its default.
+
+        Raises:
+            DescriptionError: The key is required and absent, or empty.
+        """
+        default = self._key(key).default
+        value = self._data.get(key, default)
+        if value is REQUIRED:
+            raise self.error_at(None, f"{self.title} has no '{key}', add it")
+        if value is None and default is not None:
+            raise self.error_at(key, f"'{key}' of {self.title} is empty, give its value")
+        return value
+
+    def raw_value(self, key: str) -> Any:
+        """A value, whatever it is.
+
+        Raises:
+            DescriptionError: There is none.
+        """
+        value = self._get_value(key)
+        if value is None and key in self._data:
+            raise self.error_at(key, f"'{key}' of {self.title} is empty, give its value")
+        if value is None:
+            raise self.error_at(None, f"{self.title} has no '{key}', add it")
+        return value
+
+    def values(self, *excluded: str) -> dict[str, Any]:
+        """Values of the keys that are given, by the names of the fields that they are.
+
+        Mappings, lists of mappings and values of mixed types are left to other methods.
+
+        Args:
+            excluded: Keys to leave out.
+
+        Raises:
+            DescriptionError: A value is not of its type, a key is missing, or two keys exclude
+                each other.
+        """
+        self.check_exclusive_keys()
+        found = {}
+        for name, key in self.schema.keys.items():
+            reader = _READERS.get(type(key))
+            if reader is None or name in excluded:
+                continue
+            alternatives = self.schema.alternatives(name)
+            if name in self._data or (
+                key.default is REQUIRED and not any(x in self._data for x in alternatives)
+            ):
+                value = reader(self, name)
+                if value is not None:
+                    found[key.attribute or name] = value
+        return found
+
+    def check_exclusive_keys(self) -> None:
+        """Raise for two keys of which the schema allows one."""
+        for first, second, problem in self.schema.exclusive:
+            key = next((x for x in first if x in self._data), None)
+            other = next((x for x in second if x in self._data and x != key), None)
+            if key is not None and other is not None:
+                names = {"key": key, "other": other, "title": self.title}
+                place = None if first == second else key
+                raise self.error_at(place, problem.format_map(self._data | names))
+
+    def text(self, key: str) -> Any:
+        """A non-empty string, None where there may be none; empty where its error is reported."""
+        try:
+            return self._read_text(key)
+        except DescriptionError as error:
+            report_error(error)
+            return ""
+
+    def _read_text(self, key: str) -> str | None:
+        spec, value = self._key(key), self._get_value(key)
+        if value is spec.default:
+            return value
+        if not isinstance(value, str) or not value.strip():
+            raise self._value_error(key, format_value(value), "give text (or quote it)")
+        if not "".join(value.split()).isprintable():
+            raise self.error_at(
+                key, f"'{key}' of {self.title} holds control characters, remove them"
+            )
+        return value
+
+    def number(self, key: str) -> float:
+        """A finite number within its bounds; NaN where its error is reported."""
+        try:
+            return self._read_bounded_number(key)
+        except DescriptionError as error:
+            report_error(error)
+            return math.nan
+
+    def _read_bounded_number(self, key: str) -> float:
+        number = self._read_number(key, self.raw_value(key))
+        spec = self._key(key)
+        spec = next((x for x in getattr(spec, "types", ()) if type(x) is NumberKey), spec)
+        if not isinstance(spec, NumberKey):
+            return number
+        if spec.minimum is not None and number < spec.minimum:
+            raise self._value_error(key, f"{number:g}", f"give at least {spec.minimum:g}")
+        if number == 0 and spec.zero_error:
+            raise self.error_at(key, spec.zero_error.format(key=key, title=self.title))
+        return number
+
+    def _read_number(self, key: str, value: Any) -> float:
+        number = as_float(value)
+        if math.isfinite(number):
+            return number
+        hint = "give a number"
+        if isinstance(value, float):
+            hint = "give a finite number"
+        elif isinstance(value, str) and "," in value:
+            hint = "give a number with a decimal point"
+        raise self._value_error(key, format_value(value), hint)
+
+    def boolean(self, key: str) -> bool:
+        """True or false, as on and off, in quotes or without."""
+        value = self.raw_value(key)
+        found = as_boolean(value)
+        if found is None:
+            raise self._value_error(key, format_value(value), "give true or false")
+        return found
+
+    def numbers(self, key: str) -> tuple[float, ...]:
+        """A list of finite numbers."""
+        value = self.raw_value(key)
+        if not isinstance(value, list | tuple) or not value:
+            shown = "empty" if value == [] else format_value(value)
+            raise self._value_error(key, shown, "give a list such as [0, 1]")
+        return tuple(self._read_number(key, item) for item in value)
+
+    def rows(self, key: str) -> list[list[float]]:
+        """A list of finite numbers, or of such lists: one row, or as many."""
+        value = self.raw_value(key)
+        is_nested = isinstance(value, list | tuple) and any(isinstance(x, list) for x in value)
+        rows = value if is_nested else [value]
+        if not all(isinstance(row, list | tuple) and row for row in rows):
+            hint = "give a list such as [0, 0, 1], or one of such lists"
+            raise self._value_error(key, format_value(value), hint)
+        return [[self._read_number(key, item) for item in row] for row in rows]
+
+    def read_list(
+        self, key: str, hint: str, is_item: Callable[[Any], bool], item_hint: str
+    ) -> list[Any]:
+        """A list whose items pass a test; else the errors have these hints."""
+        value = self.raw_value(key)
+        if not isinstance(value, list):
+            raise self._value_error(key, format_value(value), hint)
+        for item in value:
+            if not is_item(item):
+                raise self.error_at(key, f"'{key}' lists {format_value(item)}, {item_hint}")
+        return value
+
+    def names(self, key: str) -> tuple[str, ...]:
+        """A list of different names, empty where the key is absent."""
+        if key not in self._data and self._key(key).default is not REQUIRED:
+            return ()
+        value = self.read_list(
+            key, "give a list such as [q1, q2]", lambda x: isinstance(x, str) and x != "",
+            "which is not a name, quote it",
+        )  # fmt: skip
+        for item in value:
+            if value.count(item) > 1:
+                raise self.error_at(key, f"'{key}' lists '{item}' twice, list it once")
+        return tuple(value)
+
+    def file(self, key: str) -> Path:
+        """A file, named by its path from the folder of the file that names it."""
+        text = self.text(key)
+        path = self._data.locations.get(key, self._location)[0].parent / text
+        try:
+            if path.is_dir():
+                raise self.error_at(key, f"'{text}' of {self.title} is a folder, give a file")
+            is_file = path.is_file()
+        except OSError:  # a name longer than any file's
+            is_file = False
+        if not is_file:
+            raise self.error_at(
+                key, f"{self.title}: there is no file '{text}', give its path from this folder"
+            )
+        return path.resolve()
+
+
+_READERS: dict[type[Key], Callable[[YamlValues, str], Any]] = {
+    TextKey: YamlValues.text,
+    FileKey: YamlValues.file,
+    FlagKey: YamlValues.boolean,
+    NumberKey: YamlValues.number,
+    NumberListKey: YamlValues.numbers,
+    NameListKey: YamlValues.names,
+}
