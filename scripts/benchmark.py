@@ -11,16 +11,13 @@ import argparse
 import warnings
 from pathlib import Path
 
-from at_work import at_work
-from derivatives import derivatives
-from engines import work_precision
-from evaluations import agree, forward_dynamics, one_step, task
-from gradients import gradients
-from hydraulic_crane import hydraulic_crane
-from results import conditions, put
-from stacks import stacks, threads
-from starting import starts
-from subject import swinging
+from benchmark_machine import swinging
+from derivatives import derivatives, gradients
+from evaluations import agree, forward_dynamics, one_step, stacks, task, threads
+from measuring import conditions, put
+from start_times import starts
+from valve_cranes import at_work, hydraulic_crane
+from work_precision import work_precision
 
 import crane
 

@@ -1,8 +1,12 @@
-"""Taking times, and showing them as tables."""
+"""Measured times, their tables, and the section of a page that they are written into."""
 
+import importlib.metadata
+import os
+import platform
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 Call = Callable[[], object]
 Clock = Callable[[], float]
@@ -40,3 +44,22 @@ def microseconds(what: str, times: dict[str, float]) -> str:
     unit = next(iter(times.values()))
     rows = [(name, f"{1e6 * t:.2f}", f"{t / unit:.1f}") for name, t in times.items()]
     return table((what, "time [us]", "ratio"), rows)
+
+
+def conditions() -> str:
+    """What it was measured on."""
+    names = ("pin", "mujoco", "numpy", "scipy", "llvmlite")
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
+    return (
+        f"Measured with Python {platform.python_version()}, {versions} on {platform.system()}, "
+        f"{platform.machine()}, {os.cpu_count()} cores, with other work on them as of a load "
+        f"average of {os.getloadavg()[0]:.1f}: wall times suffer from it, CPU times hardly."
+    )
+
+
+def put(page: Path, marks: tuple[str, str], parts: list[str]) -> None:
+    """Put paragraphs between two marks of a page, in place of what is there."""
+    begin, end = marks
+    before, rest = page.read_text(encoding="utf-8").split(begin)
+    _, after = rest.split(end)
+    page.write_text("\n\n".join([before + begin, *parts, end + after]), encoding="utf-8")

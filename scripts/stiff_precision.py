@@ -22,7 +22,7 @@ from crane.machine import Machine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from benchmarks import governor  # noqa: E402
+from benchmark_mechanisms import governor  # noqa: E402
 
 OURS, SCIPYS = ("DOP853", "Radau", "rosenbrock"), ("Radau", "BDF", "LSODA")
 TOLERANCES = {

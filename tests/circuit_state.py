@@ -1,4 +1,4 @@
-"""A circuit at given pressures, without the machine around it."""
+"""The state of a hydraulic circuit at given pressures, without a machine around it."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Small excavators without cylinders, as URDFs: open trees with a boom and an arm."""
+"""Small excavators without cylinders as URDF texts: open trees with a boom and an arm."""
 
 BODY = """<link name="{}"><inertial><origin xyz="{} 0 {}"/><mass value="{}"/>
   <inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>

@@ -1,4 +1,4 @@
-"""Statics of a machine by hand: every link on its own, with the forces of its pins unknown.
+"""Statics of a machine by free-body diagrams: all links and joint forces in one system.
 
 Six balances per link that moves; six unknowns per joint and loop, less those along what moves
 freely. Places follow from the files' numbers by matrices of four. Nothing of the package but what

@@ -1,4 +1,4 @@
-"""Valid files with some bytes changed: what becomes of each. Run by test_fuzz.py in a process.
+"""Changes bytes of valid files and judges how each is read. `test_fuzz.py` runs this as a process.
 
     python tests/fuzz.py FORMAT FIRST COUNT
 
@@ -21,7 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
 import yaml  # noqa: E402
-from work import TooMuchWorkError, at_most  # noqa: E402
+from executed_lines import TooMuchWorkError, at_most  # noqa: E402
 
 import crane  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402

@@ -1,4 +1,4 @@
-"""Damaged visuals, meshes and recordings: what becomes of each. Run by test_fuzz_inputs.py.
+"""Damages visuals, meshes and recordings. `test_fuzz_inputs.py` runs this as a process.
 
     python tests/fuzz_inputs.py KIND FIRST COUNT
 

@@ -1,4 +1,4 @@
-"""Every option of every command at the edge: what becomes of each call. Run by test_options.py.
+"""Calls every command with extreme option values; `test_extreme_options.py` runs this.
 
     python tests/fuzz_options.py reported
     python tests/fuzz_options.py FIRST COUNT [COMMAND]

@@ -1,4 +1,4 @@
-"""A load on one or two cylinders, described in files of its own."""
+"""A load on one or two hydraulic cylinders, written as machine files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Machines of several formats, what is asked of them, and how they are written."""
+"""Test machines in several formats, random states of them, and copies written in other formats."""
 
 import warnings
 from functools import cache
@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import CraneWarning

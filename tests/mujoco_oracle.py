@@ -1,4 +1,4 @@
-"""MuJoCo's numbers for a closed machine: its mass matrix, forces and constraints, solved exactly.
+"""Exact accelerations of a closed machine from MuJoCo's mass matrix, forces and constraints.
 
 MuJoCo's own constraints are soft, so its accelerations are not those of closed loops. What it
 computes with is exact: M, bias, passive forces and the Jacobian J of its equality constraints at a

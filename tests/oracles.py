@@ -1,4 +1,4 @@
-"""Independent answers: closed forms on paper, and Pinocchio's own constraint solver.
+"""Independent results: closed forms on paper, and Pinocchio's constraint solver.
 
 Closed forms of positions are written so that a complex step differentiates them: with
 x + ih they give f(x) + ih f'(x) to rounding.

@@ -1,4 +1,4 @@
-"""Random mechanisms written twice: as SDF in all its ways of saying, and as plain URDF.
+"""Random mechanisms written as SDF, in all its notations, and as plain URDF.
 
 The places of links, joints and axes are drawn first, in numbers. The SDF says each of them
 relative to some frame drawn at random, the URDF in the frame of the joint that moves the link;

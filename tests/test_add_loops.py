@@ -1,4 +1,4 @@
-"""Loops that are proposed where a description leaves them open, and taken over by a command."""
+"""Loops that are proposed for an open description, and the command that adds them."""
 
 import os
 import re
@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
+from command_line import typed
 from excavators import planar
 from test_open_loops import five_bar
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -159,7 +159,7 @@ def test_open_machines_have_no_proposals(tmp_path):
 
 @pytest.mark.parametrize("name", ["5bar_linkage_iso6d", "robot_delta", "wl16_like"])
 def test_robots_of_other_people_close_by_one_command(name, tmp_path):
-    """The loops that the file beside them says, from their URDF alone."""
+    """The loops of the file beside them are found from the URDF alone."""
     if not ROBOTS.is_dir():
         pytest.skip(f"{ROBOTS} is not there")
     said = yaml.safe_load((ROBOTS / name / "robot.yaml").read_text())["closed_loop"]

@@ -1,3 +1,5 @@
+"""Batches of simulations equal single simulations."""
+
 import threading
 import warnings
 

@@ -1,8 +1,8 @@
-"""Mechanisms of the benchmarks that solvers are judged by, against published or own references."""
+"""Benchmark mechanisms against published or independently computed references."""
 
 import warnings
 
-import benchmarks
+import benchmark_mechanisms
 import numpy as np
 import pytest
 
@@ -29,12 +29,12 @@ def of(machine, found, joint):
 )
 def test_andrews_squeezing_mechanism(tmp_path, method, step, error):
     """Against the digits of the Test Set for IVP Solvers, 15.8 rad in 30 ms."""
-    machine = benchmarks.squeezer(tmp_path)
+    machine = benchmark_mechanisms.squeezer(tmp_path)
     found = crane.simulate(machine, duration=0.03, step=step, method=method)
     gamma = machine.closure.gamma(
         np.array([of(machine, found, joint)[-1] for joint in machine.joints])
     )
-    for joint, (angle, speed) in benchmarks.SQUEEZED.items():
+    for joint, (angle, speed) in benchmark_mechanisms.SQUEEZED.items():
         assert of(machine, found, joint)[-1] == pytest.approx(angle, abs=error)
         rate = gamma[machine.column(joint)] @ found.v[-1]
         assert rate == pytest.approx(speed, abs=1e3 * error)
@@ -50,7 +50,7 @@ def test_bricard_s_mechanism_moves_alike_by_any_joint(tmp_path, active):
     """Overconstrained, through dead centres of some joints, for 10 s."""
     motions = []
     for joint in ("j0", active):
-        machine = benchmarks.bricard(tmp_path, joint)
+        machine = benchmark_mechanisms.bricard(tmp_path, joint)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", crane.CraneWarning)  # of dead centres
             found = crane.simulate(machine, duration=10.0, step=1e-2)
@@ -65,7 +65,7 @@ def test_a_stiff_governor_by_all_methods(tmp_path):
     """Flyballs against 8e5 N/m and 4e4 N s/m: errors are what the tolerance says."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", crane.CraneWarning)
-        machine = benchmarks.governor(tmp_path)
+        machine = benchmark_mechanisms.governor(tmp_path)
     start = machine.home[machine.closure.active], np.array([2 * np.pi, 0.0])
 
     def run(**how):

@@ -1,4 +1,4 @@
-"""References and motions beyond the limits of a joint: told before, and named where a run ends."""
+"""Motions beyond joint limits: a warning before the run, an error that names the joint."""
 
 import re
 import warnings
@@ -51,12 +51,12 @@ class InPython:
         {},
         {"method": "RK45"},
         pytest.param({"backend": "pinocchio"}, marks=pytest.mark.slow),
-        pytest.param({"method": "LSODA"}, marks=pytest.mark.slow),
+        pytest.param({"method": "LSODA"}, marks=(pytest.mark.slow, pytest.mark.long)),
     ],
 )
 @pytest.mark.parametrize("python", [False, True])
 def test_a_run_beyond_the_limits_is_told_before_and_named_after(free, how, python):
-    """By computed torque, on every backend and by every method: no error of the closure itself."""
+    """With computed torque, every backend and method raises this error, not one of the closure."""
     control = crane.ComputedTorque(free, to(0.06))
     with warnings.catch_warnings(record=True) as caught, pytest.raises(SimulationError) as error:
         warnings.simplefilter("always", CraneWarning)
@@ -76,7 +76,7 @@ def test_a_run_beyond_the_limits_is_told_before_and_named_after(free, how, pytho
 
 
 def test_pushed_beyond_the_limits_without_a_reference(free):
-    """Past the limit, and past the dead centre behind it: both are told."""
+    """The warning names the limit, and also the dead centre behind it."""
     with pytest.warns(CraneWarning) as caught:
         run = crane.simulate(
             free.replace(friction={}), lambda t, q, v: np.array([0.0, 200.0, 0.0]), duration=0.15
@@ -97,7 +97,7 @@ def test_a_step_that_is_too_long_is_told_with_one_that_is_not(smooth):
 
 
 def test_an_end_stop_holds_what_the_reference_asks_for(mini):
-    """Told, and simulated: pressing against a stop can be meant."""
+    """A warning, then a simulation: pressing against a stop may be intended."""
     with pytest.warns(CraneWarning, match=re.escape(TOLD)):
         recording = crane.simulate(mini, crane.PI(mini, to(0.06)), duration=0.3)
     assert 0.03 < recording.q[:, 1].max() < 0.034

@@ -1,10 +1,10 @@
-"""Buckling of cylinders beside finite elements, and where their pins are."""
+"""Buckling loads of cylinders against finite elements."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hanging import joint, link
+from hanging_loads import joint, link
 from scipy.linalg import eigh
 from test_reactions import BEAM, load
 

@@ -1,4 +1,4 @@
-"""Machine code that is kept between runs."""
+"""The folder of cached machine code: location, bounds and permissions."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""What a calibration says of itself: ends of intervals, shared directions, what is left."""
+"""Results of a calibration: ends of intervals, correlated directions, remaining errors."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Lifting capacity beside statics by hand, cell by cell, and beside brute force."""
+"""Lifting capacity against statics by hand, cell by cell, and against brute force."""
 
 import numpy as np
 import pytest
@@ -235,7 +235,7 @@ def test_what_cannot_be_is_said_in_one_line(excavator, given, said):
     ],
 )  # fmt: skip
 def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):
-    """Every place once more with each number a little larger and smaller."""
+    """Each derivative equals the difference of capacities with the parameter a little changed."""
     machine = crane.load(name)
     chart = crane.capacity(machine, frame, step=1.0, **given)
     slopes = chart.derivatives(numbers)
@@ -265,7 +265,7 @@ def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):
 
 
 def test_slopes_do_not_turn_with_the_crane():
-    """Loads that nothing but drives end are the same to all sides, across the home plane too."""
+    """Loads limited by drives alone do not depend on the slew angle."""
     machine, slews = crane.load("patu655"), [0.0, 1.0, np.pi / 2, -np.pi / 2, 3.0]
     chart = crane.capacity(machine, slews=slews, step=1.0)
     slopes = chart.derivatives(["lift_boom.mass", "lift_eye.x", "supply.pressure"])

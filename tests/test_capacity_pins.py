@@ -1,4 +1,4 @@
-"""Limits of pins in lifting capacities, pin forces and buckling under them, by hand."""
+"""Lifting capacity with limits of pin forces and buckling, against statics by hand."""
 
 import dataclasses
 import re
@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from broken import MODELS
+from broken_machines import MODELS
 from free_bodies import balance
 from scipy.optimize import brentq
 from test_capacity import G, cells
@@ -90,7 +90,7 @@ def test_pin_forces_and_margins_are_those_of_statics_by_hand(excavator, chart):
 
 
 def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
-    """Gravity leaned to many sides, one after another."""
+    """The worst direction of a slope equals that of many single directions."""
     slope = 0.1
     bare = crane.load("excavator")
     chart = crane.capacity(bare, "bucket", radii=[5.0, 7.0], heights=[0.0, 2.0], slope=slope)

@@ -1,4 +1,4 @@
-"""Rated loads as they are shown: pressures, table, pictures, page and command."""
+"""Output of lifting capacity: pressures, table, figures, page and command."""
 
 import csv
 import dataclasses
@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_line import typed
 from free_bodies import balance
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.path import Path
-from typed import typed
 
 import crane
 from crane.ratings.capacity_report import load_table, slew_labels
@@ -140,7 +140,7 @@ def test_pictures_name_all_causes(chart):
     sheet = capacity_sheet_figure(chart)
     words = {text.get_text() for text in sheet.texts}
     assert {cell for row in load_table(chart).format_rows() for cell in row if cell} <= words
-    sheet.canvas.draw()
+    sheet.draw_without_rendering()
     page = sheet.bbox
     for text in sheet.texts:  # nothing runs off the page
         box = text.get_window_extent()
@@ -212,9 +212,9 @@ def test_names_are_drawn_as_they_are(chart, tmp_path):
     odd = dataclasses.replace(chart.machine, name=r"$\bad$ <b>_crane", supports=())
     bare = dataclasses.replace(chart, machine=odd)
     sheet = capacity_sheet_figure(bare)
-    sheet.canvas.draw()
+    sheet.draw_without_rendering()
     assert any(r"\$\bad\$ <b>_crane" in text.get_text() for text in sheet.texts)
-    capacity_figure(bare).canvas.draw()
+    capacity_figure(bare).draw_without_rendering()
     text = write_capacity_page(bare, tmp_path / "odd.html").read_text(encoding="utf-8")
     assert "<b>" not in text and "&lt;b&gt;" in text
 

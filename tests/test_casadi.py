@@ -1,4 +1,4 @@
-"""Formulas as functions of CasADi: against machine code, Pinocchio, and CasADi's integrators."""
+"""Formulas as CasADi functions, against machine code, Pinocchio and CasADi's integrators."""
 
 import math
 import sys

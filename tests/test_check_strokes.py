@@ -1,9 +1,9 @@
-"""What check says of tasks beyond the strokes, and of strokes where loops do not close."""
+"""`crane check` reports tasks beyond the strokes, and strokes at which the loops do not close."""
 
 import math
 import re
 
-import misfits
+import misfit_linkages
 import pytest
 
 import crane
@@ -20,7 +20,7 @@ VIA = (
 
 
 def boom(folder, limits="", more=""):
-    path = misfits.LINKAGES["boom"].write(folder)
+    path = misfit_linkages.LINKAGES["boom"].write(folder)
     urdf = folder / "linkage.urdf"
     if limits:
         urdf.write_text(urdf.read_text().replace('lower="-9" upper="9"', limits))

@@ -1,4 +1,4 @@
-"""What `crane check` says of circuits: loose ends, ways back, regulators, other units."""
+"""`crane check` on circuits: unconnected ports, return lines, regulators, units."""
 
 import re
 import warnings
@@ -7,8 +7,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import yaml
+from command_line import typed
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
-from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError

@@ -1,12 +1,12 @@
-"""Circuits in machine files: what is read, written, changed, locked, linearized and refused."""
+"""Circuits in machine files: reading, writing, changes, locked joints, linear models, errors."""
 
 import warnings
 
 import numpy as np
 import pytest
-from circuits import ALL, SIGNALS, TIMES, everything, gaps
+from command_line import typed
+from full_circuit import ALL, SIGNALS, TIMES, everything, gaps
 from hydraulic_rig import rig
-from typed import typed
 
 import crane
 from crane.common.errors import DescriptionError, InputError
@@ -61,7 +61,7 @@ def test_all_numbers_are_named_and_can_be_changed(tmp_path):
 
 
 def test_every_number_of_the_circuit_acts(tmp_path):
-    """What can be set is among the numbers of the formulas."""
+    """Every parameter that can be set is a constant of the formulas."""
     from circuit_state import circuit_of
 
     machine = everything(tmp_path)
@@ -320,10 +320,9 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, what):
     written = (tmp_path / name).read_text().splitlines()[int(number) - 1]
     assert at in written, (written, line)
     before = sorted(tmp_path.iterdir())
-    for words in (("info", "rig.yaml"), ("simulate", "rig.yaml", "--out", "run")):
-        told = typed(*words, cwd=tmp_path)
-        assert told.returncode == 2 and text in told.stderr
-        assert len([x for x in told.stderr.splitlines() if x.startswith("error")]) == 1
+    told = typed("simulate", "rig.yaml", "--out", "run", cwd=tmp_path)
+    assert told.returncode == 2 and text in told.stderr
+    assert len([x for x in told.stderr.splitlines() if x.startswith("error")]) == 1
     assert sorted(tmp_path.iterdir()) == before
 
 

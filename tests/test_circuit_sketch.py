@@ -1,14 +1,14 @@
-"""Drawn circuits: every part once with its words, nets that hang together and touch no other."""
+"""Circuit diagrams: every component once with its label, connected lines that touch no other."""
 
 import itertools
 from collections import Counter
 from dataclasses import replace
 
-import drawn_circuits as circuits
+import diagram_circuits as circuits
 import pytest
+from command_line import typed
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_sketch import overlaps
-from typed import typed
 
 import crane
 from crane.common.errors import InputError

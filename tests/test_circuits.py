@@ -1,9 +1,9 @@
-"""Pumps with their regulators, valves and what is between nodes, each against a closed form."""
+"""Pumps with regulators, valves and components between nodes, each against a closed form."""
 
 import numpy as np
 import pytest
 from circuit_state import flow, now
-from circuits import gaps
+from full_circuit import gaps
 from hydraulic_rig import AREA_A, AREA_B, HOSE, ORIFICE, STROKE, rig
 from scipy.optimize import brentq
 
@@ -346,7 +346,7 @@ def test_a_floating_load_sinks_by_its_weight(tmp_path):
 
 
 def test_a_floating_load_that_lands_is_followed(tmp_path):
-    """It bounces while both chambers are sucked empty, in a few steps per row."""
+    """A load that bounces on two empty chambers needs few steps per recorded row."""
     machine = rig(tmp_path, {**SIMPLE, "float_from": 0.8, "float_coefficient": 3e-6})
     with pytest.warns(crane.CraneWarning, match="beyond its stroke"):
         run = moved(machine, {"x": -1.0}, 1.2, initial=[0.5])

@@ -1,4 +1,4 @@
-"""Closing the loops: against closed forms, differences, and what each type of loop promises."""
+"""Loop closure against closed forms and differences, for each type of loop."""
 
 import re
 import warnings
@@ -205,8 +205,8 @@ def test_guesses_do_not_change_the_answer(mini):
         assert np.abs(mini.closure.solve(target, initial_guess=guess) - alone).max() < 1e-12
         near = mini.closure.solve(target, initial_guess=alone + 1e-4)  # beside the answer
         assert np.abs(near - alone).max() < 1e-12
-    found = mini.closure.solve(targets, initial_guess=guesses[0])
-    assert np.abs(found - mini.closure.solve(targets)).max() < 1e-12
+    guessed = mini.closure.solve(targets, initial_guess=guesses[0])
+    assert np.abs(guessed - mini.closure.solve(targets)).max() < 1e-12
 
 
 def test_stacks_equal_single_samples(mini):
@@ -249,7 +249,7 @@ def from_closed_form(machine, q):
 
 @pytest.mark.slow
 def test_far_samples_stay_on_the_branch_around_holes(five_bar):
-    """Half of all crank angles leave the rods too short: straight ways lead through holes."""
+    """Half of all crank angles cannot be closed, so straight paths lead through gaps."""
     q_a = np.random.default_rng(14).uniform(-3, 3, (240, 2))
     found, missed = [], 0
     for sample in q_a:

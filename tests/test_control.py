@@ -1,3 +1,5 @@
+"""Control laws: gains, references and their errors."""
+
 import warnings
 
 import numpy as np

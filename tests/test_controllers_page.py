@@ -1,4 +1,4 @@
-"""The program of docs/controllers.md, and what the page promises beyond it."""
+"""The program of docs/controllers.md works as the page describes."""
 
 import re
 import warnings
@@ -166,7 +166,7 @@ def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch)
 
 
 def test_states_begin_where_the_machine_stands(page):
-    """`begin` sees the inverse dynamics at the start, whoever asks."""
+    """`begin` receives the inverse dynamics at the start."""
 
     class Held(ControlLaw):
         def initial_state(self, at):

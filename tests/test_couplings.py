@@ -1,4 +1,4 @@
-"""Linear constraints of joints: gears, and joints that mimic another."""
+"""Linear constraints between joints: gears and mimic joints."""
 
 import re
 

@@ -1,10 +1,10 @@
-"""Runs that pass dead centres, and postures where branches cross, by any active joint."""
+"""Runs through dead centres and bifurcations with any active joint."""
 
 import warnings
 
 import numpy as np
 import pytest
-import singular
+import singular_linkages
 from scipy.integrate import solve_ivp
 
 import crane
@@ -31,26 +31,29 @@ def swung(angle, speed, until, inertia, lever, times):
 
 def run(machine, joint, speed, duration, **settings):
     return crane.simulate(
-        machine, initial=singular.start(machine, joint, speed), duration=duration, **settings
+        machine,
+        initial=singular_linkages.start(machine, joint, speed),
+        duration=duration,
+        **settings,
     )
 
 
 @pytest.mark.parametrize("method, step", [("rk4", 2e-4), ("DOP853", 1e-3)])
 def test_a_crank_turns_through_the_dead_centres_of_its_slider(tmp_path, method, step):
-    """As it does by the crank itself, which has none."""
-    alone = singular.slider_crank(tmp_path, "a", 0.3, 0.6)
+    """The motion equals that with the crank as active joint, which has no dead centre."""
+    alone = singular_linkages.slider_crank(tmp_path, "a", 0.3, 0.6)
     wanted = run(alone, "a", 12.0, 1.0, step=step, method=method)
-    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
+    machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
     with pytest.warns(CraneWarning, match=r"^'s' passes a dead centre at t = 0") as told:
         found = run(machine, "a", 12.0, 1.0, step=step, method=method)
     assert len(told) == 1
     assert found.joints == ("s",) and np.ptp(wanted.q) > 4 * np.pi
-    q = singular.postures(machine, found)
-    np.testing.assert_allclose(q, singular.postures(alone, wanted), rtol=0, atol=2e-8)
+    q = singular_linkages.postures(machine, found)
+    np.testing.assert_allclose(q, singular_linkages.postures(alone, wanted), rtol=0, atol=2e-8)
     assert machine.closure.residual(q).max() < 1e-13
-    rows = alone.closure.gamma(singular.postures(alone, wanted))[:, machine.column("s")]
+    rows = alone.closure.gamma(singular_linkages.postures(alone, wanted))[:, machine.column("s")]
     np.testing.assert_allclose(found.v, rows * wanted.v, rtol=0, atol=1e-6)
-    assert singular.imbalance(found) < 1e-8
+    assert singular_linkages.imbalance(found) < 1e-8
 
 
 def test_forces_and_friction_stay_those_of_the_drive(tmp_path):
@@ -59,7 +62,7 @@ def test_forces_and_friction_stay_those_of_the_drive(tmp_path):
         joint: crane.Friction(coulomb=0.2, viscous=0.1, smoothing=0.05)
         for joint in ("a", "b", "s")
     }
-    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6).replace(friction=friction)
+    machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6).replace(friction=friction)
     runs = {}
     for active in ("s", "a"):
         one = machine.with_home_configuration(machine.home, (active,))
@@ -71,10 +74,10 @@ def test_forces_and_friction_stay_those_of_the_drive(tmp_path):
             return np.array([5.0 if active == "s" else 5.0 * lever])
 
         runs[active] = crane.simulate(
-            one, push, singular.start(one, "a", 15.0), duration=1.0, step=2.5e-4
+            one, push, singular_linkages.start(one, "a", 15.0), duration=1.0, step=2.5e-4
         )
-        assert singular.imbalance(runs[active]) < 1e-7
-    q = [singular.postures(machine, one) for one in runs.values()]
+        assert singular_linkages.imbalance(runs[active]) < 1e-7
+    q = [singular_linkages.postures(machine, one) for one in runs.values()]
     assert np.ptp(q[0][:, machine.column("a")]) > 1.5 * np.pi
     np.testing.assert_allclose(*q, rtol=0, atol=1e-7)
     assert np.abs(runs["s"].tau - 5.0).max() == 0.0
@@ -88,14 +91,14 @@ def test_equal_lengths_go_on_where_branches_cross(tmp_path, active):
         sine, cosine = np.sin(a) ** 2, np.cos(a) ** 2
         return 1 / 3 + 1 / 12 + 2.25 * sine + 0.25 * cosine + 4.0 * sine
 
-    machine = singular.slider_crank(tmp_path, active)
+    machine = singular_linkages.slider_crank(tmp_path, active)
     with pytest.warns(CraneWarning, match="could go on in several ways"):
         found = run(machine, "a", 4 / 2**0.5, 4.0, step=1e-3, method="DOP853")
-    a = singular.postures(machine, found)[:, machine.column("a")]
+    a = singular_linkages.postures(machine, found)[:, machine.column("a")]
     assert np.ptp(a) > 3 * np.pi
     wanted = swung(-np.pi / 4, 4 / 2**0.5, 4.0, inertia, 1.0, found.time)
     np.testing.assert_allclose(a, wanted, rtol=0, atol=1e-7)
-    assert singular.imbalance(found) < 2e-8
+    assert singular_linkages.imbalance(found) < 2e-8
 
 
 @pytest.mark.parametrize(
@@ -109,14 +112,14 @@ def test_equal_lengths_go_on_where_branches_cross(tmp_path, active):
 )  # fmt: skip
 def test_parallelograms_stay_such_in_line(tmp_path, count, active):
     """Against the pendulum that they are; the other branch is an antiparallelogram."""
-    machine = singular.windows(tmp_path, active, count)
+    machine = singular_linkages.windows(tmp_path, active, count)
     found = run(machine, "r0", 1.0, 10.0, step=1e-3, method="rk4")
-    angle = singular.postures(machine, found)[:, machine.column("r0")]
+    angle = singular_linkages.postures(machine, found)[:, machine.column("r0")]
     inertia, lever = (count + 1) / 3 + count, (count + 1) / 2 + count
     wanted = swung(-np.pi / 2, 1.0, 10.0, lambda _: inertia, lever, found.time)
     np.testing.assert_allclose(angle, wanted, rtol=0, atol=1e-7)
     assert np.ptp(angle) > 9 * np.pi
-    assert singular.imbalance(found) < 1e-9
+    assert singular_linkages.imbalance(found) < 1e-9
 
 
 def test_crossings_do_not_analyse_the_structure_anew(tmp_path, monkeypatch):
@@ -127,12 +130,12 @@ def test_crossings_do_not_analyse_the_structure_anew(tmp_path, monkeypatch):
         analysed.append(arguments)
         return whole(*arguments)
 
-    machine = singular.windows(tmp_path, "r0", 6)
+    machine = singular_linkages.windows(tmp_path, "r0", 6)
     monkeypatch.setattr(home_search, "analyse_constraints", counted)
     found = run(machine, "r0", 1.0, 10.0, step=1e-2)
     energy = found.channels["kinetic"] + found.channels["potential"]
     assert not analysed and np.ptp(energy) < 1e-5
-    angle = singular.postures(machine, found)[:, machine.column("r0")]
+    angle = singular_linkages.postures(machine, found)[:, machine.column("r0")]
     assert np.ptp(angle) > 9 * np.pi
 
 
@@ -140,8 +143,8 @@ def test_crossings_do_not_analyse_the_structure_anew(tmp_path, monkeypatch):
 def test_a_rocker_that_turns_back_everywhere(tmp_path):
     """Each of its joints has dead centres; the motion is the same by all of them."""
     runs = [
-        singular.postures(machine, run(machine, "a", 0.0, 3.0, method="DOP853"))
-        for machine in (singular.four_bar(tmp_path, active) for active in "abc")
+        singular_linkages.postures(machine, run(machine, "a", 0.0, 3.0, method="DOP853"))
+        for machine in (singular_linkages.four_bar(tmp_path, active) for active in "abc")
     ]
     assert np.ptp(runs[0], axis=0).min() > 1.0
     for other in runs[1:]:
@@ -165,7 +168,7 @@ class Weighed(crane.ControlLaw):
 
 @pytest.mark.parametrize("made", [crane.ComputedTorque, Weighed])
 def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path, made):
-    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
+    machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
     start = machine.home[machine.closure.active]
     path = point_to_point(start, [0.95], 1.0)  # the slider gets no farther than 0.9
     with warnings.catch_warnings(), pytest.raises(SimulationError) as caught:
@@ -178,10 +181,10 @@ def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path, made):
 @pytest.mark.slow
 @pytest.mark.parametrize("rod", [2.0, 1.3])
 def test_postures_follow_a_recorded_stroke_through_dead_centres(tmp_path, rod):
-    """From the slider alone: where it turns the crank goes on, three times round."""
-    crank = singular.slider_crank(tmp_path, "a", 1.0, rod)
+    """From the slider's stroke alone the crank is followed through three revolutions."""
+    crank = singular_linkages.slider_crank(tmp_path, "a", 1.0, rod)
     found = run(crank, "a", 3.0, 5.0, step=2e-3)
-    wanted = singular.postures(crank, found)
+    wanted = singular_linkages.postures(crank, found)
     assert np.ptp(wanted[:, crank.column("a")]) > 6 * np.pi
     slider = crank.with_home_configuration(crank.home, ("s",)).closure
     stroke = wanted[:, [crank.column("s")]]

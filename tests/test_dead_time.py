@@ -1,4 +1,4 @@
-"""Dead time of valves, against closed forms of the spool, scipy, and commands that are late."""
+"""Dead time of valves against closed forms of the spool and scipy."""
 
 import numpy as np
 import pytest
@@ -207,7 +207,7 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path):
 
 
 def test_pulses_that_meet_the_machine_arrive_late(tmp_path):
-    """Also those of slots that have passed: the spool is where the signal was a delay ago."""
+    """The spool follows the signal of one delay ago, also for past periods."""
     machine = rig(tmp_path, ORIFICE | {"delay": 0.137})
     plan = np.array([[[0.6, 1.0]], [[-0.5, 0.7]], [[0.3, 1.0]]])
     pulses = PulseSignals(machine, plan, 0.2, 8.0, machine.lower, machine.upper, np.inf)

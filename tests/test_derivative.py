@@ -1,4 +1,4 @@
-"""Derivatives and sparse elimination of traced formulas."""
+"""Derivatives of traced formulas and their sparse elimination."""
 
 import numpy as np
 import pytest

@@ -1,8 +1,8 @@
-"""Designs beside linkage problems whose optimum is known, and slopes beside differences."""
+"""Design optimisation against known optima; derivatives against differences."""
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.formats.machine_loading import MachineVariants

@@ -1,4 +1,4 @@
-"""Break-out and tool forces beside free bodies by hand, brute force and the lifting capacity."""
+"""Breakout and tool forces against free-body diagrams, brute force and the lifting capacity."""
 
 import numpy as np
 import pytest
@@ -92,7 +92,7 @@ def test_what_the_drives_give_alone_is_pressure_times_levers(excavator):
 
 @pytest.mark.parametrize("weights", [False, True])
 def test_what_holds_ends_what_digs(excavator, weights):
-    """Every cause by free bodies at the posture that is said; no posture of a grid is better."""
+    """Every limit agrees with free bodies there; no configuration of a grid gives more force."""
     found = crane.breakout(excavator, weights=weights)
     for one in (found.bucket, found.arm):
         q = excavator.closure.solve(one.q_a)
@@ -122,7 +122,7 @@ def test_what_holds_ends_what_digs(excavator, weights):
         if one.joint == "X_arm":
             axes[2] = [found.bucket.stroke]
         field = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        for q_a in field[np.random.default_rng(0).choice(len(field), 60, replace=False)]:
+        for q_a in field[np.random.default_rng(0).choice(len(field), 25, replace=False)]:
             q = excavator.closure.solve(np.r_[0.0, q_a])
             tried = by_hand(excavator, [one.joint], q, tangent(excavator, q, one.pivot), gravity)
             assert min(tried.values()) <= one.force * (1 + 1e-9)
@@ -150,7 +150,7 @@ def test_a_tool_that_pushes_upwards_lifts(excavator):
 
 @pytest.mark.parametrize("direction", ["tangent", "-tangent", "normal", "in", (1.0, 0.0, -1.0)])
 def test_every_place_is_what_statics_by_hand_give(excavator, direction):
-    field = crane.tool_force(excavator, direction, step=2.0, slews=[0.0, 1.2])
+    field = crane.tool_force(excavator, direction, step=3.0, slews=[0.0, 1.2])
     ways = field.section_directions()
     reached = np.argwhere(np.isfinite(field.forces) & (field.forces > 0))
     for s, b, a in reached[np.random.default_rng(0).choice(len(reached), 8, replace=False)]:

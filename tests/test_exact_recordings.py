@@ -1,4 +1,4 @@
-"""Recordings without noise, of motions that tell little: what is found, how far to trust it."""
+"""Identification from recordings without noise and with little information."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def recorded(request):
     return request.param()
 
 
-@pytest.mark.parametrize("method", ["ols", "wls", "huber"])
+@pytest.mark.parametrize("method", ["ols", "wls", pytest.param("huber", marks=pytest.mark.long)])
 def test_intervals_hold_the_truth_where_rounding_is_all_the_noise(recorded, method):
     machine, recording = recorded
     found = crane.identify(machine, recording, method=method)

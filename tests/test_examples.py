@@ -1,4 +1,4 @@
-"""Every program of examples/: it ends well, without a warning, and prints what the index says."""
+"""Every program of examples/ ends without a warning and prints what the index says."""
 
 import ast
 import os

@@ -1,4 +1,4 @@
-"""The bundled excavator beside what data sheets of its class print, and its cycle's balance."""
+"""The bundled excavator against data sheets of its class, and the energy balance of its cycle."""
 
 import warnings
 
@@ -84,7 +84,7 @@ def test_a_cycle_ends_where_it_began_and_keeps_the_balance(machine):
 
 @pytest.mark.slow
 def test_levers_tip_it_with_the_load_that_is_said(machine):
-    """A little less leaves it on its tracks, a little more does not; quietly."""
+    """2 % less load leaves it on its tracks, 2 % more tips it; no warning is given."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = tipping_load(machine, "dig")
@@ -123,7 +123,7 @@ def shaft(run):
 
 
 def test_regulated_pumps_dig_with_less(cycles):
-    """The same motion, by less than the pressure that is kept takes."""
+    """The same motion takes less work than with a constant supply pressure."""
     (_, kept), *others = cycles.values()
     work = np.trapezoid(shaft(kept), kept.time)
     assert shaft(kept).max() > 200e3  # [W], no engine of the class has that

@@ -1,8 +1,8 @@
-"""References for identification: what they are, that they keep limits, and what they tell."""
+"""Excitation trajectories: limits are kept, and the information that they carry."""
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import InputError
@@ -62,7 +62,7 @@ def test_it_is_periodic_between_rests(series):
 
 
 def test_ways_from_and_to_rest_stay_on_the_curve(series):
-    """Points of a way lie on the periodic curve, nowhere faster than it."""
+    """Points of the start and end paths lie on the periodic curve, nowhere faster than it."""
     curve = (
         fourier_basis(np.linspace(0, series.period, 200001), 4, series.period)[0]
         @ series.coefficients
@@ -137,7 +137,7 @@ def test_forces_can_be_what_limits(edited):
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_edge_of_the_branch_is_kept(five_bar):
-    """Cranks that turn one radian either way leave the reach; the reference does not."""
+    """One radian of both cranks is out of reach; the reference stays within it."""
     result = excite(five_bar, **QUICK, period=4.0)
     q, v, a = result.trajectory(np.linspace(0, result.trajectory.duration, 3001))
     at = IdentificationModel(five_bar).samples(q, v, a)  # every sample closes

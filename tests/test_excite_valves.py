@@ -1,11 +1,11 @@
-"""Signals of valves for calibration: that limits are kept, and what they tell."""
+"""Valve signals for calibration: limits are kept, and the information that they carry."""
 
 import warnings
 
 import numpy as np
 import pytest
+from command_line import typed
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError

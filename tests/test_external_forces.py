@@ -1,4 +1,4 @@
-"""Forces from outside: by Pinocchio's own external forces, closed forms, and energy."""
+"""External forces against Pinocchio's, closed forms and energy."""
 
 import dataclasses
 import warnings
@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pinocchio as pin
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.codegen.symbolic import scale_vector
@@ -113,7 +113,7 @@ def test_all_methods_agree_and_work_is_in_the_balance(method):
 
 
 def test_what_carries_a_load_hangs_as_still_as_with_a_payload():
-    """Drives begin with what they have to bear at time 0; the oil is not pressed by it first."""
+    """Initial pressures carry the loads at time 0."""
     machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
     pull = crane.Wrench(machine.tip, (0.0, 0.0, -1500.0))
     run = crane.simulate(machine, None, None, 1.0, loads=(pull,))
@@ -155,7 +155,7 @@ def test_a_controller_of_the_bare_machine_begins_with_what_the_run_carries():
 
 
 def test_with_hydraulics_a_pull_is_in_the_chambers():
-    """A cylinder that holds still carries the load's generalised force more."""
+    """The force of a resting cylinder grows by the load's generalised force."""
     machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
     pull = crane.Wrench(machine.tip, (0.0, 0.0, -1500.0))
     runs = [crane.simulate(machine, None, None, 4.0, loads=loads) for loads in ((), (pull,))]

@@ -1,3 +1,5 @@
+"""Physically feasible inertial parameters."""
+
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,11 +1,11 @@
-"""Names in figures stand there as they are, whatever matplotlib makes of their letters."""
+"""Names in figures appear literally, without interpretation by matplotlib."""
 
 import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -32,7 +32,7 @@ def picture(text, **options):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_is_set_as_it_is(name):
-    """As matplotlib sets it where it is told that there is no mathematics."""
+    """The text looks as matplotlib sets it with mathematics switched off."""
     expected = picture(name, parse_math=False)
     assert expected.min() < 200
     np.testing.assert_array_equal(picture(escape_label(name)), expected)

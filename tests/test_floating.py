@@ -1,4 +1,4 @@
-"""Machines whose root floats: both backends, Pinocchio's open tree, closed forms of motion."""
+"""Machines with a floating base: both backends, Pinocchio's open tree, closed forms of motion."""
 
 import shutil
 from pathlib import Path
@@ -112,7 +112,7 @@ def test_steps_of_machine_code_are_those_of_python(which, arm, monkeypatch):
 
 
 def test_momentum_and_energy_in_free_flight(arm):
-    """Somersaults through every attitude: no singularity, whatever the pitch."""
+    """A rotation through all attitudes meets no singularity."""
     upright = np.array([0, 0, 0, 0, np.pi / 2, 0, 0, 0])  # where Cardan angles are not defined
     start = upright, np.array([0.3, 0.2, 4.0, 0.1, 9.0, 0.1, 0.3, -0.4])
     recording = crane.simulate(arm, initial=start, duration=2.0, step=5e-4)
@@ -156,7 +156,7 @@ def test_a_spin_about_one_axis_goes_round_and_round(tmp_path):
 
 @pytest.mark.slow
 def test_a_crane_on_its_valves_in_free_fall_keeps_its_momentum(tmp_path):
-    """Valves, oil and cylinders act inside: the whole falls as a stone, and does not turn."""
+    """Internal forces of a circuit change neither the fall nor the attitude of the whole."""
     models = Path(__file__).parents[1] / "models"
     shutil.copytree(models, tmp_path / "models")
     urdf = tmp_path / "models" / "urdf" / "patu655" / "boom.urdf"

@@ -1,4 +1,4 @@
-"""Machines in other formats: written, and read again; couplings of URDF+."""
+"""Machines written in other formats and read again; couplings of URDF+."""
 
 import dataclasses
 import itertools
@@ -7,9 +7,9 @@ import warnings
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
+from command_line import typed
 from linkages import MACHINES, WRITERS, assert_same, loaded, postures, rewritten
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -144,7 +144,7 @@ def test_limits_that_are_none_are_infinite_and_survive_every_format(tmp_path):
 
 
 def test_the_other_assembly_branch_is_kept(tmp_path):
-    """Of the four-bar there are two; the one that home says survives every format."""
+    """The assembly mode of the four-bar's home configuration is kept by every format."""
     text = (DATA / "four_bar.yaml").read_text().replace("urdf: ", f"urdf: {DATA}/")
     text = text.replace("coupler: -1.0", "coupler: -2.3").replace("rocker: 1.5", "rocker: -2.2")
     (tmp_path / "other.yaml").write_text(text)

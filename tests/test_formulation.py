@@ -1,4 +1,4 @@
-"""The decoupled formulation against lone sub-chains, and what it leaves out."""
+"""The decoupled formulation against separate sub-chains."""
 
 from pathlib import Path
 
@@ -154,7 +154,7 @@ def test_a_machine_of_one_chain_has_one_formulation():
 
 
 def test_a_simulation_follows_its_formulation(mini):
-    """It drives the machine without tracking error where its own inverse gives the forces."""
+    """Its inverse dynamics drive its own forward dynamics without tracking error."""
     path = crane.task_trajectory(mini, "lift")
     ideal = crane.Dynamics(mini, formulation="decoupled")
 

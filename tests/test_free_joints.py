@@ -1,17 +1,17 @@
-"""Joints that nothing drives: dynamics against paper, MuJoCo and Pinocchio; who may do what."""
+"""Free joints: dynamics against equations on paper, MuJoCo and Pinocchio; allowed operations."""
 
 import dataclasses
 
-import hanging
+import hanging_loads
 import numpy as np
 import pinocchio as pin
 import pytest
+from command_line import typed
 from oracles import constraint_dynamics
 from rig import Rig, Tolerances
 from rig.sensors import default_sensors
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError
@@ -22,7 +22,7 @@ BACKENDS = ("compiled", "pinocchio")
 
 @pytest.fixture
 def machine(tmp_path):
-    return crane.load(hanging.file(tmp_path))
+    return crane.load(hanging_loads.file(tmp_path))
 
 
 # --- a double pendulum that hangs from a tip that moves --------------------------------------
@@ -31,16 +31,24 @@ LENGTH, FIRST = 3.0, 0.4  # of the boom, of the upper pendulum
 BOOM, UPPER, LOWER = (120.0, 1.4, 90.0), (14.0, 0.15, 0.8), (160.0, 0.7, 21.0)  # m, c, J at c
 DOUBLE = (
     '<robot name="double"><link name="base"/>'
-    + hanging.link("boom", BOOM[0], f"{BOOM[1]} 0 0", (1, 0, 0, BOOM[2], 0, BOOM[2]))
-    + hanging.link("upper", UPPER[0], f"0 0 -{UPPER[1]}", (UPPER[2], 0, 0, UPPER[2], 0, 0.1))
-    + hanging.link("lower", LOWER[0], f"0 0 -{LOWER[1]}", (LOWER[2], 0, 0, LOWER[2], 0, 9))
-    + hanging.link("tube", 40, "-0.5 0 0", (1, 0, 0, 8, 0, 8))
-    + hanging.joint("lift", "base", "boom", "0 0 0", "0 -1 0", hanging.limits(-1, 2, 1e5))
-    + hanging.joint(
-        "reach", "boom", "tube", f"{LENGTH} 0 0", "1 0 0", hanging.limits(0, 2, 1e5), "prismatic"
+    + hanging_loads.link("boom", BOOM[0], f"{BOOM[1]} 0 0", (1, 0, 0, BOOM[2], 0, BOOM[2]))
+    + hanging_loads.link("upper", UPPER[0], f"0 0 -{UPPER[1]}", (UPPER[2], 0, 0, UPPER[2], 0, 0.1))
+    + hanging_loads.link("lower", LOWER[0], f"0 0 -{LOWER[1]}", (LOWER[2], 0, 0, LOWER[2], 0, 9))
+    + hanging_loads.link("tube", 40, "-0.5 0 0", (1, 0, 0, 8, 0, 8))
+    + hanging_loads.joint(
+        "lift", "base", "boom", "0 0 0", "0 -1 0", hanging_loads.limits(-1, 2, 1e5)
     )
-    + hanging.joint("one", "tube", "upper", "0 0 0", "0 -1 0")
-    + hanging.joint("two", "upper", "lower", f"0 0 -{FIRST}", "0 -1 0")
+    + hanging_loads.joint(
+        "reach",
+        "boom",
+        "tube",
+        f"{LENGTH} 0 0",
+        "1 0 0",
+        hanging_loads.limits(0, 2, 1e5),
+        "prismatic",
+    )
+    + hanging_loads.joint("one", "tube", "upper", "0 0 0", "0 -1 0")
+    + hanging_loads.joint("two", "upper", "lower", f"0 0 -{FIRST}", "0 -1 0")
     + "</robot>"
 )
 
@@ -123,7 +131,7 @@ def test_a_double_pendulum_on_a_moving_tip_is_that_of_lagrange(double, backend):
 
 
 def test_it_swings_as_its_equations_do_while_the_tip_is_driven(double):
-    """Computed torque: the tip keeps to its reference, the pins to the equations on paper."""
+    """Under computed torque the tip follows its reference, the pins the equations on paper."""
     path = crane.point_to_point([0.2, 0.3], [0.7, 1.1], 1.5)
     start = np.array([0.2, 0.3, 0.1, -0.5])
     run = crane.simulate(
@@ -185,7 +193,7 @@ def states(machine, count, seed=0):
 
 def test_a_floating_closed_chain_is_that_of_constraint_dynamics(tmp_path):
     """Driven crank, free hull and load: Pinocchio's free-flyer with multipliers."""
-    machine = hanging.floating_series(tmp_path)
+    machine = hanging_loads.floating_series(tmp_path)
     assert machine.driven_joints == ("turn",) and len(machine.free) == 7
     closure, dynamics = machine.closure, crane.Dynamics(machine)
     for q_a, v_a, a_d in states(machine, 10):
@@ -203,7 +211,7 @@ def test_a_floating_closed_chain_is_that_of_constraint_dynamics(tmp_path):
 
 def test_momentum_is_kept_while_a_drive_moves_what_floats(tmp_path):
     """In weightlessness, under computed torque of the crank alone: both momenta stay."""
-    machine = hanging.floating_series(tmp_path)
+    machine = hanging_loads.floating_series(tmp_path)
     machine.model.gravity.linear = np.zeros(3)
     n, turn = len(machine.active), machine.active.index("turn")
     start, rates = np.array(machine.home[machine.closure.active]), np.zeros(n)
@@ -287,7 +295,7 @@ def test_forces_gains_and_references_are_of_driven_joints(machine):
 
 
 def test_valves_tasks_and_levers_leave_it_swinging(tmp_path):
-    machine = crane.load(hanging.file(tmp_path, hanging.HYDRAULICS))
+    machine = crane.load(hanging_loads.file(tmp_path, hanging_loads.HYDRAULICS))
     path = crane.point_to_point([0.2, 0.3], [0.5, 0.4], 1.0)
     runs = [
         crane.simulate(machine, crane.ValvePD(machine, path), duration=0.5),
@@ -351,7 +359,7 @@ def test_the_rig_measures_it_and_lets_it_swing(machine):
 
 def test_it_is_linearized_where_it_hangs_still(machine, tmp_path):
     """Frequencies of the small swings with the drives at rest, those of the crane that stands."""
-    hydraulic = crane.load(hanging.file(tmp_path, hanging.HYDRAULICS))
+    hydraulic = crane.load(hanging_loads.file(tmp_path, hanging_loads.HYDRAULICS))
     stands = crane.load(machine.path, lock={"slew": 0.2, "lift": 0.3})
     dynamics = crane.Dynamics(stands)
     at = fsolve(lambda q: dynamics.gravity(q), [0.3, 0.0], xtol=1e-14)

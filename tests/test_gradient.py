@@ -1,9 +1,9 @@
-"""Gradients of sums over simulations: sensitivities, closed forms, differences."""
+"""Gradients of sums over simulations against sensitivities, closed forms and differences."""
 
 import numpy as np
 import pytest
+from executed_lines import at_most
 from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, Ramp, block, swung
-from work import at_most
 
 import crane
 from crane.common.errors import CraneError

@@ -1,11 +1,11 @@
-"""The grapple that hangs: its sway against equations on paper, and references that leave none."""
+"""A hanging grapple: sway against equations on paper, and references without residual sway."""
 
-import hanging
+import hanging_loads
 import numpy as np
 import pytest
+from command_line import typed
 from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError
@@ -321,7 +321,7 @@ def test_what_cannot_be_is_refused(loaded, quarter, call, line):
 
 def test_any_machine_that_hangs(tmp_path):
     """Another one, whose grapple's products of inertia turn both planes into each other."""
-    machine = crane.load(hanging.file(tmp_path))
+    machine = crane.load(hanging_loads.file(tmp_path))
     reference = crane.point_to_point([0.2, 0.3], [1.0, 0.45], 6.0)
     run, sway = follow(machine, suppress_sway(machine, reference), tolerance=1e-11)
     _, before = follow(machine, suppress_sway(machine, reference, "none"), tolerance=1e-11)
@@ -411,7 +411,7 @@ def test_feedback_damps_what_is_left(payload, joint):
 
 
 def test_feedback_takes_what_a_plan_did_not_know(loaded):
-    """A plan for 200 kg, and 160 kg in the claws."""
+    """A reference planned for 200 kg still reduces sway with 160 kg."""
     plan = crane.fastest_trajectory(loaded, crane.task_trajectory(loaded, "swing"), "flat")
     lighter = carrying(160.0)
     sway, left = Sway(lighter), []

@@ -1,4 +1,4 @@
-"""Contact with the ground: statics of a block on a slope, falls, wheels, energy."""
+"""Ground contact: statics of a block on a slope, falls, wheels, energy."""
 
 import warnings
 
@@ -254,7 +254,7 @@ ROCKING = STANDING.replace("fly_z: 0.5", "base_z: 0.5, base_ry: 0.3") + "floatin
 
 
 def test_a_root_has_the_freedoms_that_are_named(block, tmp_path):
-    """In its plane it rocks as one does that floats."""
+    """A planar root moves as a floating one in its plane."""
     urdf = (tmp_path / "block.urdf").read_text()
     fixed = urdf[: urdf.index('<link name="world"/>')] + urdf[urdf.index('<link name="block">') :]
     (tmp_path / "root.urdf").write_text(fixed)

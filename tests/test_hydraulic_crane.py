@@ -1,4 +1,4 @@
-"""The full-size crane on its hydraulics: what the issue of it asks to be shown."""
+"""The full-size crane on its hydraulics: balances, convergence, control and output."""
 
 import warnings
 
@@ -137,7 +137,8 @@ def test_stiff_oil_moves_with_its_flow(loaded):
     assert gaps[2] < gaps[1] / 5
 
 
-@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "swing"])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach", pytest.param("swing", marks=pytest.mark.long)])
 def test_halving_the_step_changes_nothing(task):
     """Where friction does not fall with speed, two motions side by side stay so."""
     even = {f"friction.{joint}.stiction": 0.0 for joint in ("X_lift", "X_tilt", "X_ext")}
@@ -148,7 +149,8 @@ def test_halving_the_step_changes_nothing(task):
     assert np.abs(half.q[::2] - whole.q).max() < 1e-7
 
 
-@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "swing"])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach", pytest.param("swing", marks=pytest.mark.long)])
 def test_halving_the_step_changes_less_than_a_start_beside(loaded, task):
     """A rod that slows down below the Stribeck velocity sticks and slips.
 
@@ -249,7 +251,7 @@ def test_a_program_sees_what_the_machine_does(patu):
 
 
 def test_a_program_starts_anew_in_each_simulation(patu):
-    """Spools begin at neutral, not where the last simulation left them."""
+    """Spools start at neutral in every simulation."""
     program = SampledCommand(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
     first, again = (crane.simulate(patu, program, duration=0.2) for _ in range(2))
     np.testing.assert_array_equal(first.q, again.q)
@@ -264,7 +266,7 @@ def test_methods_that_call_no_program_are_refused(patu, method):
 
 
 def test_circuit_follows_the_active_joints(patu):
-    """Cylinders, valves and gains of joints that are driven no more go together."""
+    """Cylinders, valves and gains of joints that lose their drive are removed together."""
     left = patu.with_active_joints(["slew", "q2", "X_tilt", "X_ext"]).hydraulics
     for parts in (left.cylinders, left.valves, left.control):
         assert list(parts) == ["slew", "X_tilt", "X_ext"]

@@ -1,4 +1,4 @@
-"""Valves, oil and cylinder friction from recordings that another program of equations made."""
+"""Valves, oil and cylinder friction identified from independently simulated recordings."""
 
 import dataclasses
 
@@ -279,7 +279,7 @@ def test_noise_like_the_paper_s(machine, slow, method):
 @pytest.mark.parametrize("method", ["weak", "chambers"])
 def test_intervals_cover_and_nothing_is_biased(machine, quick, method):
     data = [column[::5] for column in quick]
-    rng, draws = np.random.default_rng(5), 120
+    rng, draws = np.random.default_rng(5), 80
     errors, inside = np.empty((draws, 5)), np.empty((draws, 5))
     for i in range(draws):
         found = identify_orifices(machine, recorded(data, 1.0, rng), "boom", method)
@@ -310,7 +310,7 @@ def test_noisy_pressures_do_not_shrink_beta(machine, quick):
 
 
 def test_least_squares_on_derivatives_is_biased(machine, quick):
-    """Why the weak form is the default.
+    """Least squares on derivatives is biased, so the weak form is the default.
 
     The stroke's smoother takes the oil's oscillation, 0.02 mm, for noise, the force's does not:
     F' on the left has no counterpart on the right, and 1/beta goes to zero.
@@ -701,7 +701,7 @@ def test_valve_whose_load_rings(compensated, frequency):
 
 
 def test_means_over_periods_leave_what_does_not_ring(compensated):
-    """Noise, slow ramps and plain steps are judged as they were."""
+    """Noise, slow ramps and plain steps raise no warning of ringing."""
     time = np.arange(0, 42, 1e-2)
     run = driven(staircase(time), time, 5e-4, np.random.default_rng(0))
     found = identify_valve(compensated, run, "boom")

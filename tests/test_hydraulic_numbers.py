@@ -1,4 +1,4 @@
-"""Numbers of a circuit that cannot be, and those that are in another unit than SI."""
+"""Circuit parameters that are impossible or in units other than SI."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""The electro-hydraulic forwarder paper again: its claims, its page, and `crane circuit`."""
+"""The reproduction of the electro-hydraulic forwarder paper: claims, page, and `crane circuit`."""
 
 import re
 import subprocess
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import typed
 from test_cli import one_error
-from typed import typed
 
 import crane
 from crane.common.errors import RecordingError

@@ -1,4 +1,4 @@
-"""The circuit's laws, each against a closed form."""
+"""Laws of the hydraulic components, each against a closed form."""
 
 import numpy as np
 import pytest

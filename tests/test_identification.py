@@ -1,4 +1,4 @@
-"""The regression model and base parameters: counts that the field knows, groups in closed form."""
+"""Regression model and base parameters: known counts, groups in closed form."""
 
 import dataclasses
 

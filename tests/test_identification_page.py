@@ -1,4 +1,4 @@
-"""The case of docs/identification.md: its commands, its program, and the figures on the page."""
+"""The commands, the program and the figures of docs/identification.md agree with the page."""
 
 import contextlib
 import io
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 PAGE = Path(__file__).parents[1] / "docs" / "identification.md"
 NUMBER = r"-?\d+(?:\.\d*)?(?:e[+-]\d+)?"

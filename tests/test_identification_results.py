@@ -1,4 +1,4 @@
-"""What an identification leaves behind: machine files, a report, parameters; and payloads."""
+"""Output of identification: machine files, report, parameters, payloads."""
 
 import csv
 import dataclasses
@@ -8,12 +8,12 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-import motions
+import forwarder_motions
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
+from forwarder_motions import NOISE
 from lxml import etree
-from motions import NOISE
 from scipy.interpolate import CubicSpline
 
 import crane
@@ -32,7 +32,7 @@ HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 COLUMNS = HERE / "scripts" / "columns" / "patu655.txt"
 pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
-motion = partial(motions.motion, duration=20.0, noise=1.0)
+motion = partial(forwarder_motions.motion, duration=20.0, noise=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
 
 
 def test_a_body_that_cannot_be_asks_for_feasible_ones(mini, found, tmp_path):
-    """Nobody can correct a line of a file that is not written."""
+    """A line number is not given for a file that was not written."""
     bodies = found.parameters.copy()
     bodies[4:10] = [-1.0, 0.0, 1.0, 0.0, 0.0, 1.0]
     parted = dataclasses.replace(found, parameters=bodies, feasible=False)
@@ -448,7 +448,7 @@ def test_a_lift_that_was_recorded_is_weighed():
 
 
 def test_a_machine_that_is_not_as_described_widens_the_interval(mini):
-    """Two of its links weigh half as much again."""
+    """The load is found although two links are 50 % heavier than described."""
     changes = {f"{name}.mass": 1.5 * mass for name, mass in (("link2", 0.1833), ("link5", 0.028))}
     heavy = crane.load("mini_forwarder", changes)
     right, wrong = (

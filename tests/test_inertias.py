@@ -1,4 +1,4 @@
-"""Inertias that no body has: what is computed with, what is told, and what stays refused."""
+"""Physically impossible inertias: when they are corrected, reported or refused."""
 
 import warnings
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from command_line import typed
 from lxml import etree
 from scipy.linalg import null_space
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError
@@ -308,7 +308,7 @@ def test_check_and_strict_refuse_the_form(tmp_path):
 
 
 def test_the_written_tensor_is_possible(tmp_path):
-    """What the warning says to write loads without a word."""
+    """The values that the warning proposes load without a warning."""
     drawn = inertial(ixx=0.3, ixy=0.01, iyy=0.2, iyz=-0.02, izz=0.9, com="0.3 0 0")
     _, (line,) = told(robot(tmp_path, drawn))
     nearest = line.partition("the nearest possible is ")[2]
@@ -317,7 +317,7 @@ def test_the_written_tensor_is_possible(tmp_path):
 
 
 def test_changed_numbers_find_no_excuse(tmp_path):
-    """A number that the caller gives is no exporter's."""
+    """An inertia that is given as a change is refused, not corrected."""
     path = robot(tmp_path, inertial(ixx=1, iyy=1, izz=1))
     with pytest.raises(DescriptionError, match="no possible body"):
         crane.load(path, changes={"arm.inertia.zz": 3.0})

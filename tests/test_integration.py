@@ -1,4 +1,4 @@
-"""Steps in machine code against the same steps in Python, and against other methods."""
+"""Integration steps in machine code against the same steps in Python, and other methods."""
 
 import numpy as np
 import pytest
@@ -128,16 +128,16 @@ CONTROLS = {
 def test_machine_code_python_and_pinocchio_step_alike(forwarder, path, steps, name):
     control = CONTROLS[name](forwarder, path)
     plain = control or crane.control.ZeroForce(forwarder)
-    settings = {"duration": 0.2, "step": 1e-3}
+    settings = {"duration": 0.1, "step": 1e-3}
     if name == "pi":  # not at rest, with an offset
         start = path(0.0)[0] + [0.1, 0.001, -0.0005]
         settings["initial"] = (start, np.array([0.3, 0.01, -0.005]))
     compiled = simulate(forwarder, control, **settings)
-    assert steps == {"compiled": 200, "python": 0}
+    assert steps == {"compiled": 100, "python": 0}
     python = simulate(forwarder, InPython(plain), **settings)
-    assert steps == {"compiled": 200, "python": 200}
+    assert steps == {"compiled": 100, "python": 100}
     pinocchio = simulate(forwarder, control, **settings, backend="pinocchio")
-    assert steps == {"compiled": 200, "python": 400}
+    assert steps == {"compiled": 100, "python": 200}
     assert np.ptp(compiled.q, axis=0).max() > 1e-4  # it moves
     assert off(compiled, python) < 1e-10
     assert off(compiled, pinocchio) < 1e-10
@@ -305,7 +305,7 @@ def test_a_first_step_that_fails_is_told_alike(forwarder, steps, speed):
 
 
 def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeypatch):
-    """Wherever the failure falls among the chunks."""
+    """The run ends the same in whichever chunk the failure occurs."""
     control, settings = crane.PI(forwarder, crane.task_trajectory(forwarder, "lift")), {
         "duration": 0.5, "step": 5e-3
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Standard deviations that need no model of the noise."""
+"""Jackknife standard deviations, which need no noise model."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_intervals_where_noise_depends_on_the_motion(estimator):
     column = np.sin(2 * np.pi * time / 100 + np.sin(2 * np.pi * time / 333))
     W = np.column_stack([column**3, np.ones(1500)])
     covered = []
-    for _ in range(150):
+    for _ in range(100):
         y = W @ [2.0, 1.0] + (0.05 + np.abs(column) ** 3) * rng.standard_normal(1500)
         low, high = estimator(W, y, np.zeros(1500, int)).interval().T
         covered.append((low < [2, 1]) & (high > [2, 1]))

@@ -1,4 +1,4 @@
-"""The tip of the active joints, its derivatives, and back."""
+"""Kinematics of the tip: forward, derivatives and inverse."""
 
 import re
 

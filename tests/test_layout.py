@@ -1,6 +1,7 @@
-"""Imports run one way through the package."""
+"""The order of imports and the names of modules."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "crane"
@@ -24,8 +25,13 @@ def room(module: str) -> str:
     return module.split(".")[1]
 
 
-def imports(path: Path):
+@cache
+def imports(path: Path) -> tuple[str, ...]:
     """Modules of the package that a file imports when it is imported, not for types only."""
+    return tuple(_imports(path))
+
+
+def _imports(path):
     tree = ast.parse(path.read_text())
     skipped = {
         id(inner)
@@ -82,7 +88,7 @@ def test_no_module_hides_a_name_of_the_package():
 
 
 def test_no_module_hides_a_name_of_its_folder():
-    """A folder hands on no name that one of its modules has."""
+    """An `__init__.py` exports no name that one of its modules has."""
     hidden = []
     for path in PACKAGE.rglob("__init__.py"):
         modules = {other.stem for other in path.parent.glob("*.py")}

@@ -1,4 +1,4 @@
-"""Oscillations that do not decay: found in samples, told of runs, foretold of load sensing."""
+"""Limit cycles: detected in samples, reported for runs, predicted for load sensing."""
 
 from dataclasses import replace
 
@@ -172,7 +172,9 @@ def test_no_load_swings_up_from_the_least_sensing_on():
     ("excavator_two_pumps", "load_truck"), ("patu655_ls", "stir"), ("excavator", "dig"),
     ("patu655", "stir"),
 ])  # fmt: skip
-@pytest.mark.parametrize("droop", [None, 2e5, 1e6])
+@pytest.mark.parametrize(
+    "droop", [None, *(pytest.param(x, marks=pytest.mark.long) for x in (2e5, 1e6))]
+)
 def test_bundled_machines_do_not_ring(name, task, droop):
     changes = {"supply.droop": droop} if droop else {}
     machine = crane.load(name, changes=changes)

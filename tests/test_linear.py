@@ -1,11 +1,11 @@
-"""Linear models: closed forms, small steps of the simulation, other programs' formats."""
+"""Linear models against closed forms, short simulations and formats of other programs."""
 
 import warnings
 
 import numpy as np
 import pytest
+from command_line import typed
 from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -247,7 +247,7 @@ def test_a_valve_that_is_open_answers_its_signal(tmp_path):
 
 
 def test_over_strokes_and_loads(patu):
-    """More load rings slower; what is loaded anew has the same model."""
+    """A larger load lowers the frequency; a machine loaded with it has the same model."""
     machine = crane.load("patu655")
     found = quiet(
         crane.linear_models, machine, {"payload.mass": [0.0, 400.0], "X_lift": [0.15, 0.3]}

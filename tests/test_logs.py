@@ -1,11 +1,11 @@
-"""Logs of other programs as recordings."""
+"""Logs of other programs read as recordings."""
 
 import functools
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import RecordingError

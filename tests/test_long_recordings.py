@@ -1,4 +1,4 @@
-"""Recordings as long as an hour at 1 ms do not fill the memory, and are what they were."""
+"""Recordings of an hour at 1 ms need little memory and keep their values."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common import scratch_arrays
@@ -114,7 +114,7 @@ def peak(*arguments):
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted otherwise here")
 @pytest.mark.long
 def test_memory_grows_by_less_than_a_recording(tmp_path):
-    """Three minutes later a recording of 40 columns has grown by 320 bytes a sample."""
+    """Memory grows by 320 bytes per sample of 40 columns."""
     taken = {}
     for duration in (90, 270):
         out = tmp_path / str(duration)

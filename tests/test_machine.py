@@ -1,11 +1,11 @@
-"""The assembled machine: what it says of itself, and what it refuses."""
+"""The assembled machine: its properties and its errors."""
 
 import dataclasses
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import MINI, copy_machine, swap
+from broken_machines import MINI, copy_machine, swap
 from oracles import (
     D_IN_2,
     B,
@@ -125,7 +125,7 @@ def test_limits_are_checked_where_asked(mini):
 
 
 def test_errors_of_limits_tell_where_they_stand(tmp_path):
-    """Of a start, a path, a task and a posture; of a changed limit its parameter."""
+    """Errors name the start, path, task or configuration, and the parameter of a changed limit."""
     path = copy_machine(MINI, tmp_path)
     (file,) = tmp_path.rglob("chain_b1.urdf")
     (line,) = (i for i, text in enumerate(file.read_text().splitlines(), 1) if "<limit" in text)

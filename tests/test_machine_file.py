@@ -1,7 +1,7 @@
-"""Every line that a user sees for a broken machine file."""
+"""Errors of broken machine files, line by line."""
 
 import pytest
-from broken import ROCKER, assert_refused, case, swap, whole
+from broken_machines import ROCKER, assert_refused, case, swap, whole
 
 LOAD = """<robot name="load"><link name="load"><inertial><mass value="2"/>
   <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>

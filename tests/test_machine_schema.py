@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from typed import typed
+from command_line import typed
 
 from crane.description import bundled_machines
 from crane.description.key_types import SectionKey, SectionSchema

@@ -1,7 +1,7 @@
-"""Every line that a user sees for well described parts that make no machine."""
+"""Errors of valid parts that make no machine, line by line."""
 
 import pytest
-from broken import GROUND, MINI, ROCKER, assert_refused, case, copy_machine, swap
+from broken_machines import GROUND, MINI, ROCKER, assert_refused, case, copy_machine, swap
 
 import crane
 from crane.common.errors import CraneError

@@ -1,4 +1,4 @@
-"""MJCF files: what they say is what MuJoCo computes with."""
+"""MJCF files are read with the meaning that MuJoCo gives them."""
 
 import re
 import sys
@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 import pytest
-from broken import DATA
+from broken_machines import DATA
 from linkages import WRITERS, assert_same, postures, rewritten
 
 import crane
@@ -277,7 +277,7 @@ def test_a_motor_alone_and_shapes_that_do_not_touch_are_no_news(tmp_path):
 
 @pytest.mark.parametrize("seed", range(30))
 def test_shapes_that_can_touch_are_those_that_mujoco_finds(seed):
-    """Balls in one place touch wherever MuJoCo lets them."""
+    """The pairs of coincident balls that may touch are MuJoCo's contacts."""
     mujoco = pytest.importorskip("mujoco")
     rng = np.random.default_rng(seed)
     root = ElementTree.Element("mujoco")
@@ -516,7 +516,7 @@ MESHED = """<mujoco><compiler meshdir="shapes"/>
 
 
 def test_meshes_that_are_not_there_are_done_without(tmp_path):
-    """Drawn only, or a part of what has a mass: told. The sole mass of a body: refused."""
+    """Lost visuals and partial masses are reported; a body without any mass is refused."""
     pytest.importorskip("mujoco")
     ball = '<geom size="0.1"/>'
     machine, lines = machine_of(MESHED.format('group="2" density="0"', ball), tmp_path)

@@ -1,4 +1,4 @@
-"""Files as others write them for MuJoCo: accelerations and holding forces are MuJoCo's."""
+"""MJCF models of other authors: accelerations and holding forces equal MuJoCo's."""
 
 import warnings
 from functools import cache

@@ -1,11 +1,11 @@
-"""Motions from files: points, recordings and noisy samples; and lever tasks with a start."""
+"""Motions from files: points, recordings, noisy samples, and lever tasks with a start."""
 
 import warnings
 
 import numpy as np
 import pytest
+from command_line import typed
 from hydraulic_rig import STROKE, rig
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, LimitError

@@ -1,4 +1,4 @@
-"""Every value of every bundled machine file replaced by another: told where it stands, once.
+"""Any changed value in a bundled machine file causes errors at its own place only.
 
 An error is true if it points at what was changed, at what that is part of, or names it: a value
 that is right by itself may not fit others. All else would follow from the error that was told.
@@ -94,13 +94,8 @@ def run(tmp_path, name, count, seed=0):
     assert not wrong, "\n".join(wrong[:40])
 
 
-@pytest.mark.parametrize("name", sorted(bundled_machines()))
-def test_some_mutations(tmp_path, name):
-    run(tmp_path, name, 12)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [60, pytest.param(None, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [25, pytest.param(None, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", sorted(bundled_machines()))
 def test_mutations(tmp_path, name, count):
     run(tmp_path, name, count, seed=1)

@@ -1,4 +1,4 @@
-"""Recordings as npz: what a file declares is compared with what is in it, before it is read."""
+"""Recordings as npz: the declared content is compared with the data before it is read."""
 
 import io
 import struct

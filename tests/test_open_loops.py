@@ -1,4 +1,4 @@
-"""Loops that files only hint at are told, with what to write, and what is written closes them."""
+"""Open loops that a file hints at are reported with the missing lines, which close them."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""The program of docs/optimal_control.md: its motions are optimal, and the machine makes them."""
+"""The program of docs/optimal_control.md: motions are optimal and feasible for the machine."""
 
 import re
 import warnings

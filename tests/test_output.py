@@ -1,3 +1,5 @@
+"""Files and folders are written completely or not at all."""
+
 import ast
 import os
 import shutil
@@ -6,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from killed import killed_at
+from killed_processes import killed_at
 
 import crane.common.temporary_files
 from crane.common.atomic_output import check_folder_is_writable, replace_file, replace_folder
@@ -230,7 +232,7 @@ def test_a_run_is_wholly_old_or_wholly_new_whenever_it_is_killed(tmp_path, times
     here = Path(__file__).parent
     paths = os.pathsep.join([str(here.parent), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
-        [sys.executable, here / "killed.py", tmp_path, str(times)],
+        [sys.executable, here / "killed_processes.py", tmp_path, str(times)],
         capture_output=True, text=True, env={**os.environ, "PYTHONPATH": paths},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-500:]

@@ -1,4 +1,4 @@
-"""What is said of the package agrees wherever it is said; what it lacks is told in one line."""
+"""Metadata agrees everywhere, and a missing extra is an error of one line."""
 
 import re
 import sys
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_line import typed
 from packaging.requirements import Requirement
-from typed import typed
 
 import crane
 from crane.common import optional_libraries
@@ -80,7 +80,7 @@ def test_a_library_that_is_not_there_is_told_with_its_extra(module, monkeypatch)
 
 @pytest.mark.parametrize("tried", [(), ("--try", "bandwidth=2,5")])
 def test_identify_says_at_once_what_feasible_bodies_need(tried, tmp_path, monkeypatch):
-    """Neither after the work nor as what ends each of many trials."""
+    """A missing extra is reported before the work, not by each of many trials."""
     typed("simulate", "mini_forwarder", "--task", "lift", "--out", tmp_path / "run")
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     result = typed(

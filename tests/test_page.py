@@ -1,4 +1,4 @@
-"""The page in a browser: what it shows is what was recorded, and nothing leaves it."""
+"""The run page in a browser: shown values equal the recording, no outside requests."""
 
 import base64
 import dataclasses
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from work import at_most
+from executed_lines import at_most
 
 import crane
 from crane.common.errors import CraneWarning, RecordingError
@@ -77,7 +77,7 @@ def line(found, name):
 
 
 def test_extremes_survive_thinning_out(machine):
-    """One wild sample of a million is seen, to the precision of a float."""
+    """One outlier in a million samples is visible."""
     time = np.arange(300_001) * 1e-3
     rng = np.random.default_rng(3)
     tau = rng.normal(size=(len(time), 3))

@@ -1,10 +1,10 @@
-"""The convention of Gepetto's example-parallel-robots."""
+"""Machines in the convention of Gepetto's example-parallel-robots."""
 
 import re
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

@@ -1,4 +1,4 @@
-"""Reference motions, and what the paper says about its three trajectories."""
+"""Reference motions, and the paper's statements about its three trajectories."""
 
 import dataclasses
 import warnings

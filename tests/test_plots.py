@@ -1,3 +1,5 @@
+"""Figures of recordings: curves, labels, formats."""
+
 import subprocess
 import sys
 from dataclasses import replace
@@ -5,7 +7,6 @@ from string import ascii_lowercase
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from crane.common.errors import OutputError
 from crane.recordings.recording import Recording
@@ -165,7 +166,7 @@ def test_a_path_in_a_plane_is_drawn_in_it(recording, sizes, plane):
     for label in ("recording", "reference"):
         for values, axis in zip(curve(path, label), plane, strict=True):
             np.testing.assert_array_equal(values, tip[:, "xyz".index(axis)])
-    FigureCanvasAgg(figure).draw()
+    figure.draw_without_rendering()
     one, other = np.diff(path.transData.transform([[3, 3], [4, 4]]), axis=0)[0]
     assert one == pytest.approx(other, rel=1e-9)  # to scale
 
@@ -207,7 +208,7 @@ def test_one_sample_can_be_seen():
 
 @pytest.mark.parametrize("suffix", SIGNATURES)
 def test_formats(tmp_path, recording, suffix):
-    path = tmp_path / f"run{suffix}"
+    path, recording = tmp_path / f"run{suffix}", without(recording, "tip", "reference")
     plot_result(recording, path)
     first = path.read_bytes()
     assert first.startswith(SIGNATURES[suffix])
@@ -232,7 +233,7 @@ def test_no_global_state_of_pyplot():
 
 def boxes(figure):
     """Where the words at the axes of the path in space are drawn, by what they say [pixels]."""
-    FigureCanvasAgg(figure).draw()
+    figure.draw_without_rendering()
     (space,) = (axes for axes in figure.axes if axes.name == "3d")
     found = {}
     for name, axis in zip("xyz", (space.xaxis, space.yaxis, space.zaxis), strict=True):
@@ -347,7 +348,7 @@ def test_title_and_legend_stand_apart_where_there_is_one_joint(name):
         dict.fromkeys(pressures, "Pa"), machine_name=name,
     )  # fmt: skip
     figure = recording_figure(one)
-    FigureCanvasAgg(figure).draw()
+    figure.draw_without_rendering()
     (legend,) = figure.legends
     above, beside = (part.get_window_extent() for part in (figure._suptitle, legend))
     assert not above.overlaps(beside)

@@ -1,4 +1,4 @@
-"""Where a hydraulic run's power goes: closed forms, balances, and what is shown of them."""
+"""Power balance of hydraulic runs: closed forms, balances, figures and table."""
 
 import itertools
 from dataclasses import replace
@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from command_line import typed
+from executed_lines import at_most
 from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, ORIFICE, rig
-from typed import typed
-from work import at_most
 
 import crane
 from crane.recordings import Recording
@@ -304,7 +304,7 @@ def test_the_wrong_machine_is_refused(patu, digging, tmp_path):
 
 
 def test_samples_cost_no_python(patu):
-    """Lines that are run do not depend on how many samples there are."""
+    """The number of executed lines is independent of the number of samples."""
     machine, recording = patu
     crane.power_balance(machine, recording)
     lines = []
@@ -346,7 +346,7 @@ def test_the_command_refuses_in_one_line(patu, tmp_path):
 
 
 def test_one_sample_and_a_machine_at_rest_have_tables_and_pictures(patu, tmp_path):
-    """Nothing is divided by a duration or an energy of zero."""
+    """A duration or an energy of zero causes no division by zero."""
     machine, recording = patu
     account = crane.power_balance(machine, recording.between(0.0, 0.0))
     assert account.mean_power(account.shaft_power) == account.shaft_power[0]

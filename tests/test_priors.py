@@ -1,8 +1,8 @@
-"""What is wrong with a prior is told in terms of the parameters that it is about."""
+"""Errors of priors name the parameters that they concern."""
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import InputError
@@ -80,7 +80,7 @@ def test_a_prior_that_is_none(four_bar, one_way, prior, feasible, message):
 
 
 def test_a_share_of_the_description_is_about_friction_too(four_bar, one_way):
-    """Friction has the described size, its offset that of what it is the offset of."""
+    """The prior of friction is its described value, that of an offset is the friction's."""
     rough = four_bar.replace(
         friction={"crank": Friction(coulomb=4.0, viscous=0.5, smoothing=1e-3)}
     )

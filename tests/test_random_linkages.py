@@ -1,4 +1,4 @@
-"""Random planar linkages: they load with what is proposed, close, and move as multipliers say.
+"""Random planar linkages load, close, and move as constraint dynamics says.
 
 Trees of revolute and prismatic joints in a vertical plane, closed by one to three pins at random
 places. Which joints to drive is left to the package. What is thrown away is counted by reason.
@@ -122,7 +122,7 @@ def driven(path):
     return machine
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(plans())
 def test_random_linkages_move_as_constraint_dynamics_says(plan):
     with tempfile.TemporaryDirectory() as folder:
@@ -165,7 +165,7 @@ def test_random_linkages_move_as_constraint_dynamics_says(plan):
 
 
 def test_most_draws_are_kept():
-    """Runs after the draws; what was thrown away is told by `pytest -s`."""
+    """Most draws are used; `pytest -s` prints the reasons of the others."""
     if not DRAWN:
         pytest.skip("the draws were not made in this process")
     print(dict(DRAWN), dict(POSTURES))

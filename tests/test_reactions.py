@@ -1,13 +1,13 @@
-"""Forces in the joints: by hand, body by body, and beside Pinocchio's constraint solver."""
+"""Reactions of joints against free-body diagrams and Pinocchio's constraint solver."""
 
-import hanging
+import hanging_loads
 import numpy as np
 import pinocchio as pin
 import pytest
-from hanging import joint, limits, link
+from hanging_loads import joint, limits, link
 from linkages import postures
 from scipy.linalg import null_space
-from test_digits import four_bar, loaded, written
+from test_file_precision import four_bar, loaded, written
 
 import crane
 from crane import Dynamics, ForceElement, Reactions, Rope
@@ -175,7 +175,7 @@ def _about(point, wrench):
 def _machine(name, folder):
     """A machine with a spring, a gas of force and a rope between frames, and loads on links."""
     if name == "afloat":
-        return hanging.floating_series(folder), ["load", "hull"]
+        return hanging_loads.floating_series(folder), ["load", "hull"]
     machine = crane.load(name)
     links = [machine.tip, machine.closure.equations.loops[0].successor]
     root = machine.tree.root_link
@@ -262,7 +262,7 @@ def test_every_body_is_in_balance(name, tmp_path):
 
 
 def test_what_floats_is_held_by_nothing(tmp_path):
-    machine = hanging.floating_series(tmp_path)
+    machine = hanging_loads.floating_series(tmp_path)
     _, (q, v, _) = moving(machine, 1)
     tau = np.zeros(len(machine.active))
     q_a = q[0, machine.closure.active]

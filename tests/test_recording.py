@@ -1,3 +1,5 @@
+"""Recordings: validation, selection, conversion and files."""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Measured valve signals put through the model."""
+"""Measured valve signals replayed on the model."""
 
 import numpy as np
 import pytest

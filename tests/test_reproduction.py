@@ -1,4 +1,4 @@
-"""The reproduction of the reduced-scale forwarder paper runs and says what it must."""
+"""The reproduction of the reduced-scale forwarder paper runs and confirms its statements."""
 
 import re
 import subprocess

@@ -1,11 +1,11 @@
-"""Rotors that turn with joints, behind their gears: in every quantity, format and backend."""
+"""Rotor inertias behind gears: in every quantity, format and backend."""
 
 import warnings
 
 import numpy as np
 import oracles
 import pytest
-from broken import DATA
+from broken_machines import DATA
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

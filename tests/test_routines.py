@@ -1,4 +1,4 @@
-"""Routines, the loops around formulas, against the same in Python."""
+"""Routines, loops around formulas, against the same computation in Python."""
 
 import math
 import re

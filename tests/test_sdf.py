@@ -6,9 +6,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+from command_line import typed
 from scipy.integrate import quad
 from sdf_models import SdfWriter, draw, planar, stewart, urdf
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning

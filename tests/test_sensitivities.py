@@ -1,10 +1,10 @@
-"""Sensitivities of simulations: closed forms, and differences of simulations."""
+"""Sensitivities of simulations against closed forms and differences of simulations."""
 
 import warnings
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError

@@ -1,4 +1,4 @@
-"""Sensors of a machine: what is known of them, what they disagree on, logs that they name."""
+"""Sensors of a machine: corrections, redundancy, and logs that name them."""
 
 import dataclasses
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
@@ -219,7 +219,7 @@ def test_changes_of_sensors_that_are_none():
 
 
 def test_sensors_that_agree_say_nothing(machine, motion, tmp_path):
-    """Nor do noisy ones, whichever columns there are."""
+    """Noisy recordings cause no warning, whichever columns they have."""
     assert told(machine, written(tmp_path, motion)) == []
     random = np.random.default_rng(1)
     off = {
@@ -233,7 +233,17 @@ def test_sensors_that_agree_say_nothing(machine, motion, tmp_path):
         assert told(machine, written(tmp_path, motion, **off)) == []
 
 
-@pytest.mark.parametrize("name", crane.description.bundled_machines())
+# Their sensors are those of other bundled machines.
+SIMILAR = ("excavator_ls", "excavator_two_pumps", "patu655_ls", "tx40")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=pytest.mark.long) if x in SIMILAR else x
+        for x in crane.description.bundled_machines()
+    ],
+)
 def test_simulations_of_bundled_machines_agree_with_themselves(name, tmp_path):
     machine = crane.load(name)
     active = [x for x in machine.active if x not in machine.free]
@@ -452,7 +462,7 @@ def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
 
 
 def test_a_delay_reads_beyond_the_window(machine, motion, tmp_path):
-    """The end of a window holds what a late sensor says after it."""
+    """A window contains the samples that a delayed sensor gives after its end."""
     path = written(tmp_path, motion, [])
     table = table_reader.read_table(path)
     late = {"X_lift": Sensor(delay=0.1)}

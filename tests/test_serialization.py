@@ -1,4 +1,4 @@
-"""Values as bytes: the same value comes back, equal values have equal bytes, others differ."""
+"""Serialized values: same value from the bytes, same bytes from equal values."""
 
 from dataclasses import dataclass
 

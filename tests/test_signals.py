@@ -1,3 +1,5 @@
+"""Signals and weak forms: filters, derivatives, noise."""
+
 import dataclasses
 import math
 import warnings

@@ -1,8 +1,10 @@
+"""Simulations: outputs, tolerances, start states, errors."""
+
 import warnings
 
 import numpy as np
 import pytest
-from broken import DATA
+from broken_machines import DATA
 from scipy.integrate import solve_ivp
 
 import crane
@@ -287,7 +289,7 @@ def test_steps_by_their_error_do_not_depend_on_what_is_recorded(forwarder):
 
 
 def test_steps_by_their_error_turn_a_floating_machine_round():
-    """Through rotation vectors of half a turn, which go on at the opposite end."""
+    """A rotation vector of half a turn continues at the opposite vector."""
     with pytest.warns(CraneWarning):
         machine = crane.load(DATA / "slider_crank.yaml", floating=True)
     speeds = np.array([1.0, 0.2, 0.0, 1.0, 2.0, 9.0, 0.5])

@@ -1,4 +1,4 @@
-"""Cutting soil: wedges balanced by hand, tables of earth pressure, dissipation, energy."""
+"""Soil cutting: force balance of wedges, tables of earth pressure, dissipation, energy."""
 
 import warnings
 from pathlib import Path

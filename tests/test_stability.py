@@ -1,11 +1,11 @@
-"""Tipping: hand moments, Pinocchio's free-flyer, and machines that stand on contacts."""
+"""Tipping: moments by hand, Pinocchio's free-flyer, and machines on contacts."""
 
 import shutil
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError

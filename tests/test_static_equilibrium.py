@@ -1,4 +1,4 @@
-"""Where machines stand on their contacts when a run begins."""
+"""Static equilibrium on contacts at the start of a run."""
 
 import numpy as np
 import pytest

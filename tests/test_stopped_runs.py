@@ -1,12 +1,12 @@
-"""Runs that stop before their time leave what there is of them, and say when and why."""
+"""Runs that stop early keep their samples and report the time and the reason."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import typed
 from oracles import SliderCrank
-from typed import typed
 
 import crane
 from crane.common.errors import CraneError, SimulationError
@@ -32,7 +32,7 @@ def same(part, whole):
 
 
 def test_errors_of_controllers_carry_the_run_until_then(mini):
-    """Whatever a controller in Python raises, until the step in which it does."""
+    """Any exception of a Python controller leaves the samples up to its step."""
 
     def hold(until):
         def law(time, q_a, v_a):

@@ -1,4 +1,4 @@
-"""Design studies: what is measured, and that it does not matter where."""
+"""Design studies: measures are correct and independent of the process that computes them."""
 
 import os
 import signal
@@ -82,7 +82,7 @@ def test_a_variant_that_cannot_is_a_row_with_its_reason(pins):
 
 
 def test_strokes_where_the_loops_close(monkeypatch):
-    """Every cell as closing it alone says."""
+    """Every cell equals the result of closing that variant alone."""
     monkeypatch.setattr(measures, "_COUPLED_GRID_SIZE", 125)
     machine = crane.load("mini_forwarder", {"link3_G.x": 0.11, "link3_G.y": -0.01})
     found = measure_strokes(machine)
@@ -110,7 +110,7 @@ def test_an_open_arm_has_strokes_too():
 
 @pytest.mark.slow
 def test_rows_do_not_depend_on_what_was_computed_before(pins, tmp_path):
-    """Bitwise: alone, in another order, in two processes."""
+    """Rows are bitwise equal when computed alone, in another order, or in two processes."""
     backwards = crane.study("mini_forwarder", {k: v[::-1] for k, v in PIN.items()})
     for one, two in zip(pins.rows, reversed(backwards.rows), strict=True):
         assert str(one) == str(two)

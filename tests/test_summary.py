@@ -1,3 +1,5 @@
+"""Summaries of recordings."""
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Objects that several threads use at once give each of them what it gets alone, to the last bit.
+"""Objects shared by several threads give each thread the same bits as without sharing.
 
 Every thread asks its own samples, so that numbers of one in the answer of another show. Where it
 follows a branch is its own: alone, too, each runs in a fresh thread.

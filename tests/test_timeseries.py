@@ -1,3 +1,5 @@
+"""Time series as CSV files: reading, writing and errors."""
+
 import math
 import os
 
@@ -245,7 +247,7 @@ def test_numbers_beyond_all_that_is_measured(tmp_path):
 
 
 def test_a_pipe_is_no_file(tmp_path):
-    """It would be waited for until somebody writes into it."""
+    """A named pipe is refused, since reading it would block."""
     for name in ("table.csv", "table.npz"):
         os.mkfifo(tmp_path / name)
         with pytest.raises(RecordingError, match="is no plain file, copy it into one"):

@@ -1,4 +1,4 @@
-"""A closed machine in ROS: its tree as URDF, states of all joints from those of actuators."""
+"""A closed machine in ROS: tree as URDF, states of all joints from those of the actuators."""
 
 import runpy
 import sys
@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yourdfpy
-from broken import DATA
+from broken_machines import DATA
+from command_line import typed
+from executed_lines import at_most
 from lxml import etree
-from typed import typed
-from work import at_most
 
 import crane
 from crane.common.errors import InputError, OutOfReachError
@@ -64,7 +64,7 @@ def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(nam
     tree = yourdfpy.URDF.load(path, load_meshes=False)
     names = {x for x in machine.joints if not x.startswith("base_")}
     assert set(tree.actuated_joint_names) - {"base"} == names
-    for _ in range(5):
+    for _ in range(3):
         q_a = near_home(machine, rng)
         state = transmission.update(machine.active, q_a)
         model, data, _ = by_pinocchio(path.read_text(), state)

@@ -1,4 +1,4 @@
-"""Valves whose chambers have a spool each, against closed forms, scipy and their balances."""
+"""Valves with one spool per chamber against closed forms, scipy and their balances."""
 
 import dataclasses
 import warnings
@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from circuit_state import circuit_of, flow, now
-from circuits import gaps
+from full_circuit import gaps
 from hydraulic_rig import AREA_A, AREA_B, ORIFICE, rig
 from scipy.optimize import brentq
 from test_circuit_transients import VALVE, C, G, clip, compare, cylinder, root

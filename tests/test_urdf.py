@@ -1,9 +1,9 @@
-"""Every line that a user sees for a broken URDF, with the loops of URDF+ too."""
+"""Errors of broken URDF files, including the loops of URDF+, line by line."""
 
 import os
 
 import pytest
-from broken import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
+from broken_machines import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
 
 import crane
 from crane.formats.xml_file import XmlFile

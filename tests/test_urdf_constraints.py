@@ -1,9 +1,9 @@
-"""`<constraint>`, as proposed for URDF: where it is asked for, the same as `<loop>`."""
+"""The proposed URDF element `<constraint>` is equivalent to `<loop>`."""
 
 import numpy as np
 import pytest
-from broken import DATA, LOOPED
-from typed import typed
+from broken_machines import DATA, LOOPED
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError

@@ -4,8 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
-from broken import DATA
-from typed import typed
+from broken_machines import DATA
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError

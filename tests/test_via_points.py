@@ -1,4 +1,4 @@
-"""Via points: the spline with least jerk, attitudes, tasks and paths through points."""
+"""Via points: minimum-jerk splines, orientations, tasks and paths through points."""
 
 import numpy as np
 import pinocchio as pin

@@ -1,4 +1,4 @@
-"""Pages: what they show is where forward kinematics puts it, and nothing leaves them."""
+"""Pages of runs: placements equal forward kinematics, nothing is requested from outside."""
 
 import base64
 import dataclasses

@@ -1,4 +1,4 @@
-"""What URDFs draw: whatever stands there is drawn, or told and left out, and never needed."""
+"""Visuals of URDFs are drawn or reported and left out, and never required."""
 
 import json
 import struct
@@ -244,7 +244,7 @@ def instanced(faces, nodes):
 
 
 def test_a_small_file_that_repeats_its_parts_is_drawn_up_to_a_bound(tmp_path):
-    """Half a megabyte would be four million triangles; screws that occur often are fine."""
+    """Instances of millions of triangles are refused, repeated screws are not."""
     (tmp_path / "bomb.glb").write_bytes(instanced(10_000, 399))
     (tmp_path / "screws.glb").write_bytes(instanced(100, 900))
     bomb, screws = mesh_files.read_meshes(
@@ -256,7 +256,7 @@ def test_a_small_file_that_repeats_its_parts_is_drawn_up_to_a_bound(tmp_path):
 
 
 def test_what_a_mesh_holds_is_kept_by_its_content(tmp_path, place, monkeypatch):
-    """No process is started for it, and a copy or another name change nothing."""
+    """A known mesh is read from the cache, also as a copy or under another name."""
     (tmp_path / "a.stl").write_bytes(stl(5, 5))
     (tmp_path / "a.off").write_bytes(stl(5, 5))
     triangle = "usemtl red\nv 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n"
@@ -303,7 +303,7 @@ def test_kept_meshes_count_as_triangles_to_draw(tmp_path, place, monkeypatch):
 
 
 def test_a_reader_that_ends_costs_one_mesh(tmp_path, place, monkeypatch):
-    """It begins anew after the file at which it ended."""
+    """The reader process restarts after the file at which it ended."""
     source = Path(mesh_process.__file__).read_text()
     opened, imported = (
         "            header, arrays = _read_mesh(file, remaining)\n",

@@ -1,4 +1,4 @@
-"""Processes that a study starts end with the one that started them, however that ends."""
+"""Worker processes of a study end with the process that started them."""
 
 import os
 import signal

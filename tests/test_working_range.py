@@ -1,4 +1,4 @@
-"""A working range beside triangles by hand, brute force over the strokes, and data sheets."""
+"""Working ranges against triangles by hand, brute force over the strokes, and data sheets."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_dimensions_are_where_their_postures_put_the_lip(excavator, found):
 
 
 def test_nothing_of_a_grid_is_better(found, grid):
-    """Nor far behind: by what the lip moves between two of its nodes."""
+    """No grid point exceeds the result, which lies within one grid step."""
     _, lip, pin, floor = grid
     ground = np.abs(lip[:, 1]) < 0.1
     hangs = (np.abs(lip - pin)[:, 0] < 0.2) & (lip[:, 1] < pin[:, 1])

@@ -1,4 +1,4 @@
-"""Workspaces against geometry on paper: triangle inequalities, circles, pins of cranes."""
+"""Workspaces against triangle inequalities, circles and pins of cranes."""
 
 import csv
 
@@ -6,7 +6,7 @@ import numpy as np
 import oracles
 import pytest
 from conftest import DATA
-from test_patu655 import ELBOW, LIFT_PIN, STROKES, TIP, plane
+from test_patu655_geometry import ELBOW, LIFT_PIN, STROKES, TIP, plane
 from typer.testing import CliRunner
 
 import crane

@@ -1,4 +1,4 @@
-"""The home posture written into files: what stands there stays, and loading again searches not."""
+"""The home configuration written into files: other text stays, loading needs no search."""
 
 import os
 import re
@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 import yaml
-from broken import DATA, LOOPED, MACHINE, copy_machine, swap
-from typed import typed
+from broken_machines import DATA, LOOPED, MACHINE, copy_machine, swap
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, OutputError

@@ -1,4 +1,4 @@
-"""xacro files: expanded as xacro does, with packages found as this program finds them."""
+"""xacro files expand as with xacro itself, with packages found by this program's rules."""
 
 import shutil
 import warnings
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typed import typed
+from command_line import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError
@@ -91,7 +91,7 @@ def test_argument_that_the_file_does_not_have(arm):
 
 @pytest.mark.parametrize("how", ["given", "above", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"])
 def test_where_packages_are_found(arm, how, tmp_path, monkeypatch):
-    """Away from its packages, the file needs one of the ways to them."""
+    """Outside of its packages the file needs a package path."""
     away = tmp_path / "elsewhere" / "deep"
     away.mkdir(parents=True)
     path = Path(shutil.move(arm, away / "arm.xacro"))

@@ -1,0 +1,123 @@
+"""Linkages with dead centres and bifurcations as URDF texts.
+
+They lie in the plane of x and z and turn about y; rods are slender, of 1 kg per rod.
+"""
+
+import warnings
+
+import numpy as np
+
+import crane
+
+
+def _joint(name, parent, child, x=0.0, kind="continuous", axis="0 1 0"):
+    limit = (
+        '<limit lower="-50" upper="50" effort="1" velocity="1"/>' if kind == "prismatic" else ""
+    )
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{x} 0 0"/><axis xyz="{axis}"/>{limit}</joint>'
+    )
+
+
+def _rod(name, length):
+    inertia = length**2 / 12
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{length / 2} 0 0"/><mass value="1"/>'
+        f'<inertia ixx="1e-9" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial></link>"
+    )
+
+
+def _end(rod, length):
+    end = f"{rod}_end"
+    return f'<link name="{end}"/>' + _joint(f"{end}_joint", rod, end, length, "fixed")
+
+
+def _pin(name, one, two):
+    return (
+        f'<loop name="{name}" type="revolute"><predecessor link="{one}"/>'
+        f'<successor link="{two}"/><axis xyz="0 1 0"/></loop>'
+    )
+
+
+def _load(folder, parts, home, active):
+    states = "".join(f'<joint name="{joint}" value="{x}"/>' for joint, x in home.items())
+    path = folder / "linkage.urdf"
+    path.write_text(
+        f'<robot name="linkage"><link name="base"/>{"".join(parts)}'
+        f'<group_state name="home">{states}</group_state></robot>'
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", crane.common.errors.CraneWarning)
+        machine = crane.load(path, active=[next(iter(home))])
+        return machine.with_home_configuration(machine.home, (active,))
+
+
+def slider_crank(folder, active, crank=1.0, rod=1.0):
+    """Of equal lengths branches cross where the slider is at the crank's pin."""
+    home = {"a": -np.pi / 4}
+    lift = crank * np.sin(np.pi / 4)
+    home["b"] = np.pi / 4 + np.arcsin(lift / rod)
+    home["s"] = crank * np.cos(np.pi / 4) + np.sqrt(rod**2 - lift**2)
+    parts = [
+        _rod("crank", crank), _rod("rod", rod),
+        '<link name="slider"><inertial><mass value="1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" '
+        'ixy="0" ixz="0" iyz="0"/></inertial></link>',
+        _joint("a", "base", "crank"), _joint("b", "crank", "rod", crank), _end("rod", rod),
+        _joint("s", "base", "slider", kind="prismatic", axis="1 0 0"),
+        _pin("wrist", "rod_end", "slider"),
+    ]  # fmt: skip
+    return _load(folder, parts, home, active)
+
+
+def four_bar(folder, active, a=1.0, b=0.9, c=1.2, d=2.2):
+    """A double rocker of Grashof's second kind: every joint turns back."""
+    parts = [
+        _rod("one", a), _rod("two", b), _rod("three", c), _joint("a", "base", "one"),
+        _joint("b", "one", "two", a), _joint("c", "base", "three", d), _end("two", b),
+        _end("three", c), _pin("pin", "two_end", "three_end"),
+    ]  # fmt: skip
+    return _load(folder, parts, {"a": -1.0, "b": 0.7, "c": -2.2}, active)
+
+
+def windows(folder, active, count):
+    """N-four-bar of the IFToMM benchmarks: N parallelograms side by side, rods of 1 m.
+
+    Gonzalez, Dopico, Lugris, Cuadrado: A benchmarking system for MBS simulation software (2006).
+    All links are in line twice a turn.
+    """
+    parts, home = [], {}
+    for k in range(count + 1):
+        parts += [_rod(f"rod{k}", 1.0), _joint(f"r{k}", "base", f"rod{k}", float(k))]
+        home[f"r{k}"] = -np.pi / 2
+    for k in range(count):
+        parts += [_rod(f"bar{k}", 1.0), _joint(f"c{k}", f"rod{k}", f"bar{k}", 1.0)]
+        parts += [_end(f"bar{k}", 1.0), _end(f"rod{k + 1}", 1.0)]
+        parts += [_pin(f"l{k}", f"bar{k}_end", f"rod{k + 1}_end")]
+        home[f"c{k}"] = np.pi / 2
+    return _load(folder, parts, home, active)
+
+
+def start(machine, joint, speed):
+    """Home, with a joint's velocity."""
+    rows = machine.closure.gamma(machine.home)[machine.column(joint)]
+    return machine.home[machine.closure.active], np.array([speed]) / rows
+
+
+def postures(machine, run):
+    """(N, nq) of a recording."""
+    return np.column_stack(
+        [
+            run.q[:, run.joints.index(j)] if j in run.joints else run.channels[j]
+            for j in machine.joints
+        ]
+    )
+
+
+def imbalance(run):
+    """Of work, energies and dissipation, as a share of the kinetic energy that comes and goes."""
+    c = run.channels
+    return np.ptp(c["work"] - c["kinetic"] - c["potential"] - c["dissipated"]) / np.ptp(
+        c["kinetic"]
+    )

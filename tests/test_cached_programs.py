@@ -1,0 +1,352 @@
+"""Cached programs are found again by their keys, also after damage to the files."""
+
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+
+import cached_program
+import llvmlite.binding as llvm
+import numpy as np
+import pytest
+
+import crane
+from crane.closure.kinematics_formulas import PositionKinematics
+from crane.codegen import FormulaTooLongError, program, program_cache
+from crane.codegen.llvm import machine_code
+from crane.codegen.program_cache import cache_entry_name
+from crane.common import file_cache
+from crane.dynamics.dynamics_formulas import DynamicsFormulas
+
+PACKAGE = Path(crane.__file__).parent
+
+
+@contextmanager
+def another_processor():
+    """One whose code happens to run here too."""
+
+    class NoFeatures:
+        def flatten(self):
+            return ""
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(llvm, "get_host_cpu_name", lambda: "generic")
+        patch.setattr(llvm, "get_host_cpu_features", NoFeatures)
+        machine_code.compiler_settings.cache_clear()
+        yield
+    machine_code.compiler_settings.cache_clear()
+
+
+def ask(factor=3.0):
+    """Whether the program had to be built; its numbers are right either way."""
+    built = []
+    got = cached_program.value(cached_program.toy(factor, built))
+    assert got == pytest.approx(cached_program.wanted(factor), rel=1e-12)
+    return bool(built)
+
+
+def files(place, kind="*"):
+    return sorted(file for file in place.glob(f"*.{kind}") if not file.name.startswith("."))
+
+
+def child(place, *arguments, **more):
+    """The same in another process."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(place.parent.parent)}
+    environment |= {"PYTHONPATH": str(more.get("package", PACKAGE).parent)}
+    return subprocess.Popen(
+        [sys.executable, cached_program.__file__, *map(str, arguments)],
+        env=environment | more.get("env", {}),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def answer(process):
+    out, error = process.communicate(timeout=300)
+    assert process.returncode == 0 and not error, error
+    return out.strip()
+
+
+def test_a_later_program_is_found(place):
+    assert ask() and not ask()
+    assert ask(4.0) and not ask(4.0) and not ask()
+    assert len(files(place, "note")) == len(files(place, "code")) == 2
+
+
+def test_what_is_found_is_called_as_what_was_built(place):
+    one, two = cached_program.toy(), cached_program.toy()
+    assert two.formula_outputs("formula") == one.formula_outputs(
+        "formula"
+    ) and two.function_address("each")
+    assert two.max_formula_length == one.max_formula_length > cached_program.LONG
+    with pytest.raises(TypeError, match="'each' takes 3 arguments, not 2"):
+        two.call("each", 1, np.zeros(2))
+    with pytest.raises(KeyError):
+        two.call("nothing", 1)
+
+
+def test_other_processes_find_it(place):
+    """The key does not depend on the order of sets."""
+    assert answer(child(place, "late")) == "built"
+    for seed in "12":
+        assert answer(child(place, "late", env={"PYTHONHASHSEED": seed})) == "found"
+    assert not ask()
+
+
+def test_a_formula_that_is_too_long_is_known_to_be(place, monkeypatch):
+    monkeypatch.setattr(program, "MAX_OPERATIONS", 100)
+    built = []
+    for _ in range(2):
+        with pytest.raises(FormulaTooLongError):
+            cached_program.toy(built=built)
+    assert len(built) == 1
+    monkeypatch.setattr(program, "MAX_OPERATIONS", 10_000)
+    assert ask() and not ask()
+    monkeypatch.setattr(program, "MAX_OPERATIONS", 100)
+    with pytest.raises(FormulaTooLongError):
+        ask()
+
+
+def test_places_are_apart_where_programs_are(place):
+    @dataclass(frozen=True)
+    class Pair:
+        one: object
+        two: object
+
+    told = [
+        1, 1.0, True, "1", b"1", (1,), ((1,),), (1, 2), ((1, 2),), (1, (2,)), 0.0, -0.0, "",
+        np.array([1]), np.array([1.0]), np.array([[1.0]]), np.array([1, 0]), np.array([[1], [0]]),
+        np.int32(1), np.zeros(0), np.zeros((0, 1)), np.array([-0.0]), np.array([0.0]),
+        Pair(1, 2), Pair(2, 1), Pair(1, (2,)), ("a", "b"), ("a, b",), ("a'", "b"), ("a", "'b"),
+    ]  # fmt: skip
+    places = [cache_entry_name(("toy", x)) for x in told]
+    assert None not in places and len({*places}) == len(places)
+    assert places == [cache_entry_name(("toy", x)) for x in told]
+    assert cache_entry_name(None) is None
+
+
+@pytest.mark.parametrize(
+    "value", [object(), len, lambda: 0, [1], {1}, {1: 2}, Path(), int, np.array([object()])]
+)
+def test_what_says_nothing_lasting_is_refused(place, value):
+    with pytest.raises(TypeError, match="cannot be written as data"):
+        cache_entry_name(("toy", (1, value)))
+
+
+DAMAGES = {
+    "empty": lambda data: b"",
+    "half of the digest": lambda data: data[:16],
+    "digest alone": lambda data: data[:32],
+    "cut": lambda data: data[:-1],
+    "longer": lambda data: data + b"\0",
+    "zeros": lambda data: bytes(len(data)),
+    "bit of the digest": lambda data: flipped(data, 7),
+    "bit of the beginning": lambda data: flipped(data, 33),
+    "bit of the middle": lambda data: flipped(data, len(data) // 2),
+    "bit of the end": lambda data: flipped(data, len(data) - 1),
+}
+
+
+def flipped(data, at):
+    changed = bytearray(data)
+    changed[at] ^= 1
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("kind", ["note", "code"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_made_anew(place, kind, damage):
+    assert ask()
+    whole = {file: file.read_bytes() for file in files(place)}
+    (file,) = files(place, kind)
+    file.write_bytes(DAMAGES[damage](whole[file]))
+    assert ask() and not ask()
+    assert {file: file.read_bytes() for file in files(place)} == whole
+
+
+@pytest.mark.parametrize("kind", ["note", "code"])
+def test_missing_files_are_made_anew(place, kind):
+    assert ask()
+    (file,) = files(place, kind)
+    file.unlink()
+    assert ask() and not ask()
+
+
+def test_files_of_another_name_are_not_taken(place):
+    """A complete file of another program is rejected as well."""
+    assert ask()
+    one = {file.suffix: file for file in files(place)}
+    assert ask(4.0)
+    for file in files(place):
+        if file not in one.values():
+            shutil.copy(file, one[file.suffix])
+    assert ask() and not ask()
+    assert not ask(4.0)
+
+
+def test_another_processor_has_its_own_files(place):
+    assert ask()
+    own = {file: file.read_bytes() for file in files(place)}
+    with another_processor():
+        assert ask() and not ask()
+    others = {file.suffix: file.read_bytes() for file in files(place) if file not in own}
+    assert len(others) == 2 and not ask()
+    for file in own:  # under the names of ours
+        file.write_bytes(others[file.suffix])
+    assert ask() and not ask()
+    assert {file: file.read_bytes() for file in own} == own
+
+
+def test_what_the_user_may_not_write_is_not_kept(place):
+    place.parent.mkdir(parents=True)
+    place.write_text("a file")
+    assert ask() and ask()
+    assert place.read_text() == "a file"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_folder_that_others_may_write_is_not_read(place):
+    assert ask()
+    place.chmod(0o777)
+    assert ask()
+    place.chmod(0o700)
+    assert not ask()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="nobody is root here")
+def test_a_folder_that_may_only_be_read_serves(place):
+    """Programs work also if the folder is full or cannot be written."""
+    assert ask()
+    place.chmod(0o500)
+
+    def refused(*_, **__):
+        raise PermissionError(13, "not allowed")
+
+    with pytest.MonkeyPatch.context() as patch:  # root may all the same
+        patch.setattr(os, "utime", refused)
+        patch.setattr(os, "replace", refused)
+        assert not ask() and ask(4.0) and ask(4.0)
+    place.chmod(0o700)
+    assert len(files(place)) == 2 and not list(place.glob(".*"))
+
+
+def test_the_folder_is_bounded(place, monkeypatch):
+    ask()
+    one = sum(file.stat().st_size for file in place.iterdir())
+    killed = place / ".left.1.part"
+    killed.write_bytes(bytes(one))
+    (place / "folder").mkdir()
+    monkeypatch.setattr(file_cache, "MAX_CACHE_SIZE", 4 * one)
+    monkeypatch.setattr(file_cache, "_remaining_bytes", {})  # a process that has not looked yet
+    for factor in range(4, 12):
+        for file in place.iterdir():  # a while later
+            os.utime(file, (file.stat().st_mtime - 10,) * 2)
+        assert ask(float(factor)) and not ask(float(factor))
+        assert not ask()  # used each time
+        assert sum(file.stat().st_size for file in place.iterdir() if file.is_file()) <= 4 * one
+    assert not killed.exists() and ask(4.0)
+
+
+def test_processes_that_compile_at_once(place):
+    """Each process has a correct program, and the files are complete."""
+    at_once = [child(place, "late") for _ in range(4)]
+    assert set(map(answer, at_once)) <= {"built", "found"}
+    assert len(files(place)) == 2 and len(list(place.iterdir())) == 2
+    assert answer(child(place, "late")) == "found"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_killed_process_leaves_nothing_that_harms(place, count):
+    process = child(place, "late", "die", count)
+    process.communicate(timeout=300)
+    assert process.returncode < 0
+    assert len(files(place)) == count - 1 and len(list(place.glob(".*"))) == 1
+    assert answer(child(place, "late")) == "built"
+    assert answer(child(place, "late")) == "found"
+
+
+def test_a_changed_package_finds_nothing(place, tmp_path):
+    """Every change counts, also one that keeps the length and time of a file."""
+    copy = tmp_path / "again" / "crane"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "models"))
+
+    def run(*arguments):
+        return answer(child(place, *arguments, package=copy, env={"PYTHONDONTWRITEBYTECODE": "1"}))
+
+    assert run() == "built"  # just changed: who knows what was loaded
+    assert not files(place, "note")
+    assert run("late") == "built" and run("late") == "found"
+    file = copy / "dynamics" / "dynamics_formulas.py"
+    text, times = file.read_text(), file.stat()
+    changed = text.replace("Dynamics", "dynamics", 1)
+    assert len(changed) == len(text) and changed != text
+    file.write_text(changed)
+    os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert run("late") == "built" and run("late") == "found"
+    file.write_text(text)
+    assert run("late") == "found"
+    (copy / "codegen" / "new.py").write_text("")
+    assert run("late") == "built"
+
+
+def test_a_package_that_changes_meanwhile_keeps_nothing(place, monkeypatch):
+    class Changing(list):
+        """As if all files became newer than what was loaded while a program is built."""
+
+        def append(self, _):
+            monkeypatch.setattr(crane, "LOADED", 0.0)
+
+    cached_program.toy(built=Changing())
+    assert not files(place, "note")
+
+
+def test_a_package_that_changed_before_it_was_read_finds_nothing(place, monkeypatch):
+    """Programs are not taken from the cache if the files are newer than the loaded package."""
+    assert ask() and not ask()
+    monkeypatch.setattr(crane, "LOADED", 0.0)
+    program_cache._files_digest.cache_clear()
+    assert ask() and ask()
+
+
+def another(*_):
+    return 0.0
+
+
+@pytest.mark.parametrize(
+    "owner, name, value",
+    [
+        (crane.dynamics.joint_force_formulas, "evaluate_force_law", another),
+        (DynamicsFormulas, "mass_matrix", property(another)),
+        (PositionKinematics, "loop_frame", staticmethod(another)),
+        (DynamicsFormulas, "kinetic", cached_property(another)),
+        (machine_code, "_target_machine", lambda: None),
+        (crane.closure.compiled_closure, "LoopFormulas", type("LoopFormulas", (), {})),
+        (crane.dynamics.compiled_dynamics, "QUANTITIES", {"inverse": another}),
+    ],
+)
+def test_a_patched_package_finds_nothing(place, owner, name, value):
+    assert ask() and not ask()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, value)
+        assert program_cache.package_digest() is None
+    assert not ask()
+
+
+def test_nor_does_one_with_another_entry_or_module(place, monkeypatch):
+    assert ask() and not ask()
+    table = crane.dynamics.compiled_dynamics.QUANTITIES
+    with monkeypatch.context() as patch:
+        patch.setitem(table, next(iter(table)), another)
+        assert program_cache.package_digest() is None
+    other = ModuleType("crane.dynamics.compiled_dynamics")
+    other.effects = another
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, other.__name__, other)
+        assert program_cache.package_digest() is None
+    assert program_cache.package_digest()

@@ -1,0 +1,199 @@
+"""Numbers in options, in output, and in lines of tables."""
+
+import numpy as np
+import pytest
+
+import crane
+from crane.cli.parsing import parse_values
+from crane.common.errors import (
+    CraneError,
+    InputError,
+    RecordingError,
+    format_one_line,
+    prefix_location,
+)
+from crane.common.one_line_repr import OneLineRepr
+from crane.common.samples import (
+    MAX_COORDINATE,
+    MAX_QUANTITY,
+    MIN_QUANTITY,
+    as_count,
+    as_number,
+    as_seed,
+)
+from crane.common.units import display_unit, format_number, format_quantity
+from crane.recordings.recording_summary import recorded_machine_name, result_title
+from crane.studies.variant_study import StudyJob, measure_variant
+
+
+@pytest.mark.parametrize(
+    ("value", "above", "told"),
+    [
+        (np.nan, -np.inf, "the size is nan m, give a number"),
+        (np.inf, -np.inf, "the size is inf m, give a number"),
+        ("2", -np.inf, "the size is not made of real numbers, give a number"),
+        ([1.0], -np.inf, "the size is [1.0] m, give a number"),
+        (0.0, 0, "the size is 0.0 m, give a number above 0"),
+        (1e308, -np.inf, "the size is 1e+308 m, give a number from -1e+30 to 1e+30"),
+        (-1e300, -np.inf, "the size is -1e+300 m, give a number from -1e+30 to 1e+30"),
+        (1e31, 0, "the size is 1e+31 m, give a number from 1e-30 to 1e+30"),
+        (1e-320, 0, "the size is 1e-320 m, give a number from 1e-30 to 1e+30"),
+        (1e31, 3.0, "the size is 1e+31 m, give a number from 3 to 1e+30"),
+    ],
+)
+def test_numbers_that_no_machine_has(value, above, told):
+    with pytest.raises(InputError) as caught:
+        as_number(value, "the size", "m", above)
+    assert str(caught.value) == told
+
+
+def test_numbers_within_bounds_are_kept():
+    for value in (0.0, -MAX_QUANTITY, MAX_QUANTITY, MIN_QUANTITY, 1e-300):
+        assert as_number(value, "x", "") == value
+    assert as_number(MIN_QUANTITY, "x", "", greater_than=0) == MIN_QUANTITY
+    assert np.isfinite(MAX_QUANTITY**2) and MIN_QUANTITY**2 > 0
+    assert as_count(np.int64(3), "n") == 3 and as_seed(0) == 0
+
+
+@pytest.mark.parametrize("value", [0, -1, 2**63, 1.0, np.nan, "3"])
+def test_counts(value):
+    with pytest.raises(InputError, match=f"the count is {value}, give a whole number from 1 to 9"):
+        as_count(value, "the count", 1, 9)
+
+
+def test_joints_by_name():
+    assert parse_values("--lock", ["a=1", "b=-2e3", "a=b=0"]) == {"a": 1, "b": -2e3, "a=b": 0}
+    for words, told in (
+        (["a"], "--lock is 'a', write JOINT=VALUE"),
+        (["=1"], "--lock is '=1', write"),
+        (["a=1", "a=2"], "--lock names 'a' twice, give it once"),
+        (["a=1e309"], "--lock a is inf, give a number"),
+        (["a=nan"], "--lock a is nan, give a number"),
+        (["a=1e308"], "--lock a is 1e.308, give a number from"),
+    ):
+        with pytest.raises(InputError, match=told):
+            parse_values("--lock", words)
+
+
+@pytest.mark.parametrize("joint", ["s", "theta", "phi"])
+@pytest.mark.parametrize("value", [1e308, -1e308, 2 * MAX_COORDINATE])
+def test_locks_far_from_anything(slider_crank, joint, value):
+    with pytest.raises(InputError, match=rf"lock '{joint}' at is .* m or rad, give a number from"):
+        crane.load(slider_crank.path, lock={joint: value})
+
+
+def test_work_beyond_all_bounds_is_refused_before_it_begins(slider_crank):
+    for call, told in (
+        (lambda: crane.study(slider_crank.path, {"crank.mass": [1.0]}, processes=2**31),
+         "the number of processes is 2147483648, give a whole number from 1 to"),
+        (lambda: crane.study(slider_crank.path, {"crank.mass": [1, 2]}, draws=2**31),
+         "the number of variants is 2147483648, give a whole number from 1 to 100000"),
+        (lambda: crane.workspace(slider_crank, 2**31), "from 100 to 1000000"),
+        (lambda: crane.workspace(slider_crank, 100, seed=-1), "the seed is -1, give a whole"),
+        (lambda: crane.simulate(slider_crank, duration=1e308), "duration is 1e.308 s, give"),
+        (lambda: crane.simulate(slider_crank, duration=1.0, step=1e-300), "step is 1e-300 s"),
+        (lambda: crane.simulate(slider_crank, duration=1.0, step=1e-9), "steps of 1e-09 s, at"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=told):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (13360.4, "kg", "13.36 t"),
+        (1336.4, "kg", "1336 kg"),
+        (1.2871, "kg", "1.287 kg"),
+        (28034.0, "N", "28.03 kN"),
+        (-999.4, "N", "-999.4 N"),
+        (50.0, "N", "50 N"),
+        (3.5e7, "Pa", "350 bar"),
+        (2.0e-3, "m3/s", "120 l/min"),
+        (123456.7, "N m", "123.5 kN m"),
+        (1234567.0, "V", "1234567 V"),
+        (3.2e-5, "V", "0.000032 V"),
+        (-1e-18, "N", "0 N"),
+    ],
+)
+def test_quantities_are_read_without_exponents(value, unit, text):
+    assert format_quantity(value, unit, 4) == text
+
+
+def test_units_are_chosen_by_the_peak():
+    assert display_unit("N", -2e3) == ("kN", 1e-3) and display_unit("N", 900.0) == ("N", 1.0)
+    assert display_unit("m", 0.3) == ("mm", 1e3) and display_unit("V", 5.0) == ("V", 1.0)
+    assert (
+        format_number(2.0) == "2" and format_number(0.0) == "0" and format_number(100.0) == "100"
+    )
+
+
+def test_lines_can_be_read():
+    assert format_one_line("a\nb\x1b[31m\udcff") == "a b [31m "
+    assert len(format_one_line("x" * 100_000)) < 1000
+    assert len(str(CraneError("x y " * 100_000))) < 4000
+    assert format_one_line("short and " + "y" * 900) == "short and " + "y" * 900
+
+
+def test_a_place_is_told_once():
+    assert (
+        prefix_location("run.csv", RecordingError("line 3: no number"))
+        == "run.csv: line 3: no number"
+    )
+    assert prefix_location("run.csv", RecordingError("run.csv: is empty")) == "run.csv: is empty"
+
+
+def test_a_task_that_fails_in_a_study_is_named_once():
+    """The row gives the reason once."""
+    found, reason = measure_variant(
+        StudyJob("patu655", {"X_lift.upper": 0.2}, {}, ("reach",), False)
+    )
+    assert not found and reason.count("task 'reach'") == 1 and "X_lift" in reason
+
+
+def test_titles():
+    run = crane.Recording([0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"})
+    assert (
+        result_title("patu655", "swing") == "patu655: swing"
+        and result_title("patu655") == "patu655"
+    )
+    assert recorded_machine_name(run) == ""
+    for machine, name in (
+        ("patu655", "patu655"),
+        ('patu655 with {"changes": {"payload.mass": 200.5}, "lock": {"slew": 0.0}}', "patu655"),
+        ("/data/machines/log_crane.yaml", "log_crane"),
+    ):
+        named = crane.Recording(
+            [0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"}, machine=machine
+        )
+        assert recorded_machine_name(named) == name
+
+
+def test_what_a_notebook_shows_is_short(mini):
+    run = crane.simulate(mini, duration=0.01)
+    study = crane.study("mini_forwarder", {"link7.mass": [0.1, 0.2]}, ["lift"], ["peak_X1"])
+    space = crane.workspace(mini, 100)
+    for thing, words in (
+        (mini, "Machine('mini_forwarder', 3 degrees of freedom, 11 joints, 4 loops)"),
+        (mini.closure, "Closure of A1_eye, A2_eye, J, K: 8 passive joints from q1, X1, X2"),
+        (crane.Dynamics(mini), "Dynamics of 'mini_forwarder', compiled"),
+        (crane.Kinematics(mini), "Kinematics of 'link7_tip' of 'mini_forwarder'"),
+        (run, "Recording of mini_forwarder, 0.01 s in 11 samples: 21 channels beside q1 [rad], "),
+        (study, "Study of mini_forwarder: 2 variants of link7.mass, 0 not measured; peak_X1"),
+        (space, "Workspace of 'link7_tip' of 'mini_forwarder': "),
+        (space.patches[0], "WorkspacePatch(, base=(3,), axes: 2, "),
+    ):
+        assert repr(thing).startswith(words)
+        assert len(repr(thing)) <= 200 and "\n" not in repr(thing)
+
+
+def test_brief_names_shapes():
+    class Thing(OneLineRepr):
+        def __init__(self):
+            self.name, self.values, self.parts, self.other = (
+                "a",
+                np.zeros((3, 2)),
+                (1, 2),
+                object(),
+            )
+
+    assert repr(Thing()) == "Thing(name='a', values=(3, 2), parts: 2)"
