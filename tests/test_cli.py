@@ -13,7 +13,7 @@ import pytest
 import typer
 from broken_machines import DATA, MINI, copy_machine
 from command_line import MAIN, typed
-from written import walked
+from writing_commands import walked
 
 import crane
 from crane.cli import entry

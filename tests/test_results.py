@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from written import read
+from writing_commands import read
 
 import crane
 from crane.common.errors import OutputError

@@ -329,9 +329,9 @@ def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":
     import numpy as np
 
     from crane.description.external_forces import WRENCH_COMPONENTS
-    from crane.recordings import timeseries
+    from crane.recordings.table_reader import read_table
 
-    table = timeseries.read_table(path)
+    table = read_table(path)
     names = list(table.units)
     if "time" not in names:
         raise InputError(f"{path}: has no column 'time', add it")

@@ -202,11 +202,9 @@ class Transmission(OneLineRepr):
                 )
             f_a[self._actuator_indices[joint]] = as_number(value, f"effort of {joint}", "")
         joint_indices = [self._joint_index(joint) for joint in joints]
-        units, active_units = (
-            self.machine.closure.units,
-            self.machine.closure.active[self._actuator_columns],
-        )
-        joint_units, active_units = units[self._joint_columns[joint_indices]], units[active_units]
+        units = self.machine.closure.units
+        joint_units = units[self._joint_columns[joint_indices]]
+        active_units = units[self.machine.closure.active[self._actuator_columns]]
         scaled_gamma = gamma[joint_indices] / joint_units[:, None] * active_units
         singular_values = np.linalg.svd(scaled_gamma, compute_uv=False)
         if (
