@@ -200,8 +200,8 @@ def test_tubes_and_counts_are_written_and_read(tmp_path):
     }  # fmt: skip
     assert one == two
     text = file.read_text()
-    start = text.index("slew", text.index("cylinders:"))
-    turning = text[:start] + text[start:].replace("tube: 0.0", "tube: 0.3", 1)
+    start = text.index("slew: {", text.index("cylinders:")) + len("slew: {")
+    turning = f"{text[:start]}tube: 0.3, {text[start:]}"
     assert turning != text
     file.write_text(turning)
     with pytest.raises(CraneError, match="cylinder of 'slew' turns its joint"):

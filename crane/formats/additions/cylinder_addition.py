@@ -26,21 +26,21 @@ from crane.machine import Machine
 
 def replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str | None) -> None:
     """Make a cylinder a drive in place of a joint, and remove sections of that joint."""
-    active, free = draft.data["active"], draft.data["free"]
+    active = draft.data["active"]
     if joint in active:
         active[active.index(joint)] = name
     else:
         active.append(name)
-    draft.data["free"] = [other for other in free if other != joint]
+    draft.data["free"] = [other for other in draft.data.get("free") or () if other != joint]
     removed = []
-    if draft.data["control"]:
-        draft.data["control"] = {}
+    if draft.data.pop("control", None):
         removed.append("gains")
-    tasks = {key: task for key, task in draft.data["tasks"].items() if "tip" in task}
-    if len(tasks) < len(draft.data["tasks"]):
+    all_tasks = draft.data.get("tasks") or {}
+    tasks = {key: task for key, task in all_tasks.items() if "tip" in task}
+    if len(tasks) < len(all_tasks):
         draft.data["tasks"] = tasks
         removed.append("tasks of active joints")
-    cylinders = draft.data.get("hydraulics", {}).get("cylinders", {})
+    cylinders = (draft.data.get("hydraulics") or {}).get("cylinders", {})
     if joint in cylinders:
         for section in draft.data["hydraulics"].values():
             section.pop(joint, None)
