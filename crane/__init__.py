@@ -53,7 +53,7 @@ if TYPE_CHECKING:
         write_urdf_plus,
     )
     from crane.formats.additions import add_cylinder, add_loops
-    from crane.formats.check import check
+    from crane.formats.checks import check
     from crane.hydraulics import PDGains
     from crane.identification.calibration.calibrate import calibrate
     from crane.identification.calibration.calibration_result import Calibration
@@ -99,7 +99,7 @@ if TYPE_CHECKING:
         working_range,
     )
     from crane.recordings import Recording
-    from crane.recordings.limit_cycles import limit_cycles
+    from crane.recordings.limit_cycle_detection import limit_cycles
     from crane.recordings.measured_recordings import read_measured
     from crane.simulation import InterruptedRun, simulate
     from crane.simulation.batch import Batch, simulate_batch
@@ -116,10 +116,10 @@ if TYPE_CHECKING:
         study,
         sway_study,
     )
-    from crane.studies.design import Design, design
+    from crane.studies.optimization import Design, design
     from crane.view.page import report
     from crane.view.page.identification_page import identification_report
-    from crane.view.sketch import sketch, sketch_circuit
+    from crane.view.sketches import sketch, sketch_circuit
 
 __version__ = "0.2.0"
 LOADED = time.time()  # before any other file of the package was read
@@ -143,7 +143,7 @@ _HOMES = {
     "crane.dynamics.reactions": "Reactions",
     "crane.formats": "load robot_description write_machine write_mjcf write_urdf_plus",
     "crane.formats.additions": "add_cylinder add_loops",
-    "crane.formats.check": "check",
+    "crane.formats.checks": "check",
     "crane.hydraulics": "PDGains",
     "crane.identification.calibration.calibrate": "calibrate",
     "crane.identification.calibration.calibration_result": "Calibration",
@@ -165,7 +165,7 @@ _HOMES = {
     "crane.ratings": "Breakout Capacity Rule ToolForce Torques WorkingRange breakout capacity "
     "tool_force torques working_range",
     "crane.recordings": "Recording",
-    "crane.recordings.limit_cycles": "limit_cycles",
+    "crane.recordings.limit_cycle_detection": "limit_cycles",
     "crane.recordings.measured_recordings": "read_measured",
     "crane.simulation": "InterruptedRun simulate",
     "crane.simulation.batch": "Batch simulate_batch",
@@ -174,10 +174,10 @@ _HOMES = {
     "crane.simulation.sensitivity": "Gradient Sensitivities gradient sensitivities",
     "crane.simulation.casadi_functions": "casadi_function",
     "crane.studies": "PowerBalance PowerComparison Study SwayStudy power_balance study sway_study",
-    "crane.studies.design": "Design design",
+    "crane.studies.optimization": "Design design",
     "crane.view.page": "report",
     "crane.view.page.identification_page": "identification_report",
-    "crane.view.sketch": "sketch sketch_circuit",
+    "crane.view.sketches": "sketch sketch_circuit",
 }
 
 __all__ = [

@@ -15,7 +15,7 @@ from test_open_loops import five_bar
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.check import check
+from crane.formats.checks import check
 
 MODELS = Path(__file__).parents[1] / "models"
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"

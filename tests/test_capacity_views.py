@@ -21,7 +21,7 @@ from crane.ratings.capacity_report import load_table, slew_labels
 from crane.view.page.capacity_page import capacity_page_data, write_capacity_page
 from crane.view.plots.capacity_figure import _draw_contours, capacity_figure, load_contours
 from crane.view.plots.capacity_sheet import capacity_sheet_figure
-from crane.view.sketch.mechanism_projection import machine_outline
+from crane.view.sketches.mechanism_projection import machine_outline
 
 G = np.array([0.0, 0.0, -9.81])
 TANK = 3.0e5

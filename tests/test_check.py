@@ -23,7 +23,7 @@ from executed_lines import TooMuchWorkError, at_most
 import crane
 from crane.description import bundled_machines, example_robots
 from crane.formats import write_machine
-from crane.formats.check import CheckReport, check
+from crane.formats.checks import CheckReport, check
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"

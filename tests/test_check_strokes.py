@@ -11,7 +11,7 @@ from crane.common.errors import SimulationError
 from crane.control.levers import LeverPhases
 from crane.description import bundled_machines
 from crane.description.task_phases import Phase
-from crane.formats.check import check
+from crane.formats.checks import check
 
 VIA = (
     "tasks:\n  out:\n    via:\n      - {{time: 0, lift_stroke: 0.4}}\n"

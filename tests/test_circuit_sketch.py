@@ -13,8 +13,8 @@ from test_sketch import overlaps
 import crane
 from crane.common.errors import InputError
 from crane.hydraulics.circuit_elements import TANK_NODE
-from crane.view.sketch.circuit import circuit_figure
-from crane.view.sketch.circuit.valve_symbols import (
+from crane.view.sketches.circuit import circuit_figure
+from crane.view.sketches.circuit.valve_symbols import (
     format_displacement,
     format_flow,
     format_number,

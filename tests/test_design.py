@@ -6,13 +6,13 @@ from command_line import typed
 
 import crane
 from crane.formats.machine_loading import MachineVariants
-from crane.studies.design.measure_expressions import (
+from crane.studies.optimization.measure_expressions import (
     DUAL_FUNCTIONS,
     DualNumber,
     MeasureExpression,
     parse_requirement,
 )
-from crane.studies.design.variant_measures import MeasureOptions, VariantEvaluation
+from crane.studies.optimization.variant_measures import MeasureOptions, VariantEvaluation
 
 pytestmark = pytest.mark.slow
 

@@ -16,8 +16,8 @@ from crane.view.plots.figure_text import escape_label
 from crane.view.plots.identification_figures import correlation_figure
 from crane.view.plots.recording_figure import joint_symbol, write_figure
 from crane.view.result_files import plot_result
-from crane.view.sketch.sketch_canvas import format_joint_symbol
-from crane.view.sketch.sketch_figure import sketch
+from crane.view.sketches.sketch_canvas import format_joint_symbol
+from crane.view.sketches.sketch_figure import sketch
 
 NAMES = [r"$\bad$", "$", "$$", "a$b$c", r"a\$b", r"\$\bad\$", r"$x^{", r"\frac{", "x^y_z", "50 %"]
 

@@ -10,7 +10,7 @@ import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.plausible_ranges import PLAUSIBLE_RANGES, ROTARY_RANGES, implausible_value_text
 from crane.control import ValveSignals
-from crane.formats.check import check
+from crane.formats.checks import check
 from crane.hydraulics import Supply
 
 

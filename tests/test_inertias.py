@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import crane
 from crane.common.errors import CraneWarning, DescriptionError
 from crane.description.inertia_feasibility import inertia_problem, nearest_inertia
-from crane.formats.check import check
+from crane.formats.checks import check
 
 GRBDA = Path(__file__).parents[2] / "shared" / "data" / "third_party" / "grbda"
 FILES = sorted(GRBDA.glob("*.urdf"))

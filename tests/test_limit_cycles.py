@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import crane
 from crane.hydraulics.circuit_elements import Supply
 from crane.hydraulics.pump_equations import least_sensing_ratio, unstable_frequency_range
-from crane.recordings.limit_cycles import limit_cycle_message, limit_cycles, sustained_oscillation
+from crane.recordings.limit_cycle_detection import limit_cycle_message, limit_cycles, sustained_oscillation
 from crane.recordings.recording_summary import summarize
 
 TIME = np.arange(0.0, 10.0, 2e-3)

@@ -13,7 +13,7 @@ from linkages import WRITERS, assert_same, postures, rewritten
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.formats.check import check
+from crane.formats.checks import check
 from crane.formats.mjcf.unsupported_features import colliding_geoms
 
 TREE = """<mujoco model="tree">

@@ -180,7 +180,7 @@ def test_what_a_notebook_shows_is_short(mini):
         (run, "Recording of mini_forwarder, 0.01 s in 11 samples: 21 channels beside q1 [rad], "),
         (study, "Study of mini_forwarder: 2 variants of link7.mass, 0 not measured; peak_X1"),
         (space, "Workspace of 'link7_tip' of 'mini_forwarder': "),
-        (space.patches[0], "WorkspacePatch(, base=(3,), axes: 2, "),
+        (space.patches[0], "WorkspacePatch(stroke_pair: 2, held_coordinates=(3,), axes: 2, "),
     ):
         assert repr(thing).startswith(words)
         assert len(repr(thing)) <= 200 and "\n" not in repr(thing)

@@ -10,7 +10,7 @@ import yaml
 
 import crane
 from crane.common.errors import CraneWarning
-from crane.formats.check import check
+from crane.formats.checks import check
 
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
 

@@ -14,9 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
 from crane.description import bundled_machines
-from crane.view.sketch.sketch_canvas import format_joint_symbol
-from crane.view.sketch.sketch_elements import find_plane
-from crane.view.sketch.sketch_figure import sketch_figure
+from crane.view.sketches.sketch_canvas import format_joint_symbol
+from crane.view.sketches.sketch_elements import find_plane
+from crane.view.sketches.sketch_figure import sketch_figure
 
 PLANAR = ["four_bar.yaml", "slider_crank.yaml", "five_bar.urdf"]
 
@@ -150,7 +150,7 @@ def test_axes_are_equal_and_named_in_metres(at_home):
 
 def test_cylinders_reach_from_pin_to_pin(mini):
     """Barrels begin at their pins, rods end at theirs, whatever the strokes."""
-    from crane.view.sketch.mechanism_projection import project_mechanism
+    from crane.view.sketches.mechanism_projection import project_mechanism
 
     for q_a in random_postures(mini, 10):
         q = mini.closure.solve(q_a)

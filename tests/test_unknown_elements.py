@@ -9,7 +9,7 @@ import crane
 import crane.view.page.machine_visuals
 from crane.common.errors import CraneWarning
 from crane.formats import write_urdf_plus
-from crane.formats.check import check
+from crane.formats.checks import check
 from crane.formats.visuals.mesh_files import find_mesh_file
 
 COUPLER = '    <parent link="crank_arm"/>\n'

@@ -8,7 +8,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.package_search import use_load_options
-from crane.formats.check import check
+from crane.formats.checks import check
 from crane.formats.urdf.urdf_reader import read_urdf
 
 TEXT = (DATA / LOOPED).read_text()

@@ -14,7 +14,7 @@ import wheel_loader
 import crane
 from crane.common.errors import CraneWarning
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.formats.check import check
+from crane.formats.checks import check
 from crane.formats.visuals import mesh_files, mesh_process
 from crane.formats.visuals.urdf_shapes import (
     DEFAULT_COLOUR,

@@ -14,7 +14,7 @@ from command_line import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.description import bundled_machines
-from crane.formats.check import check
+from crane.formats.checks import check
 
 WRONG = (0.7, 0.9, 0.99, 1.01, 1.1, 1.3)
 LINKAGES = misfit_linkages.LINKAGES

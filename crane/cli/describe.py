@@ -128,7 +128,7 @@ def check(
     The exit status is 0 without findings, 1 with warnings only, 2 with errors.
     """
     from crane.formats import write_home as write
-    from crane.formats.check import check as check_machine
+    from crane.formats.checks import check as check_machine
 
     values = assembly.assembly()
     driven = values["active"], values["free"]

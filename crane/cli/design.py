@@ -93,7 +93,7 @@ def design(
     seed: Seed = 0,
 ) -> None:
     """Optimize parameters for objectives and constraints."""
-    from crane.studies.design import design as compute
+    from crane.studies.optimization import design as compute
 
     loaded = options.load(machine)
     with progress_bar("searching") as progress:

@@ -123,8 +123,8 @@ def sketch(
     """
     from crane.common.atomic_output import portable_file_name
     from crane.formats.assembly_warnings import alternative_configurations
-    from crane.view.sketch.circuit import sketch_circuit
-    from crane.view.sketch.sketch_figure import sketch as draw
+    from crane.view.sketches.circuit import sketch_circuit
+    from crane.view.sketches.sketch_figure import sketch as draw
 
     if circuit:
         text = "is for the mechanism, leave it out with --circuit"

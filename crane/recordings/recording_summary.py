@@ -10,7 +10,7 @@ from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks, release_pages
 from crane.common.units import display_unit, format_number, format_quantity
 from crane.description.machine_lookup import without_changes
-from crane.recordings.limit_cycles import limit_cycle_message
+from crane.recordings.limit_cycle_detection import limit_cycle_message
 from crane.recordings.recording import FORCE_UNITS, REFERENCE_PREFIX, Recording
 
 SUPPORT_PREFIX = "support_"

@@ -25,14 +25,14 @@ from crane.formats import load
 from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 from crane.ratings.rating_rules import Rule, find_rule
-from crane.studies.design.measure_expressions import (
+from crane.studies.optimization.measure_expressions import (
     MeasureExpression,
     MeasureFunction,
     load_user_measures,
     parse_requirement,
     transferable_measures,
 )
-from crane.studies.design.variant_measures import (
+from crane.studies.optimization.variant_measures import (
     PLAIN_MEASURES,
     MeasureOptions,
     VariantEvaluation,
@@ -69,7 +69,7 @@ class StudyJob(NamedTuple):
         locked_joints: Joints that are held.
         tasks: Tasks that are measured.
         with_strokes: Whether the strokes are measured.
-        expressions: Expressions of measures, see `crane.studies.design`.
+        expressions: Expressions of measures, see `crane.studies.optimization`.
         requirements: Requirements.
         user_measures: Python file of user measures, or functions by name.
         frame: Link at which loads hang.

@@ -23,7 +23,7 @@ from crane.view.page.report_page import report_html
 from crane.view.plots.image_tags import image_tag, svg_tag
 from crane.view.plots.recording_figure import FIGURE_STYLE
 from crane.view.result_files import figure_function, notebook_figures, result_files
-from crane.view.sketch.sketch_figure import sketch_figure
+from crane.view.sketches.sketch_figure import sketch_figure
 
 _FRAME_SHARE = (
     0.06  # of the frames and spans of a page: a notebook keeps all its outputs in one file

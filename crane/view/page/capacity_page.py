@@ -22,7 +22,7 @@ from crane.view.plots.capacity_figure import (
     home_outlines,
     load_contours,
 )
-from crane.view.sketch.mechanism_projection import MachineOutline, machine_outline
+from crane.view.sketches.mechanism_projection import MachineOutline, machine_outline
 
 _MAX_CELLS = 1500  # per slew angle, at most
 _OUTLINE_RESOLUTION = 4000.0  # of the extent, to which outlines are rounded

@@ -21,7 +21,7 @@ from crane.ratings.capacity_report import slew_labels
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
-from crane.view.sketch.mechanism_projection import MachineOutline, machine_outline
+from crane.view.sketches.mechanism_projection import MachineOutline, machine_outline
 
 FACTOR_COLOURS = (
     "#a9c8ea", "#f6c08c", "#a6d9b0", "#d5b8e4", "#f0aaa6", "#a5d8df", "#e5d98f", "#c3c7cd",

@@ -13,13 +13,13 @@ from crane.common.samples import Array
 from crane.formats import load
 from crane.formats.machine_loading import MachineVariants
 from crane.ratings.rating_rules import Rule
-from crane.studies.design.design_result import DesignSolution
-from crane.studies.design.measure_expressions import (
+from crane.studies.optimization.design_result import DesignSolution
+from crane.studies.optimization.measure_expressions import (
     DualNumber,
     MeasureExpression,
     load_user_measures,
 )
-from crane.studies.design.variant_measures import (
+from crane.studies.optimization.variant_measures import (
     MeasureOptions,
     VariantEvaluation,
     load_positions,

@@ -2,7 +2,7 @@
 
 import math
 
-from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
+from crane.view.sketches.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
 
 PUMP_RADIUS, ENGINE_RADIUS, MOTOR_RADIUS = 12.0, 12.0, 10.0  # radii
 BARREL_HALF_HEIGHT = 8.0  # half of a cylinder's height

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
+from crane.view.sketches.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
 
 
 def format_number(value: float) -> str:

@@ -5,15 +5,15 @@ from collections.abc import Mapping
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.components import CounterbalanceValve
 from crane.view.plots.figure_text import escape_label
-from crane.view.sketch.circuit import machine_symbols, valve_symbols
-from crane.view.sketch.circuit.circuit_canvas import (
+from crane.view.sketches.circuit import machine_symbols, valve_symbols
+from crane.view.sketches.circuit.circuit_canvas import (
     NAME_TEXT_SIZE,
     CircuitCanvas,
     SheetPoint,
     SymbolPose,
 )
-from crane.view.sketch.circuit.circuit_functions import CircuitFunction, port_lane, valve_rows
-from crane.view.sketch.circuit.valve_symbols import (
+from crane.view.sketches.circuit.circuit_functions import CircuitFunction, port_lane, valve_rows
+from crane.view.sketches.circuit.valve_symbols import (
     SPOOL_HEIGHT,
     SpoolSymbol,
     format_area,
@@ -22,7 +22,7 @@ from crane.view.sketch.circuit.valve_symbols import (
     format_number,
     format_pressure,
 )
-from crane.view.sketch.sketch_canvas import format_joint_symbol
+from crane.view.sketches.sketch_canvas import format_joint_symbol
 
 SECTION_WIDTH = 122.0
 CHAMBER_LANE = 14.0  # of chambers, from the section's middle

@@ -10,8 +10,8 @@ import pinocchio as pin
 from crane.common.samples import Array
 from crane.machine import Machine
 from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
-from crane.view.sketch.sketch_canvas import convex_hull
-from crane.view.sketch.sketch_elements import (
+from crane.view.sketches.sketch_canvas import convex_hull
+from crane.view.sketches.sketch_elements import (
     DrawingPlane,
     SketchBody,
     SketchCollar,

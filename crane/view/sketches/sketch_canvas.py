@@ -18,7 +18,7 @@ from crane.machine import Machine
 from crane.recordings.recording_summary import DISPLAY_UNITS
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import INK_COLOUR
-from crane.view.sketch.sketch_elements import DrawingPlane, SketchMechanism
+from crane.view.sketches.sketch_elements import DrawingPlane, SketchMechanism
 
 HullCorner = tuple[float, ...]
 

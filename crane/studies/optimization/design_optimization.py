@@ -13,16 +13,16 @@ from crane.common.samples import Array, as_count, as_seed
 from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 from crane.ratings.rating_rules import Rule, find_rule
-from crane.studies.design.design_problem import DesignJob, DesignProblem, solve_design_job
-from crane.studies.design.design_result import Design, DesignSolution
-from crane.studies.design.measure_expressions import (
+from crane.studies.optimization.design_problem import DesignJob, DesignProblem, solve_design_job
+from crane.studies.optimization.design_result import Design, DesignSolution
+from crane.studies.optimization.measure_expressions import (
     MeasureExpression,
     MeasureFunction,
     load_user_measures,
     parse_requirement,
     transferable_measures,
 )
-from crane.studies.design.variant_measures import (
+from crane.studies.optimization.variant_measures import (
     MeasureOptions,
     available_measures,
     check_unique_names,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from crane.hydraulics.circuit_elements import TANK_NODE, Supply
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
-from crane.view.sketch.circuit import valve_symbols
-from crane.view.sketch.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
-from crane.view.sketch.circuit.valve_symbols import format_flow, format_pressure
+from crane.view.sketches.circuit import valve_symbols
+from crane.view.sketches.circuit.circuit_canvas import CircuitCanvas, SheetPoint, SymbolPose
+from crane.view.sketches.circuit.valve_symbols import format_flow, format_pressure
 
 _PORT_LANES = {"Ta": -26.0, "LS": -20.0, "P": 0.0, "T": 12.0}
 _SUPPLY_LANE_BESIDE_CENTRE = -7.0  # lane of P beside an open centre

@@ -18,7 +18,7 @@ from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings import capacity, torques
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.rating_rules import Rule
-from crane.studies.design.measure_expressions import (
+from crane.studies.optimization.measure_expressions import (
     DUAL_FUNCTIONS,
     DualNumber,
     MeasureExpression,

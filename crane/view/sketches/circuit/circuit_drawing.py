@@ -13,16 +13,16 @@ from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine import Machine
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
-from crane.view.sketch.circuit import circuit_section
-from crane.view.sketch.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
-from crane.view.sketch.circuit.circuit_functions import (
+from crane.view.sketches.circuit import circuit_section
+from crane.view.sketches.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
+from crane.view.sketches.circuit.circuit_functions import (
     CircuitFunction,
     OpenCentreLines,
     valve_rows,
 )
-from crane.view.sketch.circuit.circuit_section import CircuitSection
-from crane.view.sketch.circuit.supply_items import SupplyItem, create_supply_items
-from crane.view.sketch.circuit.valve_symbols import SPOOL_HEIGHT
+from crane.view.sketches.circuit.circuit_section import CircuitSection
+from crane.view.sketches.circuit.supply_items import SupplyItem, create_supply_items
+from crane.view.sketches.circuit.valve_symbols import SPOOL_HEIGHT
 
 _FUNCTIONS_PER_ROW = 4  # functions beside each other
 _RAIL_SPACING, _ITEM_DISTANCE = 9.0, 12.0  # between rails; from the lowest rail to items

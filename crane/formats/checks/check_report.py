@@ -21,9 +21,9 @@ from crane.description.findings import Findings, collect_findings, error_recover
 from crane.description.floating_bases import add_floating_base
 from crane.description.machine_lookup import command_line_arguments, find_machine_file
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
-from crane.formats.check.circuit_check import flow_shortages, warn_about_circuit
-from crane.formats.check.mechanism_check import check_mechanism
-from crane.formats.check.plausibility_check import warn_about_implausible_values
+from crane.formats.checks.circuit_check import flow_shortages, warn_about_circuit
+from crane.formats.checks.mechanism_check import check_mechanism
+from crane.formats.checks.plausibility_check import warn_about_implausible_values
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.robot_files import is_simulator_file
 from crane.machine.machine_checks import has_mass

@@ -17,9 +17,9 @@ from crane.common.samples import Array
 from crane.machine import Machine
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
-from crane.view.sketch.label_placement import SketchLabel, find_clear_point, place_labels
-from crane.view.sketch.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
-from crane.view.sketch.sketch_canvas import (
+from crane.view.sketches.label_placement import SketchLabel, find_clear_point, place_labels
+from crane.view.sketches.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
+from crane.view.sketches.sketch_canvas import (
     CENTRE_MARKER,
     DOT_MARKER,
     JOINT_MARKER,
@@ -31,7 +31,7 @@ from crane.view.sketch.sketch_canvas import (
     format_joint_symbol,
     marker_options,
 )
-from crane.view.sketch.sketch_elements import (
+from crane.view.sketches.sketch_elements import (
     SketchBody,
     SketchMechanism,
     SketchPin,

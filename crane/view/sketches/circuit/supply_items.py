@@ -12,10 +12,10 @@ from crane.hydraulics.circuit_elements import (
 )
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.view.plots.figure_text import escape_label
-from crane.view.sketch.circuit import machine_symbols, valve_symbols
-from crane.view.sketch.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose
-from crane.view.sketch.circuit.circuit_functions import CircuitFunction
-from crane.view.sketch.circuit.valve_symbols import (
+from crane.view.sketches.circuit import machine_symbols, valve_symbols
+from crane.view.sketches.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose
+from crane.view.sketches.circuit.circuit_functions import CircuitFunction
+from crane.view.sketches.circuit.valve_symbols import (
     format_flow,
     format_number,
     format_pressure,

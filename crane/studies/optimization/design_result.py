@@ -12,7 +12,7 @@ from crane.formats.machine_loading import MachineVariants
 from crane.machine import Machine
 from crane.ratings import Capacity, capacity
 from crane.recordings.timeseries import Table, write_table
-from crane.studies.design.variant_measures import MeasureOptions
+from crane.studies.optimization.variant_measures import MeasureOptions
 
 
 @dataclass(frozen=True, eq=False)

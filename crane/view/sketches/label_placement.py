@@ -11,7 +11,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from crane.common.samples import Array
-from crane.view.sketch.sketch_canvas import GREY, SketchCanvas
+from crane.view.sketches.sketch_canvas import GREY, SketchCanvas
 
 _RING_GAPS = (2.0, 5.0, 9.0, 15.0, 23.0, 33.0, 45.0, 60.0)  # gaps to the symbol [points]
 _LEADER_LINE_GAP = 12.0  # gap from which a thin line leads to the label [points]

@@ -1,6 +1,0 @@
-"""Drawings of a machine: sketch of its mechanism, and its hydraulic circuit."""
-
-from crane.view.sketch.circuit.circuit_drawing import sketch_circuit
-from crane.view.sketch.sketch_figure import sketch
-
-__all__ = ["sketch", "sketch_circuit"]
