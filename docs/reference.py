@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_args, get_type_hints
 
 from docutils import nodes
@@ -21,6 +22,8 @@ from crane.view.result_files import RESULT_FILES
 HERE = Path(__file__).parent
 GENERATED = HERE / "generated"
 EXAMPLES = HERE.parent / "examples"
+ROOMS = [name for name in crane.__all__ if inspect.ismodule(getattr(crane, name))]
+_HOMES = {name: f"crane.{room}" for room in ROOMS for name in getattr(crane, room).__all__}
 _MEMBERS = "   :members:\n   :inherited-members: Exception, BaseException, object, tuple\n"
 
 
@@ -41,7 +44,9 @@ class Public(SphinxRole):
         name = self.text.removeprefix("crane.")
         shown = nodes.literal(self.rawtext, self.text)
         first = name.split(".")[0]
-        home = "crane" if first in crane.__all__ else "crane.common.errors"
+        if first in ROOMS and "." in name:  # `crane.control.PI`
+            first, name = name.split(".")[1], name.partition(".")[2]
+        home = _HOMES.get(first, "crane.common.errors")
         if not hasattr(import_module(home), first):
             return [shown], []
         link = pending_xref(
@@ -93,15 +98,12 @@ def write() -> None:
     """Write all of them anew."""
     shutil.rmtree(GENERATED / "api", ignore_errors=True)
     (GENERATED / "api").mkdir(parents=True)
-    rooms: dict[str, list[str]] = {}
-    for module, names in crane._HOMES.items():
-        rooms.setdefault(module.split(".")[1], []).extend(names.split())
-    del rooms["common"]
     parts = _parts()
-    for room, names in rooms.items():
+    for room in ROOMS:
+        names = getattr(crane, room).__all__
         _write(f"api/{room}.rst", _room(room, sorted(names), parts.get(room, [])))
     _write("api/errors.rst", _errors())
-    _write("api/index.rst", _index(list(rooms)))
+    _write("api/index.rst", _index())
     _write("commands.md", _commands())
     _write("results.md", _results())
     _write("examples.md", _examples())
@@ -113,7 +115,7 @@ def _write(name: str, text: str) -> None:
 
 def _parts() -> dict[str, list[type]]:
     """By room, classes without a public name that attributes and results of public ones are."""
-    every = [getattr(crane, name) for name in crane.__all__]
+    every = [getattr(import_module(home), name) for name, home in _HOMES.items()]
     to_follow = [value for value in every if callable(value)]
     seen, found = set(to_follow), {}
     while to_follow:
@@ -159,13 +161,13 @@ def _room(room: str, names: list[str], inner: list[type]) -> str:
     module = import_module(f"crane.{room}")
     parts = [_title(room.capitalize()), str(module.__doc__)]
     for name in names:
-        value = getattr(crane, name)
+        value, path = getattr(module, name), f"crane.{room}.{name}"
         if inspect.isclass(value):
-            parts.append(f".. autoclass:: crane.{name}\n{_MEMBERS}")
+            parts.append(f".. autoclass:: {path}\n{_MEMBERS}")
         elif callable(value):
-            parts.append(f".. autofunction:: crane.{name}\n")
+            parts.append(f".. autofunction:: {path}\n")
         else:
-            parts.append(f".. py:data:: crane.{name}\n\n   By name: {', '.join(value)}.\n")
+            parts.append(f".. py:data:: {path}\n\n   By name: {', '.join(value)}.\n")
     if inner:
         heading = "What these lead to"
         parts += [f"{heading}\n{'-' * len(heading)}", "Classes of their attributes and results."]
@@ -179,12 +181,26 @@ def _errors() -> str:
     return "\n\n".join([_title("Errors"), text, body])
 
 
-def _index(rooms: list[str]) -> str:
-    text = (
-        "Every public name is in ``crane`` itself; here they stand by the rooms that have them.\n"
+def _index() -> str:
+    root = ", ".join(
+        f"`{name}`" for name in crane.__all__ if not inspect.ismodule(getattr(crane, name))
     )
-    tree = "\n".join(f"   {room}" for room in [*rooms, "errors"])
-    return f"{_title('The package')}\n\n{text}\n.. toctree::\n   :maxdepth: 2\n\n{tree}\n"
+    rows = "\n".join(
+        f"   * - :doc:`crane.{room} <{room}>`\n     - {_first_sentence(getattr(crane, room))}"
+        for room in ROOMS
+    )
+    tree = "\n".join(f"   {room}" for room in [*ROOMS, "errors"])
+    text = (
+        f"``crane`` itself has what short programs need: {root}. All else is in submodules, which "
+        "``import crane`` makes available."
+    )
+    table = f".. list-table::\n\n{rows}\n"
+    toctree = f".. toctree::\n   :maxdepth: 2\n   :hidden:\n\n{tree}\n"
+    return "\n\n".join([_title("The package"), text, table, toctree])
+
+
+def _first_sentence(module: ModuleType) -> str:
+    return str(module.__doc__).partition("\n\n")[0].replace("\n", " ")
 
 
 def _title(text: str) -> str:

@@ -10,7 +10,9 @@ masses = np.linspace(0.0, 0.2, 100)  # [kg]
 machines = [empty.with_payload(crane.Payload("link7_tip", mass=m)) for m in masses]
 
 # all share their machine code; threads use all cores
-batch = crane.simulate_batch(machines, lambda machine: crane.PI(machine, trajectory), step=0.01)
+batch = crane.simulation.simulate_batch(
+    machines, lambda machine: crane.PI(machine, trajectory), step=0.01
+)
 assert not batch.failures
 
 peak = np.abs(batch.tau[:, :, 1]).max(axis=1)  # of cylinder X1 [N]

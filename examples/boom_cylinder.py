@@ -28,7 +28,7 @@ def eye(link, place):
     return f"{link}:{','.join(map(str, place))}"
 
 
-added = crane.add_cylinder(
+added = crane.formats.add_cylinder(
     "boom.urdf",
     (eye("column", FOOT), eye("boom", EYE)),
     bore=0.08,

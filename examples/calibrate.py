@@ -13,7 +13,7 @@ true = crane.load("patu655", changes=truth, lock=held)  # which nobody knows
 time = np.array([0.0, 0.3, 0.5, 1.2, 1.4, 1.8, 2.0, 2.6, 2.8])  # [s]
 volts = np.array([5.8, 5.8, 4.5, 4.5, 5.8, 5.8, 6.9, 6.9, 5.8])
 run = crane.simulate(
-    true, crane.ValveSignals(true, time, {"X_lift": volts}), duration=4.0, step=0.02
+    true, crane.control.ValveSignals(true, time, {"X_lift": volts}), duration=4.0, step=0.02
 )
 columns = ["time", "voltage_X_lift", "X_lift", "pressure_X_lift_a", "pressure_X_lift_b"]
 noise = np.random.default_rng(0).normal(size=(len(run.time), 5)) * [0, 0, 2e-4, 2e4, 2e4]

@@ -19,7 +19,9 @@ def recorded(frequencies, seed):
     time = np.arange(0.0, 40.0, 0.01)
     way = sum(1 - np.cos(2 * np.pi * f * time) for f in frequencies) / (2 * len(frequencies))
     curve = CubicSpline(time, (0.005 + 0.02 * way)[:, None], bc_type="clamped")
-    run = crane.simulate(true, crane.ComputedTorque(true, crane.Trajectory(curve)), step=0.01)
+    run = crane.simulate(
+        true, crane.ComputedTorque(true, crane.motion.Trajectory(curve)), step=0.01
+    )
     return run.with_noise({"X1": 1e-6, "X1_force": 0.05}, seed)
 
 

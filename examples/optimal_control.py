@@ -8,8 +8,8 @@ import crane
 machine = crane.load(
     "patu655", changes={"payload.mass": 200.0}, lock={"slew": 0.0, "X_tilt": 0.246, "X_ext": 0.1}
 )
-inverse = crane.casadi_function(machine, "inverse")  # (q, v_A, a_A) -> forces
-loops = crane.casadi_function(machine, "loops")  # q -> 0 where the loops are closed
+inverse = crane.simulation.casadi_function(machine, "inverse")  # (q, v_A, a_A) -> forces
+loops = crane.simulation.casadi_function(machine, "loops")  # q -> 0 where the loops are closed
 
 PARTS, WAY, SPEED, FORCE = 40, 0.3, 0.15, 70e3  # way of the stroke [m], limits [m/s], [N]
 lift = int(machine.closure.active[0])

@@ -19,7 +19,7 @@ def feedback(t, q_a, v_a):
     return weight + KP * (trajectory.position(t) - q_a) - KD * v_a
 
 
-class Feedback(crane.ControlLaw):
+class Feedback(crane.control.ControlLaw):
     """The same in formulas, from which machine code is made."""
 
     def references(self, times):

@@ -15,7 +15,7 @@ Path("path.csv").write_text("""time [s],x [m],y [m],z [m]
 """)
 
 machine = crane.load("patu655")
-path = crane.read_path(machine, "path.csv")  # inverse kinematics through the loops
+path = crane.motion.read_path(machine, "path.csv")  # inverse kinematics through the loops
 recording = crane.simulate(machine, crane.ComputedTorque(machine, path), step=0.005)
 
 tip = np.column_stack([recording[f"tip_{axis}"] for axis in "xyz"])  # [m]

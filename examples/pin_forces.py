@@ -9,7 +9,7 @@ LOAD = np.array([0.0, 0.0, -20e3, 0.0, 0.0, 0.0])  # at the bucket's lip: force 
 machine = crane.load("excavator")
 q_a = machine.home[machine.closure.active]
 q = machine.closure.solve(q_a)
-reactions = crane.Reactions(machine)
+reactions = crane.dynamics.Reactions(machine)
 found = dict(
     zip(reactions.names, reactions.joint_wrenches(q, wrenches={"bucket_lip": LOAD}), strict=True)
 )

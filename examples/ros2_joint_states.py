@@ -35,9 +35,9 @@ class ClosedMachine(Node):
 
     def __init__(self, machine):
         super().__init__("closed_machine")
-        self.transmission = crane.Transmission(machine)
+        self.transmission = crane.motion.Transmission(machine)
         description = self.create_publisher(String, "robot_description", LATCHED)
-        description.publish(String(data=crane.robot_description(machine)))
+        description.publish(String(data=crane.formats.robot_description(machine)))
         self.joints = self.create_publisher(JointState, "joint_states", 10)
         self.create_subscription(JointState, "actuator_states", self.heard, 10)
 

@@ -11,7 +11,7 @@ machine = crane.load("patu655", changes={"payload.mass": 200.0}, lock=held)
 time = np.array([0.0, 0.5, 0.7, 2.7, 2.9])  # [s]
 volts = np.array([5.8, 5.8, 4.6, 4.6, 5.8])
 recording = crane.simulate(
-    machine, crane.ValveSignals(machine, time, {"X_lift": volts}), duration=5.0, step=0.005
+    machine, crane.control.ValveSignals(machine, time, {"X_lift": volts}), duration=5.0, step=0.005
 )
 print(recording)
 

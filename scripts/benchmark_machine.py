@@ -36,7 +36,7 @@ def swinging(machine: crane.Machine) -> crane.Machine:
     middle = np.array([0.0, 0.015, 0.015])
     weight = crane.Dynamics(machine, backend="pinocchio").gravity(middle)
     springs = tuple(
-        crane.ForceElement(joint, stiffness=k, rest=float(m + w / k), damping=c)
+        crane.description.ForceElement(joint, stiffness=k, rest=float(m + w / k), damping=c)
         for joint, k, c, m, w in zip(
             machine.active, (0.3, 3000.0, 5000.0), (0.02, 40.0, 40.0), middle, weight, strict=True
         )

@@ -87,8 +87,8 @@ def gradients() -> str:
         call()
         return time.process_time() - start
 
-    def back(by: list[str] | None) -> crane.Gradient:
-        return crane.gradient(
+    def back(by: list[str] | None) -> crane.simulation.Gradient:
+        return crane.simulation.gradient(
             machine,
             levers,
             None,

@@ -153,7 +153,7 @@ def task(mini: crane.Machine, rounds: int) -> str:
     def driven() -> ValveDrive:
         return ValveDrive(valves, ValvePD(valves, push))
 
-    cases: dict[str, tuple[crane.Machine, Callable[[], ControlLaw], crane.Trajectory]] = {
+    cases: dict[str, tuple[crane.Machine, Callable[[], ControlLaw], crane.motion.Trajectory]] = {
         "`mini_forwarder` lifts, `PI`": (mini, lambda: PI(mini, lift), lift),
         "the same, `ComputedTorque`": (mini, lambda: ComputedTorque(mini, lift), lift),
         "`patu655` pushes on its valves, `ValvePD`": (valves, driven, push),

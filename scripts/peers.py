@@ -185,7 +185,7 @@ def mjcf(
         body = etree.SubElement(bodies[model.parents[i]], "body", name=f"body_{name}", **place)
         bodies.append(body)
         slides = machine.unit(name) == "m"
-        passive = elements.get(name, crane.ForceElement(name))
+        passive = elements.get(name, crane.description.ForceElement(name))
         memory = model.joints[i].createData()
         model.joints[i].calc(memory, np.zeros(1))
         etree.SubElement(

@@ -36,7 +36,9 @@ DRAWS = 40  # of the feasible set, per kind of variation
 
 
 def exact_wins(
-    rig: Rig, paths: dict[str, crane.Trajectory], runs: dict[str, dict[tuple[str, str], Run]]
+    rig: Rig,
+    paths: dict[str, crane.motion.Trajectory],
+    runs: dict[str, dict[tuple[str, str], Run]],
 ) -> np.ndarray:
     """(3, 3) tasks and signals where the exact form comes closer to a rig's measurement."""
     out = []

@@ -58,16 +58,16 @@ def problems(folder: Path) -> dict[str, Problem]:
     mass = crane.Dynamics(mini).mass_matrix(path.position(0.0)).diagonal()
     fast = 2 * np.pi * 1000.0
     gains = {
-        joint: crane.PIGains(float(m) * fast**2, float(m) * fast**2 * 10.0)
+        joint: crane.description.PIGains(float(m) * fast**2, float(m) * fast**2 * 10.0)
         for joint, m in zip(mini.active, mass, strict=True)
     }
     damped = mini.replace(
         forces=tuple(
-            crane.ForceElement(joint, damping=float(2 * m * fast))
+            crane.description.ForceElement(joint, damping=float(2 * m * fast))
             for joint, m in zip(mini.active, mass, strict=True)
         )
     )
-    hit = mini.replace(end_stops=(crane.EndStop("X1", 1e9, 0.5),))
+    hit = mini.replace(end_stops=(crane.description.EndStop("X1", 1e9, 0.5),))
     law = ZeroForce
     return {
         "flyball governor, 10 s": (

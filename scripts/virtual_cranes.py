@@ -64,7 +64,7 @@ def recorded(machine, values, true, seed, path):
     times, random = np.arange(0, 20.0, 0.01), np.random.default_rng(seed)
     levers = crane.joystick(machine, LEVERS).references(times)
     signals = dict(zip(machine.hydraulics.joints, levers.T, strict=True))
-    drive = crane.ValveSignals(crane_, times, signals)
+    drive = crane.control.ValveSignals(crane_, times, signals)
     run = crane.simulate(crane_, drive, [0.15, 0.3], 19.99, 0.01, tolerance=1e-9)
     columns, units, read = run.columns(), {"time": "s"}, [times]
     for joint, signal in signals.items():

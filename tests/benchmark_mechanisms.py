@@ -106,10 +106,10 @@ def squeezer(folder, active="beta"):
         *(loop(f"e2_{other}", "e2", other) for other in ("e3", "e4", "e6")),
     ]
     machine = load(folder, "squeezer", parts, home, active)
-    spring = crane.ForceElement("", stiffness=4530.0, rest=0.07785, between=("c", "d"))
+    spring = crane.description.ForceElement("", stiffness=4530.0, rest=0.07785, between=("c", "d"))
     model = machine.model.copy()
     model.gravity.linear = np.zeros(3)
-    forces = (spring, crane.ForceElement("beta", force=0.033))
+    forces = (spring, crane.description.ForceElement("beta", force=0.033))
     return dataclasses.replace(machine, forces=forces, model=model)
 
 
@@ -144,7 +144,7 @@ def governor(folder):
         home[f"arm_{side}"], home[f"link_{side}"] = -sign * lean, 2 * sign * lean
     machine = load(folder, "governor", parts, home, "spin")
     machine = machine.with_active_joints(("spin", "collar"))
-    stiff = crane.ForceElement("collar", 8e5, -np.cos(lean), 4e4)
+    stiff = crane.description.ForceElement("collar", 8e5, -np.cos(lean), 4e4)
     return machine.replace(forces=(stiff,))
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crane.hydraulics import CircuitEquations
+from crane.hydraulics.circuit_equations import CircuitEquations
 
 
 def circuit_of(machine):

@@ -108,8 +108,10 @@ def test_a_cylinder_is_as_long_as_it_is_said():
 def closed(tmp_path):
     """The planar digger with both cylinders, by two calls."""
     planar(tmp_path)
-    crane.add_cylinder(tmp_path / "digger.urdf", name="hoist", out=tmp_path / "d.yaml", **LIFT)
-    crane.add_cylinder(
+    crane.formats.add_cylinder(
+        tmp_path / "digger.urdf", name="hoist", out=tmp_path / "d.yaml", **LIFT
+    )
+    crane.formats.add_cylinder(
         tmp_path / "d.yaml", name="crowd", out=tmp_path / "d.yaml", force=True, **FOLD
     )
     return crane.load(tmp_path / "d.yaml")
@@ -185,7 +187,7 @@ def test_without_weight_it_is_the_open_machine(tmp_path):
     first = crane.load(planar(tmp_path))
     for name, given, before in (("hoist", LIFT, "digger.urdf"), ("crowd", FOLD, "a.yaml")):
         length = given.get("dead_length", given["stroke"] + 4 * given["bore"])
-        crane.add_cylinder(
+        crane.formats.add_cylinder(
             tmp_path / before, given["between"], 1e-5, 5e-6, given["stroke"],
             name=name, dead_length=length, out=tmp_path / "a.yaml", force=True,
         )  # fmt: skip
@@ -206,7 +208,7 @@ def test_in_space_the_barrel_has_a_universal_joint(tmp_path):
     ]
     before = spatial(tmp_path)
     for name, between, bore, stroke, dead in given:
-        added = crane.add_cylinder(
+        added = crane.formats.add_cylinder(
             before, between, bore, bore / 2, stroke,
             name=name, dead_length=dead, out=tmp_path / "s.yaml", force=True,
         )  # fmt: skip
@@ -227,9 +229,9 @@ def test_in_space_the_barrel_has_a_universal_joint(tmp_path):
 
 def test_two_cylinders_on_one_boom_share_its_load(tmp_path):
     path = planar(tmp_path)
-    one = crane.add_cylinder(path, name="left", out=tmp_path / "d.yaml", **LIFT)
+    one = crane.formats.add_cylinder(path, name="left", out=tmp_path / "d.yaml", **LIFT)
     assert one.joint == "lift" and not one.shares_load
-    two = crane.add_cylinder(one.path, name="right", out=tmp_path / "d2.yaml", **LIFT)
+    two = crane.formats.add_cylinder(one.path, name="right", out=tmp_path / "d2.yaml", **LIFT)
     assert two.joint == "left" and two.shares_load
     assert str(two).startswith("right shares the load on left from 0 to 0.9 m")
     machine = crane.load(two.path)
@@ -247,13 +249,15 @@ def test_any_format_goes_in(kind, tmp_path):
         pytest.importorskip("mujoco")
     machine = crane.load(planar(tmp_path))
     first = {
-        "mjcf": lambda: crane.write_mjcf(machine, tmp_path / "m.xml") or tmp_path / "m.xml",
+        "mjcf": lambda: (
+            crane.formats.write_mjcf(machine, tmp_path / "m.xml") or tmp_path / "m.xml"
+        ),
         "urdf+": lambda: (
-            crane.write_urdf_plus(machine, tmp_path / "m.urdf") or tmp_path / "m.urdf"
+            crane.formats.write_urdf_plus(machine, tmp_path / "m.urdf") or tmp_path / "m.urdf"
         ),
         "machine": lambda: crane.write_machine(machine, tmp_path / "m"),
     }[kind]()
-    added = crane.add_cylinder(first, name="hoist", out=tmp_path / "out.yaml", **LIFT)
+    added = crane.formats.add_cylinder(first, name="hoist", out=tmp_path / "out.yaml", **LIFT)
     closed = crane.load(added.path)
     assert closed.active == ("hoist", "fold")
     assert eyes_apart(closed, "hoist", closed.home)[0] == pytest.approx(
@@ -263,7 +267,7 @@ def test_any_format_goes_in(kind, tmp_path):
 
 def test_an_eye_beside_the_plane_moves_along_its_pin(tmp_path):
     between = ["house:0.6,0.02,0.7", "boom:1.9,-0.03,0.3"]
-    added = crane.add_cylinder(
+    added = crane.formats.add_cylinder(
         planar(tmp_path), **LIFT | {"between": between}, out=tmp_path / "d.yaml"
     )
     (note,) = added.notes
@@ -276,7 +280,9 @@ def test_axes_that_are_parallel_to_few_digits_get_a_universal_joint(tmp_path):
     path = planar(tmp_path, rpy="1e-6 0 0")
     path.write_text(path.read_text().replace('<axis xyz="0 1 0"/>', '<axis xyz="0 1 1e-6"/>', 1))
     given = {"between": ["house:0.6,0,0.7", "arm:0.3,0,0.1"], "bore": 0.1, "rod": 0.05}
-    added = crane.add_cylinder(path, **given, stroke=2.0, dead_length=2.5, out=tmp_path / "d.yaml")
+    added = crane.formats.add_cylinder(
+        path, **given, stroke=2.0, dead_length=2.5, out=tmp_path / "d.yaml"
+    )
     machine = crane.load(added.path)
     assert machine.closure.equations.loops[0].type == "spherical"
     assert machine.closure.residual(machine.home) < 1e-13
@@ -285,7 +291,7 @@ def test_axes_that_are_parallel_to_few_digits_get_a_universal_joint(tmp_path):
 def test_of_two_joints_it_drives_the_one_it_moves_best(tmp_path):
     """From the house to the arm: whichever stays active, the loop closes and says so."""
     given = {"between": ["house:0.6,0,0.7", "arm:-0.5,0,0.35"], "bore": 0.1, "rod": 0.06}
-    added = crane.add_cylinder(
+    added = crane.formats.add_cylinder(
         planar(tmp_path), **given, stroke=2.0, dead_length=2.1, out=tmp_path / "d.yaml"
     )
     assert added.joint == "lift"
@@ -301,7 +307,11 @@ def test_home_goes_where_the_cylinder_fits(tmp_path):
     """At the zero configuration the mounting points are closer than the retracted cylinder."""
     given = LIFT | {"stroke": 0.6, "dead_length": 1.8}
     added, told = told_by(
-        crane.add_cylinder, planar(tmp_path), name="hoist", out=tmp_path / "d.yaml", **given
+        crane.formats.add_cylinder,
+        planar(tmp_path),
+        name="hoist",
+        out=tmp_path / "d.yaml",
+        **given,
     )
     machine = crane.load(added.path)
     stroke = machine.home[machine.column("hoist")]
@@ -314,7 +324,9 @@ def test_home_goes_where_the_cylinder_fits(tmp_path):
 def test_its_ends_are_where_the_stroke_ends(tmp_path):
     """By the law of cosines about the pin, at radii a and b: L^2 = a^2 + b^2 - 2 a b cos."""
     a, b = np.hypot(0.6, 0.8), np.hypot(1.9, 0.3)
-    added, told = told_by(crane.add_cylinder, planar(tmp_path), out=tmp_path / "d.yaml", **LIFT)
+    added, told = told_by(
+        crane.formats.add_cylinder, planar(tmp_path), out=tmp_path / "d.yaml", **LIFT
+    )
 
     def lift(length):
         angle = np.arccos((a**2 + b**2 - length**2) / (2 * a * b))
@@ -340,7 +352,7 @@ def test_its_ends_are_dead_centres_where_these_come_first(tmp_path, along):
     eyes = ["house:0.6,0,1.5", f"boom:-1.0,0,{along}"]
     steel = {"bore": 0.1, "rod": 0.07, "stroke": 1.2, "dead_length": 1.35}
     added, told = told_by(
-        crane.add_cylinder, planar(tmp_path), eyes, out=tmp_path / "d.yaml", **steel
+        crane.formats.add_cylinder, planar(tmp_path), eyes, out=tmp_path / "d.yaml", **steel
     )
     dead = -np.arctan2(along, 1.0)
     assert dead in [pytest.approx(x, abs=1e-6) for x in added.driven_range]
@@ -355,7 +367,7 @@ def test_its_ends_are_where_the_machine_closes(tmp_path):
     reach = np.sqrt((SliderCrank.r + SliderCrank.rod) ** 2 - SliderCrank.e**2)
     eyes = ["base:-0.5,0,0.3", "slider"]
     steel = {"bore": 0.05, "rod": 0.03, "stroke": 0.3, "dead_length": 0.65}
-    added = crane.add_cylinder(tmp_path / "s.yaml", eyes, out=tmp_path / "d.yaml", **steel)
+    added = crane.formats.add_cylinder(tmp_path / "s.yaml", eyes, out=tmp_path / "d.yaml", **steel)
     assert added.driven_range == pytest.approx((0.15, reach), abs=1e-6)
     assert added.limits[1] == pytest.approx(reach, abs=1e-8)
     assert added.stroke_range == pytest.approx((0.0, reach - 0.15), abs=1e-6)
@@ -365,7 +377,9 @@ def test_its_ends_are_where_the_machine_closes(tmp_path):
 def test_strokes_beyond_a_dead_centre_are_told(tmp_path):
     given = FOLD | {"between": ["boom:1.5,0,0.9", "arm:-0.6,0,0.1"], "stroke": 1.2}
     given["dead_length"] = 1.64
-    _, told = told_by(crane.add_cylinder, planar(tmp_path), out=tmp_path / "e.yaml", **given)
+    _, told = told_by(
+        crane.formats.add_cylinder, planar(tmp_path), out=tmp_path / "e.yaml", **given
+    )
     assert any("the linkage does not close at 0 to 0.40" in line for line in told)
     machine = crane.load(tmp_path / "e.yaml")
     q_a = machine.home[machine.closure.active]
@@ -381,22 +395,22 @@ def test_machines_lighter_than_their_cylinder_are_told(tmp_path):
     path = planar(tmp_path)
     path.write_text(path.read_text().replace('mass value="800.0"', 'mass value="0.03"'))
     lift, fold = LIFT | {"name": "hoist"}, FOLD | {"name": "crowd"}
-    _, told = told_by(crane.add_cylinder, path, out=tmp_path / "d.yaml", **lift)
+    _, told = told_by(crane.formats.add_cylinder, path, out=tmp_path / "d.yaml", **lift)
     assert not any("weighs" in line for line in told)  # it moves the arm as well
     path.write_text(re.sub('mass value=".*?"', 'mass value="0.03"', path.read_text()))
-    _, told = told_by(crane.add_cylinder, path, out=tmp_path / "e.yaml", **lift)
+    _, told = told_by(crane.formats.add_cylinder, path, out=tmp_path / "e.yaml", **lift)
     assert told[-1] == (
         "the cylinder weighs 81.26 kg, and all that 'lift' moves 0.06 kg: forces are little more "
         "than its own weight, give the bodies the masses of the real machine"
     )
-    _, told = told_by(crane.add_cylinder, path, out=tmp_path / "f.yaml", **fold)
+    _, told = told_by(crane.formats.add_cylinder, path, out=tmp_path / "f.yaml", **fold)
     assert "all that 'fold' moves 0.03 kg" in told[-1]
 
 
 def test_a_joint_without_limits_takes_those_of_its_cylinder(tmp_path):
     path = planar(tmp_path)
     path.write_text(path.read_text().replace('"lift" type="revolute"', '"lift" type="continuous"'))
-    added, told = told_by(crane.add_cylinder, path, out=tmp_path / "d.yaml", **LIFT)
+    added, told = told_by(crane.formats.add_cylinder, path, out=tmp_path / "d.yaml", **LIFT)
     assert not told
     machine = crane.load(added.path)
     lift = machine.closure.solve([[0.0, 1.0], [0.9, 1.0]])[:, machine.column("lift")]
@@ -416,7 +430,11 @@ def test_what_belonged_to_the_joint_is_left_out(tmp_path):
         "  over: {duration: 1, tip: {x: [5], y: [0], z: [2]}}\n"
     )
     added, told = told_by(
-        crane.add_cylinder, tmp_path / "m.yaml", name="hoist", out=tmp_path / "n.yaml", **LIFT
+        crane.formats.add_cylinder,
+        tmp_path / "m.yaml",
+        name="hoist",
+        out=tmp_path / "n.yaml",
+        **LIFT,
     )
     assert any("m: gains, tasks of active joints belonged to the active joints" in x for x in told)
     machine = crane.load(added.path)
@@ -497,7 +515,7 @@ def test_refused_in_one_line_and_nothing_is_left(case, tmp_path, monkeypatch):
     planar(tmp_path)
     given = {"out": "d.yaml"} | LIFT | changed
     with pytest.raises(CraneError) as caught:
-        crane.add_cylinder("digger.urdf", **given)
+        crane.formats.add_cylinder("digger.urdf", **given)
     assert str(caught.value).startswith(text)
     assert os.listdir(tmp_path) == ["digger.urdf"]
 

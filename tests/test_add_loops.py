@@ -88,7 +88,9 @@ def test_the_gap_is_that_of_the_frames(tmp_path):
 
 
 def test_the_machine_with_the_proposed_loops_is_the_whole_one(tmp_path):
-    added = crane.add_loops(opened("mini_forwarder", tmp_path), out=tmp_path / "closed.yaml")
+    added = crane.formats.add_loops(
+        opened("mini_forwarder", tmp_path), out=tmp_path / "closed.yaml"
+    )
     closed, whole = crane.load(added.path), crane.load("mini_forwarder")
     assert closed.active == whole.active and added.mobility == 3
     rng = np.random.default_rng(0)
@@ -112,7 +114,7 @@ def test_frames_without_names_that_meet(mass, tmp_path):
     (proposal,) = check(tmp_path / "bars.urdf").proposals
     assert (proposal.loop.type, proposal.loop.axis) == ("revolute", (0, 0, 1))
     assert proposal.gap == pytest.approx(0, abs=1e-15) and not proposal.is_named
-    added = crane.add_loops(tmp_path / "bars.urdf", out=tmp_path / "bars.yaml")
+    added = crane.formats.add_loops(tmp_path / "bars.urdf", out=tmp_path / "bars.yaml")
     assert added.mobility == 2
 
 
@@ -134,7 +136,7 @@ def test_a_barrel_and_a_rod_that_hang_on_two_bodies_slide_in_each_other(tmp_path
     assert (loop.type, loop.predecessor) == ("prismatic", "lift_barrel")
     assert loop.successor == "lift_rod"
     assert loop.axis == pytest.approx((1, 0, 0), abs=1e-9)
-    machine = crane.load(crane.add_loops(path, out=tmp_path / "d.yaml").path)
+    machine = crane.load(crane.formats.add_loops(path, out=tmp_path / "d.yaml").path)
     assert machine.closure.degrees_of_freedom == 2
     lift = crane.load(tmp_path / "d.yaml", active=["lift", "fold"])
     q = lift.closure.solve(np.array([-0.4, 1.0]))
@@ -163,7 +165,7 @@ def test_robots_of_other_people_close_by_one_command(name, tmp_path):
     if not ROBOTS.is_dir():
         pytest.skip(f"{ROBOTS} is not there")
     said = yaml.safe_load((ROBOTS / name / "robot.yaml").read_text())["closed_loop"]
-    added = crane.add_loops(ROBOTS / name / "robot.urdf", out=tmp_path / "robot.yaml")
+    added = crane.formats.add_loops(ROBOTS / name / "robot.urdf", out=tmp_path / "robot.yaml")
     assert len(added.loops) == len(said)
     machine = crane.load(added.path)
     assert machine.closure.residual(machine.home) < 1e-10
@@ -184,7 +186,7 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, monkeypatch):
     )
     with warnings.catch_warnings(), pytest.raises(CraneError) as caught:
         warnings.simplefilter("ignore", CraneWarning)
-        crane.add_loops("far.urdf", out="far.yaml")
+        crane.formats.add_loops("far.urdf", out="far.yaml")
     assert str(caught.value).startswith(
         "the machine does not close with the proposed loops foot: far.yaml:"
     )

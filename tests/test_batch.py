@@ -26,7 +26,7 @@ def test_a_batch_is_its_simulations(forwarder):
         forwarder.with_payload(crane.Payload("link7_tip", 0.02 * i)) for i in range(len(STARTS))
     ]
     shares = []
-    batch = crane.simulate_batch(
+    batch = crane.simulation.simulate_batch(
         machines, lambda m: crane.PI(m, target), STARTS, threads=3, progress=shares.append
     )
     assert batch.failures == {} and shares[-1] == 1.0
@@ -42,23 +42,25 @@ def test_a_batch_is_its_simulations(forwarder):
 
 
 def test_one_machine_many_starts(forwarder):
-    batch = crane.simulate_batch(forwarder, initial=STARTS, duration=0.05)
+    batch = crane.simulation.simulate_batch(forwarder, initial=STARTS, duration=0.05)
     np.testing.assert_array_equal(batch.q[:, 0], STARTS)
 
 
 def test_a_variant_that_fails_loses_nothing_of_the_others(forwarder):
     starts = [*STARTS[:2], [0.0, 0.04, 0.01], *STARTS[2:]]
-    batch = crane.simulate_batch(forwarder, initial=starts, duration=0.05)
+    batch = crane.simulation.simulate_batch(forwarder, initial=starts, duration=0.05)
     assert list(batch.failures) == [2]
     assert "X1 = 0.04 is outside of its limits" in batch.failures[2]
     assert np.isnan(batch.q[2]).all() and np.isfinite(np.delete(batch.q, 2, axis=0)).all()
 
 
 def test_a_step_too_long_is_told(forwarder):
-    hard = {**forwarder.friction, "X1": crane.Friction(coulomb=16, smoothing=5e-5)}
+    hard = {**forwarder.friction, "X1": crane.description.Friction(coulomb=16, smoothing=5e-5)}
     machines = [forwarder, forwarder.replace(friction=hard)]
     target = crane.point_to_point([0, 0.015, 0.012], [0, 0.018, 0.012], 1.0)
-    batch = crane.simulate_batch(machines, lambda m: crane.PI(m, target), step=1e-3, method="rk4")
+    batch = crane.simulation.simulate_batch(
+        machines, lambda m: crane.PI(m, target), step=1e-3, method="rk4"
+    )
     assert batch.failures == {} and list(batch.warnings) == [1]
     assert "the step of 0.001 s is too long" in batch.warnings[1]
 
@@ -66,14 +68,17 @@ def test_a_step_too_long_is_told(forwarder):
 def test_wrong_batches(forwarder):
     arm = crane.load("ur5_robot")
     for call, text in (
-        (lambda: crane.simulate_batch([], duration=1.0), "there are no machines"),
+        (lambda: crane.simulation.simulate_batch([], duration=1.0), "there are no machines"),
         (
-            lambda: crane.simulate_batch([forwarder] * 2, initial=STARTS, duration=1.0),
+            lambda: crane.simulation.simulate_batch([forwarder] * 2, initial=STARTS, duration=1.0),
             "2 machines and 6 initial states",
         ),
-        (lambda: crane.simulate_batch([forwarder, arm], duration=1.0), "machine 1 is driven at"),
         (
-            lambda: crane.simulate_batch(forwarder, initial=[[0, 1, 0]], duration=1.0),
+            lambda: crane.simulation.simulate_batch([forwarder, arm], duration=1.0),
+            "machine 1 is driven at",
+        ),
+        (
+            lambda: crane.simulation.simulate_batch(forwarder, initial=[[0, 1, 0]], duration=1.0),
             "all 1 simulations failed, the first: initial: X1 = 1",
         ),
     ):
@@ -110,7 +115,7 @@ def test_a_machine_cannot_be_changed(forwarder):
     with pytest.raises(ValueError, match="read-only"):
         forwarder.lower[1] = -1
     with pytest.raises(TypeError):
-        forwarder.friction["X1"] = crane.Friction()
+        forwarder.friction["X1"] = crane.description.Friction()
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
@@ -126,12 +131,12 @@ def test_dynamics_keep_the_parameters_of_their_moment(backend):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: crane.Friction(coulomb=-1),
-        lambda: crane.Friction(viscous=np.nan),
-        lambda: crane.ForceElement("X1", stiffness=-1),
-        lambda: crane.EndStop("X1", -5.0),
-        lambda: crane.PIGains(np.nan, 1),
-        lambda: crane.PIGains("1", 1),
+        lambda: crane.description.Friction(coulomb=-1),
+        lambda: crane.description.Friction(viscous=np.nan),
+        lambda: crane.description.ForceElement("X1", stiffness=-1),
+        lambda: crane.description.EndStop("X1", -5.0),
+        lambda: crane.description.PIGains(np.nan, 1),
+        lambda: crane.description.PIGains("1", 1),
     ],
 )
 def test_impossible_parameters(make):

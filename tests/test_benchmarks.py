@@ -85,7 +85,7 @@ def test_a_stiff_governor_by_all_methods(tmp_path):
     # a hundred times as stiff, explicit steps would be a hundred times as short
     (spring,) = machine.forces
     hard = machine.replace(
-        forces=(crane.ForceElement("collar", 8e7, spring.rest, 100 * spring.damping),)
+        forces=(crane.description.ForceElement("collar", 8e7, spring.rest, 100 * spring.damping),)
     )
     one, two = (
         crane.simulate(hard, None, start, 2.0, 1e-2, method="Radau", tolerance=x)
@@ -119,7 +119,7 @@ def test_a_block_between_stops_bounces_as_its_closed_form(tmp_path, how, error):
         <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
     )
     machine = crane.load(tmp_path / "block.urdf")
-    machine = machine.replace(end_stops=(crane.EndStop("x", stiffness),))
+    machine = machine.replace(end_stops=(crane.description.EndStop("x", stiffness),))
     found = crane.simulate(machine, None, (np.zeros(1), np.ones(1)), 60.0, 0.1, **how)
     omega = np.sqrt(stiffness / mass)
     contact = np.pi / omega

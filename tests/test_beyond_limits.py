@@ -174,13 +174,15 @@ def test_a_task_beyond_the_limits_is_an_error(tmp_path):
 
 
 def test_batches_say_it_of_each(mini, free):
-    found = crane.simulate_batch(
+    found = crane.simulation.simulate_batch(
         [free, mini], lambda m: crane.PI(m, to(0.06)), duration=0.2, step=1e-3
     )
     assert all(TOLD in text for text in found.warnings.values())
     assert set(found.warnings) | set(found.failures) == {0, 1}
     assert all("beyond its limit 0.03 m" in text for text in found.failures.values())
-    inside = crane.simulate_batch([mini], lambda m: crane.PI(m, to(0.028)), duration=0.05)
+    inside = crane.simulation.simulate_batch(
+        [mini], lambda m: crane.PI(m, to(0.028)), duration=0.05
+    )
     assert not inside.failures and TOLD not in inside.warnings.get(0, "")
 
 

@@ -9,8 +9,9 @@ from scipy.linalg import eigh
 from test_reactions import BEAM, load
 
 import crane
-from crane import Buckling, Dynamics
+from crane import Dynamics
 from crane.common.errors import CraneError, InputError
+from crane.dynamics import Buckling
 from crane.dynamics.buckling import YOUNGS_MODULUS_STEEL, CylinderColumn
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.hydraulics.circuit_elements import Supply

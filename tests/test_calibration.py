@@ -48,7 +48,7 @@ def recorded(machine, path, seed, truth=None, offset=0.0, extra=()):
         true = crane.load(machine.path, changes=TRUTH if truth is None else truth)
         run = crane.simulate(
             true,
-            crane.ValveSignals(true, time, {"x": voltage}),
+            crane.control.ValveSignals(true, time, {"x": voltage}),
             [0.2],
             5.99,
             0.01,

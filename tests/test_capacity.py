@@ -313,7 +313,7 @@ def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
     at = {"radii": [6.0], "heights": [1.0], "frame": "bucket", "slews": [1.5]}
     by_rule = crane.capacity(excavator, rule="sfs4677", **at)
     by_hand = crane.capacity(
-        excavator, rule=crane.Rule("own", "", tipping=1 / 1.1), slope=np.deg2rad(5), **at
+        excavator, rule=crane.ratings.Rule("own", "", tipping=1 / 1.1), slope=np.deg2rad(5), **at
     )
     assert by_rule.loads[0, 0, 0] == by_hand.loads[0, 0, 0]
     assert by_rule.limiting_factors[by_rule.limiting_factor_index[0, 0, 0]].reason == "tips"
@@ -398,7 +398,7 @@ def test_odd_arguments_are_said_in_one_line(excavator, given):
 @pytest.mark.parametrize("share", [-1.0, 0.0, 1.5, np.nan])
 def test_rules_have_shares(share):
     with pytest.raises(crane.CraneError, match="the tipping share of rule 'own'"):
-        crane.Rule("own", "", tipping=share)
+        crane.ratings.Rule("own", "", tipping=share)
 
 
 def test_a_column_behind_the_axis_has_a_table():

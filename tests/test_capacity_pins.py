@@ -29,7 +29,7 @@ def excavator(tmp_path_factory):
 @pytest.fixture(scope="module")
 def chart(excavator):
     return crane.capacity(
-        excavator, "bucket", rule=crane.Rule("own", "", structural=0.8), step=1.0
+        excavator, "bucket", rule=crane.ratings.Rule("own", "", structural=0.8), step=1.0
     )
 
 
@@ -64,9 +64,9 @@ def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
 
 def test_pin_forces_and_margins_are_those_of_statics_by_hand(excavator, chart):
     forces, margins = chart.pin_forces(), chart.buckling()
-    assert set(forces) == set(crane.Reactions(excavator).names)
+    assert set(forces) == set(crane.dynamics.Reactions(excavator).names)
     assert set(margins) == {"X_boom", "X_arm", "X_bucket"}
-    loads = crane.Buckling(excavator)
+    loads = crane.dynamics.Buckling(excavator)
     for cell in map(tuple, cells(chart, 5, seed=1)):
         q = excavator.closure.solve(chart.q_a[cell])
         drives, pins = balance(excavator, q, G, chart.loads[cell], "bucket")
@@ -94,7 +94,7 @@ def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
     slope = 0.1
     bare = crane.load("excavator")
     chart = crane.capacity(bare, "bucket", radii=[5.0, 7.0], heights=[0.0, 2.0], slope=slope)
-    margins, columns = chart.buckling(), crane.Buckling(bare).columns
+    margins, columns = chart.buckling(), crane.dynamics.Buckling(bare).columns
     cell = tuple(np.argwhere(np.isfinite(chart.loads))[0])
     q = bare.closure.solve(chart.q_a[cell])
     least = dict.fromkeys(columns, np.inf)

@@ -54,7 +54,10 @@ def log_crane():
 def test_values_and_derivatives_are_those_of_machine_code(name, quantity):
     """Values to 1e-12; (df/dq) gamma against `Dynamics.derivatives`, which goes through loops."""
     machine = crane.load(name)
-    dynamics, function = crane.Dynamics(machine), crane.casadi_function(machine, quantity)
+    dynamics, function = (
+        crane.Dynamics(machine),
+        crane.simulation.casadi_function(machine, quantity),
+    )
     for q, *rest in states(machine):
         q_a, rest = q[machine.closure.active], rest[: ARGUMENTS[quantity]]
         wanted = np.array(getattr(dynamics, quantity)(q_a, *rest))
@@ -79,14 +82,14 @@ def test_a_machine_that_floats():
     q, v, x = (0.3 * rng.normal(size=len(machine.active)) for _ in range(3))
     for quantity in ("inverse", "forward"):
         wanted = getattr(dynamics, quantity)(q, v, x)
-        found = np.array(crane.casadi_function(machine, quantity)(q, v, x)).ravel()
+        found = np.array(crane.simulation.casadi_function(machine, quantity)(q, v, x)).ravel()
         assert np.abs(found - wanted).max() <= 1e-12 * np.abs(wanted).max()
 
 
 def test_friction_is_in_when_asked_for(log_crane):
     dynamics = crane.Dynamics(log_crane)
     for quantity in ("inverse", "forward"):
-        function = crane.casadi_function(log_crane, quantity, friction=True)
+        function = crane.simulation.casadi_function(log_crane, quantity, friction=True)
         for q, v, x in states(log_crane):
             wanted = getattr(dynamics, quantity)(q[log_crane.closure.active], v, x, friction=True)
             found = np.array(function(q, v, x)).ravel()
@@ -95,7 +98,7 @@ def test_friction_is_in_when_asked_for(log_crane):
 
 def test_loops_gamma_and_tip(log_crane):
     loops, gamma, tip = (
-        crane.casadi_function(log_crane, name) for name in ("loops", "gamma", "tip")
+        crane.simulation.casadi_function(log_crane, name) for name in ("loops", "gamma", "tip")
     )
     place = crane.Kinematics(log_crane)
     for q, *_ in states(log_crane):
@@ -111,7 +114,7 @@ def test_a_rootfinder_closes_the_loops(log_crane):
     """q_P by q_A, as the page says; its derivative is gamma."""
     closure = log_crane.closure
     q = ca.SX.sym("q", log_crane.model.nv)
-    loops = crane.casadi_function(log_crane, "loops")
+    loops = crane.simulation.casadi_function(log_crane, "loops")
     active, passive = (list(map(int, x)) for x in (closure.active, closure.passive))
     problem = {"x": q[passive], "p": q[active], "g": loops(q)}
     closed = ca.rootfinder("closed", "newton", problem)
@@ -128,7 +131,7 @@ def test_a_rootfinder_closes_the_loops(log_crane):
 
 def test_the_simulation_s_rates_are_those_that_are_integrated(log_crane):
     machine = smooth(log_crane)
-    function = crane.casadi_function(machine, "simulation")
+    function = crane.simulation.casadi_function(machine, "simulation")
     drive = ValveDrive(machine, ValveSignals(machine, [0.0], {}))
     circuit, chart = drive.circuit, Chart.from_dynamics(crane.Dynamics(machine))
     stepper = RosenbrockStepper(chart, drive, circuit.state_count)
@@ -151,7 +154,7 @@ def test_the_simulation_s_rates_are_those_that_are_integrated(log_crane):
 def test_sundials_moves_the_crane_as_crane_does(log_crane):
     """The same rates by CVODES, two seconds of lifting."""
     machine = smooth(log_crane)
-    function = crane.casadi_function(machine, "simulation")
+    function = crane.simulation.casadi_function(machine, "simulation")
     signals = {"X_lift": 4.9, "X_ext": 6.6}
     command = ValveSignals(machine, [0.0], {joint: [x] for joint, x in signals.items()})
     drive = ValveDrive(machine, command)
@@ -220,11 +223,11 @@ def test_what_cannot_be_is_one_line(log_crane, slider_crank, five_bar, monkeypat
         (five_bar, "tip", {}, "has no tip, name a link"),
     ):
         with pytest.raises(CraneError) as error:
-            crane.casadi_function(machine, quantity, **options)
+            crane.simulation.casadi_function(machine, quantity, **options)
         assert said in str(error.value) and "\n" not in str(error.value)
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(CraneError, match="repository's folder: pip install '..casadi.'"):
-        crane.casadi_function(log_crane, "gravity")
+        crane.simulation.casadi_function(log_crane, "gravity")
 
 
 def test_dots_are_sums_of_products():

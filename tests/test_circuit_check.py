@@ -191,7 +191,9 @@ def test_what_nothing_relieves_rises_as_far_as_is_told(base):
     told = re.search("up to (.*) Pa over its (.*) Pa", finding.message).groups()
     machine = crane.load(path)
     time, signal = [0.0, 0.1, 0.1001, 0.8, 0.8001, 1.6], [0.0, 0.0, 10.0, 10.0, 0.0, 0.0]
-    run = crane.simulate(machine, crane.ValveSignals(machine, time, {"x": signal}), duration=1.6)
+    run = crane.simulate(
+        machine, crane.control.ValveSignals(machine, time, {"x": signal}), duration=1.6
+    )
     assert run.channels["share_supply"].max() > 0.999
     peak = run.channels["pressure_supply"].max()
     assert 0.99 < peak / sum(map(float, told)) < 1.0

@@ -157,9 +157,9 @@ def test_what_knows_cylinders_alone_says_so(tmp_path):
     assert "'x' has a valve that shares its flow: take valve-pd" in told.stderr
     two = crane.load("excavator_two_pumps")
     with pytest.raises(InputError, match="'slew' has a motor: take valve-pd"):
-        crane.ValveFeedforward(two, crane.task_trajectory(two, "grade"))
+        crane.control.ValveFeedforward(two, crane.task_trajectory(two, "grade"))
     with pytest.raises(InputError, match="that of 'rig' has load-sensing control"):
-        crane.excite_valves(machine, ["oil.bulk_modulus"], trials=2)
+        crane.identification.excite_valves(machine, ["oil.bulk_modulus"], trials=2)
 
 
 @pytest.mark.slow

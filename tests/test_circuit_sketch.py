@@ -321,4 +321,4 @@ def test_refusals(tmp_path, monkeypatch):
     assert done.returncode == 2 and "--com is for the mechanism, leave it out" in done.stderr
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="has no hydraulic circuit"):
-        crane.sketch_circuit(crane.load("tx40"), tmp_path / "x.png")
+        crane.view.sketch_circuit(crane.load("tx40"), tmp_path / "x.png")

@@ -470,7 +470,7 @@ def test_a_valve_of_priority_is_served_first(tmp_path, first):
         == machine.hydraulics
     )
     loads = [crane.Wrench("load_y", (-3e4, 0, 0))]
-    signals = crane.ValveSignals(machine, [0.0, 4.0], {"x": [1.0, 1.0], "y": [1.0, 1.0]})
+    signals = crane.control.ValveSignals(machine, [0.0, 4.0], {"x": [1.0, 1.0], "y": [1.0, 1.0]})
     run = crane.simulate(machine, signals, [0.05, 0.05], duration=2.0, step=5e-3, loads=loads)
     flows = np.array([run.channels[f"flow_{joint}_a"][-1] for joint in "xy"])
     assert flows.sum() == pytest.approx(6e-4, rel=1e-3)

@@ -63,19 +63,21 @@ def dressed(machine, seed=0):
         always = joint == machine.joints[0]
         if random.random() < 0.6 or always:
             coulomb, viscous = random.uniform(0.1, 2.0, 2)
-            friction[joint] = crane.Friction(
+            friction[joint] = crane.description.Friction(
                 coulomb, coulomb * random.uniform(-0.5, 0.5), viscous,
                 viscous * random.uniform(-0.5, 0.5), random.uniform(0.01, 0.2),
             )  # fmt: skip
         if random.random() < 0.4 or always:
             stiffness, damping, rest, force = random.uniform(0.1, 3.0, 4)
             forces.append(
-                crane.ForceElement(
+                crane.description.ForceElement(
                     joint, stiffness=stiffness, damping=damping, rest=rest, force=force
                 )
             )
         if random.random() < 0.5 and np.isfinite(limits).all():
-            stops.append(crane.EndStop(joint, stiffness=1e3, damping=random.uniform(0, 2)))
+            stops.append(
+                crane.description.EndStop(joint, stiffness=1e3, damping=random.uniform(0, 2))
+            )
     return machine.replace(friction=friction, forces=tuple(forces), end_stops=tuple(stops))
 
 
@@ -101,10 +103,10 @@ def machines(mini, slider_crank, stewart):
         arms = {name: crane.load(name) for name in ("ur5_robot", "xarm7")}
     load = crane.Payload("link7_tip", 0.2, (0.02, -0.01, 0.03), np.diag([2e-4, 3e-4, 4e-4]))
     elements = (
-        crane.ForceElement("q3", stiffness=2.0, rest=1.2),
-        crane.ForceElement("q3", stiffness=0.5, rest=0.3, force=0.2),
-        crane.ForceElement("X1", stiffness=800.0, rest=0.01, damping=30.0),
-        crane.ForceElement("q9", damping=0.7),
+        crane.description.ForceElement("q3", stiffness=2.0, rest=1.2),
+        crane.description.ForceElement("q3", stiffness=0.5, rest=0.3, force=0.2),
+        crane.description.ForceElement("X1", stiffness=800.0, rest=0.01, damping=30.0),
+        crane.description.ForceElement("q9", damping=0.7),
     )
     return {
         "mini": (mini, 1.2),

@@ -83,16 +83,17 @@ def test_named_controllers(forwarder, path):
 
 def test_errors(forwarder, path):
     with pytest.raises(InputError, match="no PI gains for driven joint 'X1'"):
-        crane.PI(forwarder, path, gains={"q1": crane.PIGains(1, 1)})
-    form = r"gains=\{'X1': crane.PIGains\(kp, ki\)\}"
+        crane.PI(forwarder, path, gains={"q1": crane.description.PIGains(1, 1)})
+    form = r"gains=\{'X1': crane.description.PIGains\(kp, ki\)\}"
     with pytest.raises(InputError, match=f"machine file, or in Python {form}$"):
-        crane.PI(forwarder, path, gains={"q1": crane.PIGains(1, 1)})
-    good = {joint: crane.PIGains(1, 1) for joint in forwarder.active}
+        crane.PI(forwarder, path, gains={"q1": crane.description.PIGains(1, 1)})
+    good = {joint: crane.description.PIGains(1, 1) for joint in forwarder.active}
     for wrong in ((1.0, 2.0), {"kp": 1.0, "ki": 2.0}, 3.0, None):
         told = f"^gains of 'X1' are a {type(wrong).__name__}, give {form}$"
         with pytest.raises(InputError, match=told):
             crane.PI(forwarder, path, gains=good | {"X1": wrong})
-    told = r"^gains are a list, give them by joint: gains=\{'JOINT': crane.PIGains\(kp, ki\)\}$"
+    gains = r"crane.description.PIGains\(kp, ki\)"
+    told = rf"^gains are a list, give them by joint: gains=\{{'JOINT': {gains}\}}$"
     with pytest.raises(InputError, match=told):
         crane.PI(forwarder, path, gains=[(1.0, 2.0)] * 3)
     with pytest.raises(InputError, match="the bandwidth is 0 rad/s"):

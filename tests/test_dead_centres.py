@@ -59,7 +59,7 @@ def test_a_crank_turns_through_the_dead_centres_of_its_slider(tmp_path, method, 
 def test_forces_and_friction_stay_those_of_the_drive(tmp_path):
     """The slider is pushed through its dead centres, against friction of all joints."""
     friction = {
-        joint: crane.Friction(coulomb=0.2, viscous=0.1, smoothing=0.05)
+        joint: crane.description.Friction(coulomb=0.2, viscous=0.1, smoothing=0.05)
         for joint in ("a", "b", "s")
     }
     machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6).replace(friction=friction)
@@ -151,7 +151,7 @@ def test_a_rocker_that_turns_back_everywhere(tmp_path):
         np.testing.assert_allclose(other, runs[0], rtol=0, atol=1e-7)
 
 
-class Weighed(crane.ControlLaw):
+class Weighed(crane.control.ControlLaw):
     """A spring along a reference, and what holds the weight."""
 
     def __init__(self, machine, reference):

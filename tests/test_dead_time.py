@@ -65,7 +65,7 @@ def test_a_spool_follows_a_program_that_holds_its_signals(tmp_path, late):
     """A sum of steps, of the period 10 ms; one after the other, with the first one before them."""
     machine = rig(tmp_path, ORIFICE | QUICK | {"delay": late})
     signals = 0.6 * np.sin(np.arange(31))
-    program = crane.SampledCommand(
+    program = crane.control.SampledCommand(
         lambda t, q, v, p: [signals[round(t / 0.01)]], machine, period=0.01
     )
     for _ in range(2):  # nothing is remembered of the first run
@@ -115,7 +115,7 @@ def test_a_law_is_asked_each_millisecond_and_held(tmp_path):
         q_ref, v_ref, _ = reference(t)
         return 20.0 * (q_ref - q) + 0.5 * (v_ref - v)
 
-    program = crane.SampledCommand(unit, machine, period=1e-3)
+    program = crane.control.SampledCommand(unit, machine, period=1e-3)
     two = crane.simulate(machine, program, duration=0.4)
     np.testing.assert_allclose(one.q, two.q, atol=1e-9)
     np.testing.assert_allclose(one.channels["voltage_x"], two.channels["voltage_x"], atol=1e-6)
@@ -172,7 +172,7 @@ def test_how_a_motion_changes_with_dead_time(tmp_path):
     np.testing.assert_allclose(found.derivatives[:, 0, 0], slope, atol=2e-3 * np.abs(slope).max())
     weights = np.ones((501, 1))
     with pytest.raises(CraneError, match="changes when signals arrive, which a gradient takes"):
-        crane.gradient(machine, control(machine), functional=weights, duration=0.5,
+        crane.simulation.gradient(machine, control(machine), functional=weights, duration=0.5,
                        parameters=["valve.x.delay"], outputs=["x"])  # fmt: skip
 
 

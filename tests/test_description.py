@@ -28,14 +28,10 @@ from crane.common.errors import (
     MechanismError,
     suggest_names,
 )
-from crane.description import (
-    LOOP_TYPES,
-    Friction,
-    bundled_machines,
-    example_robots,
-    inertia_problem,
-)
+from crane.description import Friction, bundled_machines, example_robots
+from crane.description.inertia_feasibility import inertia_problem
 from crane.description.machine_lookup import find_machine_file
+from crane.description.specification import LOOP_TYPES
 
 NO_MACHINE = (
     "not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an SDF (.sdf) or a MJCF "

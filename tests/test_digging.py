@@ -58,7 +58,7 @@ def lever_of_bucket(at):
 
 def test_what_the_drives_give_alone_is_pressure_times_levers(excavator):
     """Moments about the pins of rocker, link and bucket; about those of the arm."""
-    found = crane.breakout(excavator)
+    found = crane.ratings.breakout(excavator)
     assert (found.bucket.joint, found.bucket.pivot) == ("X_bucket", "bucket")
     assert (found.arm.joint, found.arm.pivot) == ("X_arm", "arm")
     assert found.bucket.radius == pytest.approx(1.47, rel=1e-12)
@@ -93,7 +93,7 @@ def test_what_the_drives_give_alone_is_pressure_times_levers(excavator):
 @pytest.mark.parametrize("weights", [False, True])
 def test_what_holds_ends_what_digs(excavator, weights):
     """Every limit agrees with free bodies there; no configuration of a grid gives more force."""
-    found = crane.breakout(excavator, weights=weights)
+    found = crane.ratings.breakout(excavator, weights=weights)
     for one in (found.bucket, found.arm):
         q = excavator.closure.solve(one.q_a)
         way, gravity = tangent(excavator, q, one.pivot), G if weights else NONE
@@ -129,10 +129,10 @@ def test_what_holds_ends_what_digs(excavator, weights):
 
 
 def test_arm_and_bucket_are_named_or_found(excavator):
-    found = crane.breakout(excavator, bucket="X_arm", arm="X_boom")
+    found = crane.ratings.breakout(excavator, bucket="X_arm", arm="X_boom")
     assert (found.bucket.joint, found.arm.joint) == ("X_arm", "X_boom")
-    assert crane.breakout(excavator, bucket="X_boom").arm is None
-    text = crane.breakout(excavator).to_markdown()
+    assert crane.ratings.breakout(excavator, bucket="X_boom").arm is None
+    text = crane.ratings.breakout(excavator).to_markdown()
     assert "| bucket | X_bucket | bucket | 1.4700 | 140.06 |" in text
 
 
@@ -140,17 +140,17 @@ def test_arm_and_bucket_are_named_or_found(excavator):
 def test_a_tool_that_pushes_upwards_lifts(excavator):
     """As many newtons as the capacity has kilograms times g, by the same causes."""
     chart = crane.capacity(excavator, step=1.0)
-    field = crane.tool_force(excavator, "up", step=1.0)
+    field = crane.ratings.tool_force(excavator, "up", step=1.0)
     assert np.array_equal(np.isfinite(field.forces), np.isfinite(chart.loads))
     assert np.nanmax(np.abs(field.forces / (9.81 * chart.loads) - 1)) < 1e-13
     assert np.array_equal(field.limiting_factor_index, chart.limiting_factor_index)
-    other = crane.tool_force(excavator, (0.0, 0.0, 2.0), step=1.0)
+    other = crane.ratings.tool_force(excavator, (0.0, 0.0, 2.0), step=1.0)
     assert np.array_equal(other.forces, field.forces, equal_nan=True)
 
 
 @pytest.mark.parametrize("direction", ["tangent", "-tangent", "normal", "in", (1.0, 0.0, -1.0)])
 def test_every_place_is_what_statics_by_hand_give(excavator, direction):
-    field = crane.tool_force(excavator, direction, step=3.0, slews=[0.0, 1.2])
+    field = crane.ratings.tool_force(excavator, direction, step=3.0, slews=[0.0, 1.2])
     ways = field.section_directions()
     reached = np.argwhere(np.isfinite(field.forces) & (field.forces > 0))
     for s, b, a in reached[np.random.default_rng(0).choice(len(reached), 8, replace=False)]:
@@ -189,7 +189,7 @@ def test_every_place_is_what_statics_by_hand_give(excavator, direction):
 )
 def test_slopes_of_tool_forces_are_those_of_fields_beside(excavator, given, gap):
     """A direction that turns with the tool, too; slewed."""
-    field = crane.tool_force(excavator, **given, step=1.5, slews=[0.4])
+    field = crane.ratings.tool_force(excavator, **given, step=1.5, slews=[0.4])
     works = "X_boom" if given["direction"] == "normal" else "X_arm"
     names = ["boom_lift.y", "arm.mass", f"cylinder.{works}.area_a"]
     slopes, beside = field.derivatives(names), MachineVariants(excavator)
@@ -198,7 +198,7 @@ def test_slopes_of_tool_forces_are_those_of_fields_beside(excavator, given, gap)
         value = beside.values[name]
         step = 1e-4 * (value or 0.1)
         more, less = (
-            crane.tool_force(beside.machine({name: value + x * step}), **given, **at)
+            crane.ratings.tool_force(beside.machine({name: value + x * step}), **given, **at)
             for x in (1, -1)
         )
         with np.errstate(invalid="ignore"):
@@ -226,7 +226,7 @@ def test_slopes_of_tool_forces_are_those_of_fields_beside(excavator, given, gap)
 )
 def test_what_digs_not_is_said_in_one_line(name, given, said):
     with pytest.raises(crane.CraneError, match=said) as error:
-        crane.breakout(crane.load(name), **given)
+        crane.ratings.breakout(crane.load(name), **given)
     assert "\n" not in str(error.value)
 
 
@@ -244,5 +244,5 @@ def test_what_digs_not_is_said_in_one_line(name, given, said):
 )
 def test_forces_that_cannot_be_are_said_in_one_line(excavator, given, said):
     with pytest.raises(crane.CraneError, match=said) as error:
-        crane.tool_force(excavator, **given)
+        crane.ratings.tool_force(excavator, **given)
     assert "\n" not in str(error.value)

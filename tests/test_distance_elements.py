@@ -18,6 +18,7 @@ from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen import Program, Tape
 from crane.codegen.differentiation import differentiate
 from crane.common.errors import CraneWarning, InputError
+from crane.description import ForceElement, Rope
 from crane.dynamics.compiled_dynamics import QUANTITIES, STICK_SLIP_QUANTITIES
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.identification.mechanics.base_parameters import random_samples
@@ -65,18 +66,18 @@ def clad(machine, seed):
     far = [float(np.linalg.norm(at_home[two] - at_home[one])) for one, two in pairs]
     return machine.replace(
         forces=(
-            crane.ForceElement("", 30.0, 0.8 * far[0], 4.0, 2.0, between=pairs[0]),
-            crane.ForceElement("", 20.0, between=pairs[0]),
-            crane.ForceElement(damping=3.0, between=pairs[1]),
-            crane.ForceElement(machine.joints[0], stiffness=2.0, damping=0.1),
+            ForceElement("", 30.0, 0.8 * far[0], 4.0, 2.0, between=pairs[0]),
+            ForceElement("", 20.0, between=pairs[0]),
+            ForceElement(damping=3.0, between=pairs[1]),
+            ForceElement(machine.joints[0], stiffness=2.0, damping=0.1),
         ),
         gas_springs=(
-            crane.GasSpring("one", 1e-3, 2e4, 1e-3, far[0], 1.4, between=pairs[0]),
-            crane.GasSpring("two", 1e-3, 1e4, 2e-3, far[2], between=pairs[2]),
+            crane.description.GasSpring("one", 1e-3, 2e4, 1e-3, far[0], 1.4, between=pairs[0]),
+            crane.description.GasSpring("two", 1e-3, 1e4, 2e-3, far[2], between=pairs[2]),
         ),
         ropes=(
-            crane.Rope(pairs[3], 0.9 * far[3], 500.0, 2.0),
-            crane.Rope(pairs[3], 1.02 * far[3], 300.0),
+            Rope(pairs[3], 0.9 * far[3], 500.0, 2.0),
+            Rope(pairs[3], 1.02 * far[3], 300.0),
         ),
     )
 
@@ -182,11 +183,11 @@ def test_large_machines(family, joints, tmp_path):
 
 def test_forces_are_the_slope_of_what_is_stored(mini):
     """With laws and lengths written out here; on both backends; added to gravity's."""
-    gas = crane.GasSpring("strut", 2e-4, 3e5, 2e-5, 0.15, 1.3, between=STRUT)
+    gas = crane.description.GasSpring("strut", 2e-4, 3e5, 2e-5, 0.15, 1.3, between=STRUT)
     machine = bare(mini).replace(
-        forces=(crane.ForceElement("", 300.0, 0.2, 0.0, -4.0, between=BOOM),),
+        forces=(ForceElement("", 300.0, 0.2, 0.0, -4.0, between=BOOM),),
         gas_springs=(gas,),
-        ropes=(crane.Rope(BOOM, 0.2, 900.0, 3.0),),
+        ropes=(Rope(BOOM, 0.2, 900.0, 3.0),),
     )
 
     def stored(q_a):
@@ -218,8 +219,8 @@ def test_forces_are_the_slope_of_what_is_stored(mini):
 
 
 def test_dampers_and_ropes_take_out_what_the_length_s_rate_says(mini):
-    rope = crane.Rope(STRUT, 0.05, 400.0, 1.5)
-    damper = crane.ForceElement(damping=7.0, between=BOOM)
+    rope = Rope(STRUT, 0.05, 400.0, 1.5)
+    damper = ForceElement(damping=7.0, between=BOOM)
     machine = bare(mini).replace(forces=(damper,), ropes=(rope,))
     dynamics, home = crane.Dynamics(machine), np.array([0.2, 0.01, 0.02])
     random = np.random.default_rng(4)
@@ -244,11 +245,11 @@ def test_the_balance_of_energies(mini):
     held = zip(machine.active, (0.3, 2e3, 4e3), middle, weight, strict=True)
     machine = machine.replace(
         forces=(
-            *(crane.ForceElement(x, k, float(at + w / k)) for x, k, at, w in held),
-            crane.ForceElement("", 30.0, far, 8.0, between=BOOM),
+            *(ForceElement(x, k, float(at + w / k)) for x, k, at, w in held),
+            ForceElement("", 30.0, far, 8.0, between=BOOM),
         ),
-        gas_springs=(crane.GasSpring("strut", 2e-5, 3e5, 2e-5, 0.1, between=STRUT),),
-        ropes=(crane.Rope(BOOM, far + 3e-4, 200.0, 0.5),),
+        gas_springs=(crane.description.GasSpring("strut", 2e-5, 3e5, 2e-5, 0.1, between=STRUT),),
+        ropes=(Rope(BOOM, far + 3e-4, 200.0, 0.5),),
     )
     start = np.array([0.3, 0.018, 0.013]), np.array([0.5, 0.0, 0.02])
     run = crane.simulate(machine, initial=start, duration=1.0, step=5e-4)
@@ -258,7 +259,7 @@ def test_the_balance_of_energies(mini):
     assert np.abs(gap).max() < 1e-6 * np.ptp(channels["dissipated"])
     boom = [length(machine, q_a, BOOM) - far - 3e-4 for q_a in run.q[::20]]
     assert sum(one * two < 0 for one, two in pairwise(boom)) >= 2
-    batch = crane.simulate_batch(machine, initial=[start[0]], duration=0.05)
+    batch = crane.simulation.simulate_batch(machine, initial=[start[0]], duration=0.05)
     alone = crane.simulate(machine, initial=start[0], duration=0.05)
     np.testing.assert_array_equal(batch.q[0], alone.q)
 
@@ -313,7 +314,7 @@ def lift(folder, **elements):
 
 def test_a_mass_on_a_spring_oscillates(tmp_path):
     """m z'' = k (l - rest) - m g with l = 1.5 - z: about z_0 by cos(sqrt(k / m) t)."""
-    spring = crane.ForceElement("", 50.0, 0.4, between=("eye", "ball"))
+    spring = ForceElement("", 50.0, 0.4, between=("eye", "ball"))
     machine = lift(tmp_path, forces=(spring,))
     run = crane.simulate(machine, initial=[0.2], duration=2.0)
     middle = 1.1 - 2 * oracles.GRAVITY / 50
@@ -323,7 +324,7 @@ def test_a_mass_on_a_spring_oscillates(tmp_path):
 
 def test_a_ball_on_a_rope_falls_freely_until_it_is_taut(tmp_path):
     """From the rope's other end, then about m g / k under its length, then flying up again."""
-    rope = crane.Rope(("eye", "ball"), 0.8, 400.0)
+    rope = Rope(("eye", "ball"), 0.8, 400.0)
     machine = lift(tmp_path, ropes=(rope,))
     g, rate = oracles.GRAVITY, np.sqrt(400.0 / 2)
     run = crane.simulate(machine, initial=[1.5], duration=1.0, step=2e-4)
@@ -344,7 +345,7 @@ def test_a_ball_on_a_rope_falls_freely_until_it_is_taut(tmp_path):
 
 
 def test_ropes_pull_and_never_push(tmp_path):
-    rope = crane.Rope(("eye", "ball"), 0.8, 400.0, 5.0)
+    rope = Rope(("eye", "ball"), 0.8, 400.0, 5.0)
     dynamics = crane.Dynamics(lift(tmp_path, ropes=(rope,)))
     for z, v, force in (
         (0.8, -9.0, 0.0), (0.7, -9.0, 0.0), (0.6, 0.0, 40.0), (0.6, -0.1, 60.0), (0.6, 0.1, 20.0),
@@ -357,7 +358,7 @@ def test_a_spring_of_no_length_balances_a_pendulum(slider_crank):
     """k c r sin(angle): with rest 0 the force is k (p_2 - p_1), linear in the ends' places."""
     machine = bare(slider_crank)
     one, two = places(machine, machine.home, ("guide", "rod_eye"))
-    spring = crane.ForceElement(stiffness=70.0, between=("guide", "rod_eye"))
+    spring = ForceElement(stiffness=70.0, between=("guide", "rod_eye"))
     dynamics = crane.Dynamics(machine.replace(forces=(spring,)))
     crank = oracles.SliderCrank()
 
@@ -373,12 +374,12 @@ def test_a_spring_of_no_length_balances_a_pendulum(slider_crank):
 def test_frames_that_meet_have_no_direction_and_no_force(tmp_path):
     """Along a motion nothing acts there; at home it is refused unless its law says nothing."""
     ends = ("eye", "ball")
-    gas = crane.GasSpring("gas", 1e-3, 1e5, 1e-3, between=ends)
+    gas = crane.description.GasSpring("gas", 1e-3, 1e5, 1e-3, between=ends)
     machine = lift(
         tmp_path,
-        forces=(crane.ForceElement("", 30.0, 0.2, 5.0, 1.0, between=ends),),
+        forces=(ForceElement("", 30.0, 0.2, 5.0, 1.0, between=ends),),
         gas_springs=(gas,),
-        ropes=(crane.Rope(ends, 0.3, 100.0, 1.0),),
+        ropes=(Rope(ends, 0.3, 100.0, 1.0),),
     )
     for backend in ("compiled", "pinocchio"):
         dynamics = crane.Dynamics(machine, backend=backend)
@@ -387,7 +388,7 @@ def test_frames_that_meet_have_no_direction_and_no_force(tmp_path):
         push = dynamics.passive([[1.5 - 1e-9], [1.5 + 1e-9]], [[0.0], [0.0]])[:, 0]
         assert push == pytest.approx([-107.0, 107.0], rel=1e-6)  # one limit on each side
     meeting = crane.load(tmp_path / "lift.urdf", changes={"eye.z": 0.0})
-    calm = crane.ForceElement(stiffness=30.0, between=ends)
+    calm = ForceElement(stiffness=30.0, between=ends)
     assert meeting.replace(forces=(calm,), ropes=machine.ropes).forces == (calm,)
     line = "between 'eye' and 'ball' has no direction, its frames meet at home"
     with pytest.raises(InputError, match=f"the force element {line}"):
@@ -411,7 +412,7 @@ def test_a_floating_body_on_springs(tmp_path):
         '<joint name="base" type="floating"><parent link="world"/><child link="box"/></joint>'
         f"{anchors}</robot>"
     )
-    springs = tuple(crane.ForceElement("", 90.0, 0.9, between=(f"a{i}", f"e{i}")) for i in "012")
+    springs = tuple(ForceElement("", 90.0, 0.9, between=(f"a{i}", f"e{i}")) for i in "012")
     machine = crane.load(tmp_path / "box.urdf").replace(forces=springs)
     assert machine.coordinates.floating_base_columns
     same_on_both_backends(machine, samples_of(machine, 0.3))
@@ -445,12 +446,12 @@ def given(folder):
 
 def test_machine_files_hold_them(tmp_path):
     machine = crane.load(given(tmp_path))
-    spring = crane.ForceElement("", 40.0, 0.2, 3.0, -1.0, between=("ground", "coupler_arm"))
+    spring = ForceElement("", 40.0, 0.2, 3.0, -1.0, between=("ground", "coupler_arm"))
     assert machine.forces[1] == spring
     assert machine.gas_springs == (
-        crane.GasSpring("lift", 1e-4, 1e5, 1e-4, between=("pin_B", "crank_arm")),
+        crane.description.GasSpring("lift", 1e-4, 1e5, 1e-4, between=("pin_B", "crank_arm")),
     )
-    assert machine.ropes == (crane.Rope(("coupler_pin", "pin_B"), 0.3, 1e4, 0.2),)
+    assert machine.ropes == (Rope(("coupler_pin", "pin_B"), 0.3, 1e4, 0.2),)
     again = crane.load(crane.write_machine(machine, tmp_path / "again"))
     assert again.force_elements == machine.force_elements
 
@@ -537,17 +538,17 @@ def test_is_refused(broken, tmp_path):
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda m: m.replace(ropes=(crane.Rope(("base", "moon"), 1, 1),)), "frame 'moon' is unk"),
-        (lambda m: m.replace(ropes=(crane.Rope(("link1", "link1_B"), 1, 1),)), "within one body"),
-        (lambda _: crane.Rope(("base", "base"), 1, 1), "needs two frames, give two"),
-        (lambda _: crane.Rope(("base", "link1"), 0, 1), "length of rope between 'base' and"),
-        (lambda _: crane.ForceElement(stiffness=1.0), "acts on nothing, give it a joint or two"),
+        (lambda m: m.replace(ropes=(Rope(("base", "moon"), 1, 1),)), "frame 'moon' is unk"),
+        (lambda m: m.replace(ropes=(Rope(("link1", "link1_B"), 1, 1),)), "within one body"),
+        (lambda _: Rope(("base", "base"), 1, 1), "needs two frames, give two"),
+        (lambda _: Rope(("base", "link1"), 0, 1), "length of rope between 'base' and"),
+        (lambda _: ForceElement(stiffness=1.0), "acts on nothing, give it a joint or two"),
         (
-            lambda _: crane.ForceElement("q1", stiffness=1.0, between=BOOM),
+            lambda _: ForceElement("q1", stiffness=1.0, between=BOOM),
             "is on 'q1', too, keep one of the two",
         ),
         (
-            lambda _: crane.GasSpring("x", 1e-4, -1.0, 1e-4, between=BOOM),
+            lambda _: crane.description.GasSpring("x", 1e-4, -1.0, 1e-4, between=BOOM),
             "pressure of gas spring between 'base' and 'link7' is -1, it must not be negative",
         ),
     ],
@@ -582,9 +583,9 @@ def test_meeting_frames_of_a_file_are_told_with_the_section(tmp_path):
 
 def test_columns_of_identification(mini):
     """Stiffness, preload and damping of a distance, and a strut's scale; what is known stays."""
-    spring = crane.ForceElement("", 30.0, 0.0, 4.0, -2.0, between=BOOM)
-    gas = crane.GasSpring("strut", 2e-4, 3e5, 2e-5, 0.15, 1.3, between=STRUT)
-    rope = crane.Rope(BOOM, 0.05, 90.0, 1.0)
+    spring = ForceElement("", 30.0, 0.0, 4.0, -2.0, between=BOOM)
+    gas = crane.description.GasSpring("strut", 2e-4, 3e5, 2e-5, 0.15, 1.3, between=STRUT)
+    rope = Rope(BOOM, 0.05, 90.0, 1.0)
     machine = bare(mini).replace(forces=(spring,), gas_springs=(gas,), ropes=(rope,))
     samples = random_samples(IdentificationModel(machine), 30, seed=8)
     tau = crane.Dynamics(machine).inverse(samples.q_a, samples.v_a, samples.a_a)
@@ -637,7 +638,7 @@ def test_identified_machines_keep_them(tmp_path):
     terms = [*default_terms(locked), GasSpringTerm(locked, "strut")]
     result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
     scale = result.parameters[result.model.names.index("strut.gas_scale")]
-    written = crane.load(crane.write_identified(result, tmp_path / "out"))
+    written = crane.load(crane.identification.write_identified(result, tmp_path / "out"))
     assert written.ropes == machine.ropes and written.forces == machine.forces
     (gas,) = written.gas_springs
     assert gas.pressure == pytest.approx(3e5 * scale) and gas.between == STRUT
@@ -648,14 +649,14 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
     pytest.importorskip("mujoco")
     machine = bare(mini).replace(
         forces=(
-            crane.ForceElement("", 30.0, 0.2, 0.0, 3.0, between=BOOM),
-            crane.ForceElement("", 30.0, 0.1, 0.0, -6.0, between=STRUT),
-            crane.ForceElement(force=2.0, between=STRUT),
+            ForceElement("", 30.0, 0.2, 0.0, 3.0, between=BOOM),
+            ForceElement("", 30.0, 0.1, 0.0, -6.0, between=STRUT),
+            ForceElement(force=2.0, between=STRUT),
         ),
-        ropes=(crane.Rope(STRUT, 0.1, 90.0, 1.0),),
+        ropes=(Rope(STRUT, 0.1, 90.0, 1.0),),
     )
     with pytest.warns(CraneWarning) as told:
-        crane.write_mjcf(machine, tmp_path / "mini.xml")
+        crane.formats.write_mjcf(machine, tmp_path / "mini.xml")
     (line,) = [str(x.message) for x in told if "has no place for" in str(x.message)]
     names = "between 'link3_H' and 'A1_rod'"
     assert line.count(f"the constant force of the force element {names}") == 2
@@ -666,9 +667,9 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
     first, second = (x for x in again.forces if x.between)
     assert first.between == BOOM and first.rest == pytest.approx(0.3)  # 30 (l - 0.3)
     assert (second.stiffness, second.rest) == (30.0, 0.0)
-    assert again.ropes == (crane.Rope(STRUT, 0.1, 90.0),)
+    assert again.ropes == (Rope(STRUT, 0.1, 90.0),)
     with pytest.warns(CraneWarning, match=r"springs and forces, ropes"):
-        crane.write_urdf_plus(machine, tmp_path / "mini.urdf")
+        crane.formats.write_urdf_plus(machine, tmp_path / "mini.urdf")
 
 
 def test_operations_of_machines_without_elements_read_none():
@@ -681,6 +682,10 @@ def test_operations_of_machines_without_elements_read_none():
     )
     sizes = [
         len(crane.Dynamics(machine.replace(ropes=ropes)).formula_constants)
-        for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)
+        for ropes in (
+            (),
+            (Rope(BOOM, 1, 1),),
+            (Rope(BOOM, 1, 1),) * 2,
+        )
     ]
     assert [two - one for one, two in pairwise(sizes)] == [28, 28]

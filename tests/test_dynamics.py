@@ -20,13 +20,16 @@ STROKE = 0.030  # [m]
 
 # Everything one machine may carry along its joints, on active and on passive ones.
 ELEMENTS = (
-    crane.ForceElement("q3", stiffness=2.0, rest=1.2),
-    crane.ForceElement("q3", stiffness=0.5, rest=0.3, force=0.2),
-    crane.ForceElement("q9", damping=0.7),
-    crane.ForceElement("X1", stiffness=800.0, rest=0.01, damping=30.0),
-    crane.ForceElement("q7", force=-0.3),
+    crane.description.ForceElement("q3", stiffness=2.0, rest=1.2),
+    crane.description.ForceElement("q3", stiffness=0.5, rest=0.3, force=0.2),
+    crane.description.ForceElement("q9", damping=0.7),
+    crane.description.ForceElement("X1", stiffness=800.0, rest=0.01, damping=30.0),
+    crane.description.ForceElement("q7", force=-0.3),
 )
-STOPS = (crane.EndStop("X1", stiffness=2e5, damping=20.0), crane.EndStop("X2", stiffness=1e5))
+STOPS = (
+    crane.description.EndStop("X1", stiffness=2e5, damping=20.0),
+    crane.description.EndStop("X2", stiffness=1e5),
+)
 
 
 @pytest.fixture(scope="module")
@@ -442,7 +445,7 @@ def test_friction_brakes_the_motion_and_is_left_out_unless_asked_for(mini):
 
 
 def test_viscous_friction_of_passive_joints_acts_through_gamma(mini):
-    viscous = {joint: crane.Friction(viscous=0.4) for joint in oracles.PASSIVE}
+    viscous = {joint: crane.description.Friction(viscous=0.4) for joint in oracles.PASSIVE}
     dynamics = crane.Dynamics(mini.replace(friction=viscous))
     q_a, v_a, _, _ = states(20, seed=15)
     slopes = oracles.mini_forwarder_gamma(*q_a.T[1:])
@@ -456,7 +459,7 @@ def test_friction_law_and_its_smoothing(slider_crank):
     q_a = np.array([1.1])
     for smoothing in (0.0, 0.05, 1e-3):
         machine = slider_crank.replace(
-            friction={"theta": crane.Friction(**law, smoothing=smoothing)}
+            friction={"theta": crane.description.Friction(**law, smoothing=smoothing)}
         )
         dynamics = crane.Dynamics(machine)
         for v in (-2.0, -0.03, 0.0, 0.03, 2.0):
@@ -504,8 +507,8 @@ def test_gas_follows_its_law_and_stores_its_work(bare, exponent, backend):
     """p V^n = const on an active and on a passive joint; force = - d/dq_A of -int p dV."""
     area, pressure, volume, rest = -3e-4, 4e5, 2e-5, 0.01
     gas = (
-        crane.GasSpring("X1", area, pressure, volume, rest, exponent),
-        crane.GasSpring("q3", 2e-5, 1e5, 8e-5, 1.3, exponent),
+        crane.description.GasSpring("X1", area, pressure, volume, rest, exponent),
+        crane.description.GasSpring("q3", 2e-5, 1e5, 8e-5, 1.3, exponent),
     )
     dynamics, plain = (
         crane.Dynamics(bare.replace(gas_springs=g), backend=backend) for g in (gas, ())
@@ -536,7 +539,7 @@ def test_gas_follows_its_law_and_stores_its_work(bare, exponent, backend):
 
 
 def test_dampers_take_power_out(bare):
-    damper = crane.ForceElement("q9", damping=0.7)
+    damper = crane.description.ForceElement("q9", damping=0.7)
     dynamics = crane.Dynamics(bare.replace(forces=(damper,)))
     q_a, v_a, _, _ = states(10, seed=17)
     slope = oracles.mini_forwarder_gamma(*q_a.T[1:])["q9"][:, 0]
@@ -768,7 +771,7 @@ def test_motion_equals_mujoco(mini):
     middle = np.array([0.0, 0.015, 0.015])
     weight = crane.Dynamics(mini).gravity(middle)
     springs = tuple(
-        crane.ForceElement(joint, stiffness=k, rest=float(m + w / k), damping=c)
+        crane.description.ForceElement(joint, stiffness=k, rest=float(m + w / k), damping=c)
         for joint, k, c, m, w in zip(
             mini.active, (0.3, 2000.0, 4000.0), (0.02, 20.0, 20.0), middle, weight, strict=True
         )
@@ -805,7 +808,7 @@ def test_motion_equals_mujoco(mini):
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
 def test_from_rest_friction_that_sticks_is_against_the_acceleration(mini, backend):
     """Offsets always act, Coulomb friction only on moving joints, also passive ones."""
-    laws = {**mini.friction, "q4": crane.Friction(coulomb=0.2, stiction=0.1)}
+    laws = {**mini.friction, "q4": crane.description.Friction(coulomb=0.2, stiction=0.1)}
     machine = mini.replace(friction=laws)
     rough = crane.Dynamics(machine, backend=backend)
     bare = crane.Dynamics(mini.replace(friction={}), backend=backend)

@@ -25,7 +25,7 @@ def tremble():
     knots = small * (machine.upper - machine.lower)
     knots[[0, -1]] = 0
     knots += machine.home[machine.closure.active]
-    path = crane.Trajectory(CubicSpline(np.linspace(0, 6, 4), knots, bc_type="clamped"))
+    path = crane.motion.Trajectory(CubicSpline(np.linspace(0, 6, 4), knots, bc_type="clamped"))
     control = crane.ComputedTorque(machine, path)
     return machine, crane.simulate(machine, control, path(0.0)[:2])
 

@@ -35,7 +35,9 @@ def machine(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(machine):
     fit = [*FIT, "oil.gas_exponent"]
-    return crane.excite_valves(machine, fit, duration=5.0, step=0.005, noise=NOISE, trials=8)
+    return crane.identification.excite_valves(
+        machine, fit, duration=5.0, step=0.005, noise=NOISE, trials=8
+    )
 
 
 def test_a_notebook_shows_signals_and_what_they_tell(found):
@@ -47,7 +49,11 @@ def test_a_notebook_shows_signals_and_what_they_tell(found):
 def strokes(machine, signals, time):
     """Of a machine that the signals drive, and its velocities."""
     run = crane.simulate(
-        machine, crane.ValveSignals(machine, time, signals), None, time[-1], time[1] - time[0]
+        machine,
+        crane.control.ValveSignals(machine, time, signals),
+        None,
+        time[-1],
+        time[1] - time[0],
     )
     return run.q[:, 0], run.v[:, 0]
 
@@ -65,7 +71,7 @@ def test_the_steady_velocity_at_full_opening(tmp_path, valve, backwards):
     signal = part.neutral + (part.full - part.neutral) * (-1 if backwards else 1)
     start = 0.45 if backwards else 0.05
     run = crane.simulate(
-        machine, crane.ValveSignals(machine, [0.0], {"x": [signal]}), [start], 1.0
+        machine, crane.control.ValveSignals(machine, [0.0], {"x": [signal]}), [start], 1.0
     )
     settled = np.abs(run.v[-300:, 0]).mean()
     force = 2000.0 * 9.81
@@ -103,7 +109,9 @@ def test_the_pump_delivers_what_is_asked_for(tmp_path):
         tmp_path, VALVE, joints=("x", "y"), friction={"viscous": 600.0},
         supply={"pressure": 140e5, "tank": 8e5, "flow": 30 / 6e4, "droop": 2e5, "volume": 2e-3},
     )  # fmt: skip
-    found = crane.excite_valves(machine, ["load_x.mass"], duration=6.0, trials=3, rate=4.0)
+    found = crane.identification.excite_valves(
+        machine, ["load_x.mass"], duration=6.0, trials=3, rate=4.0
+    )
     assert 0.5 < found.pump_flow_share <= 1.0
     flows = found.run.channels
     drawn = sum(np.maximum(flows[f"flow_{x}_{y}"], 0.0) for x in "xy" for y in "ab")
@@ -122,8 +130,8 @@ def test_the_information_is_that_of_derivatives_by_hand(machine, found):
         ends = []
         for side in (1.0, -1.0):
             other = crane.load(machine.path, changes={one.name: one.start * (1 + side * 1e-3)})
-            drive = crane.ValveDrive(
-                other, crane.ValveSignals(other, time, found.signals),
+            drive = crane.control.ValveDrive(
+                other, crane.control.ValveSignals(other, time, found.signals),
                 {"x": (found.run.channels["pressure_x_a"][0],
                        found.run.channels["pressure_x_b"][0])},
             )  # fmt: skip
@@ -166,7 +174,7 @@ def test_estimates_spread_as_expected_and_less_than_of_a_joystick(machine, tmp_p
     """
     from scipy.stats import chi2
 
-    count, found = 20, crane.excite_valves(machine, FIT, trials=40, **QUICK)
+    count, found = 20, crane.identification.excite_valves(machine, FIT, trials=40, **QUICK)
     wrong = crane.load(machine.path, changes={
         "load_x.mass": 2010.0, "oil.bulk_modulus": 1.19e9, "friction.x.viscous": 700.0,
     })  # fmt: skip
@@ -204,7 +212,7 @@ def test_of_a_log_crane_they_tell_more_than_its_task_of_levers():
     """In the twenty seconds of the machine's own task, ln det and every deviation."""
     machine = crane.load("patu655", lock={"slew": 0.0}, changes={"payload.mass": 211.4})
     fit = ["payload.mass", "oil.bulk_modulus", "friction.X_lift.viscous", "valve.X_lift.neutral"]
-    found = crane.excite_valves(machine, fit, duration=20.0, trials=30)
+    found = crane.identification.excite_valves(machine, fit, duration=20.0, trials=30)
     told = SignalInformation(machine, fit, None, None, 0)
     stir = crane.simulate(machine, crane.joystick(machine, "stir"), None, 20.0, 0.01)
     usual = told.measures(stir)
@@ -212,7 +220,7 @@ def test_of_a_log_crane_they_tell_more_than_its_task_of_levers():
     assert (found.optimized_information.std < usual.std).all()
     heavy = crane.load("patu655", lock={"slew": 0.0}, changes={"payload.mass": 1.3 * 211.4})
     run = crane.simulate(
-        heavy, crane.ValveSignals(heavy, found.run.time, found.signals), None, 20.0, 0.01
+        heavy, crane.control.ValveSignals(heavy, found.run.time, found.signals), None, 20.0, 0.01
     )
     assert (run.q.min(axis=0) > heavy.lower).all() and (run.q.max(axis=0) < heavy.upper).all()
 
@@ -241,7 +249,7 @@ def test_of_a_log_crane_they_tell_more_than_its_task_of_levers():
 )
 def test_what_cannot_be_is_one_line(machine, options, said):
     with pytest.raises(CraneError) as error:
-        crane.excite_valves(machine, options.pop("fit", FIT), trials=2, **options)
+        crane.identification.excite_valves(machine, options.pop("fit", FIT), trials=2, **options)
     assert said in str(error.value) and "\n" not in str(error.value)
 
 
@@ -250,12 +258,12 @@ def test_no_signals_within_the_limits(tmp_path):
     machine = rig(tmp_path, VALVE, {"relief": 20e5}, supply={"pressure": 140e5, "tank": 8e5})
     text = "none of 2 random signals keeps 'rig' within its limits, lastly for the .*: lower"
     with pytest.raises(CraneError, match=text):
-        crane.excite_valves(machine, ["load_x.mass"], duration=3.0, trials=2)
+        crane.identification.excite_valves(machine, ["load_x.mass"], duration=3.0, trials=2)
 
 
 def test_a_machine_without_valves(slider_crank):
     with pytest.raises(CraneError, match="has no valves, describe its circuit"):
-        crane.excite_valves(slider_crank, ["crank.mass"])
+        crane.identification.excite_valves(slider_crank, ["crank.mass"])
 
 
 @pytest.mark.slow

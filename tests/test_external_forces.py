@@ -50,7 +50,7 @@ def test_wrenches_do_what_those_of_pinocchio_do(name):
         assert found[i] == pytest.approx(true, abs=1e-11 * np.abs(true).max() + 1e-12)
 
 
-class Drag(crane.ExternalForce):
+class Drag(crane.description.ExternalForce):
     """A force against the velocity, and a moment against the spin."""
 
     def wrench(self, here):
@@ -72,14 +72,17 @@ def loads_of(machine, drag):
 def test_a_function_in_python_does_what_formulas_do(method):
     sticky = crane.load("mini_forwarder")
     machine = sticky.replace(
-        friction={x: crane.Friction(viscous=law.viscous) for x, law in sticky.friction.items()}
+        friction={
+            x: crane.description.Friction(viscous=law.viscous)
+            for x, law in sticky.friction.items()
+        }
     )
     start = machine.home[machine.closure.active], [0.3, 0.02, 0.01]
     runs = [
         crane.simulate(machine, None, start, 0.3, 2e-3, method=method, loads=loads)
         for loads in (
             loads_of(machine, Drag(machine.tip, "drag")),
-            loads_of(machine, crane.WrenchFunction(machine.tip, dragged, "drag")),
+            loads_of(machine, crane.description.WrenchFunction(machine.tip, dragged, "drag")),
         )
     ]
     assert runs[0].q == pytest.approx(runs[1].q, abs=1e-11)
@@ -147,7 +150,7 @@ def test_a_controller_of_the_bare_machine_begins_with_what_the_run_carries():
     assert np.abs(run.q - run.q[0]).max() < 1e-9
     crane_ = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
     pull = crane.Wrench(crane_.tip, (0.0, 0.0, -1500.0))
-    drive = crane.ValveDrive(crane_, crane.ValveSignals(crane_, [0.0], {}))
+    drive = crane.control.ValveDrive(crane_, crane.control.ValveSignals(crane_, [0.0], {}))
     given, own = (
         crane.simulate(crane_, control, duration=0.1, loads=(pull,)) for control in (drive, None)
     )
@@ -180,7 +183,10 @@ def test_the_energy_of_a_load_on_valves_is_kept():
     motion = crane.ValvePD(machine, crane.task_trajectory(machine, "reach"))
     run, other = (
         crane.simulate(machine, motion, None, 3.0, loads=[pull, drag])
-        for drag in (Drag(machine.tip, "drag"), crane.WrenchFunction(machine.tip, dragged, "drag"))
+        for drag in (
+            Drag(machine.tip, "drag"),
+            crane.description.WrenchFunction(machine.tip, dragged, "drag"),
+        )
     )
     assert other.q == pytest.approx(run.q, abs=1e-8)
     seen = run.channels
@@ -234,7 +240,11 @@ def test_what_a_function_in_python_raises_comes_out():
     for controller in (None, crane.ComputedTorque(machine, motion)):
         with pytest.raises(ZeroDivisionError, match="torn"):
             crane.simulate(
-                machine, controller, None, 0.2, loads=[crane.WrenchFunction(machine.tip, torn)]
+                machine,
+                controller,
+                None,
+                0.2,
+                loads=[crane.description.WrenchFunction(machine.tip, torn)],
             )
 
 
@@ -251,8 +261,8 @@ def test_what_is_no_load_is_refused():
         (lambda: crane.Wrench(tip, (1, 0, np.nan)), "no finite number"),
         (lambda: crane.Wrench(tip, [[1, 0, 0]] * 2, times=[1, 0]), "times do not rise"),
         (lambda: crane.Wrench(tip, axes="tip"), "give 'world' or 'frame'"),
-        (lambda: crane.WrenchFunction(tip, lambda *_: [np.nan] * 6), "six numbers"),
-        (lambda: crane.WrenchFunction(tip, lambda *_: [1.0, 2.0]), "six numbers"),
+        (lambda: crane.description.WrenchFunction(tip, lambda *_: [np.nan] * 6), "six numbers"),
+        (lambda: crane.description.WrenchFunction(tip, lambda *_: [1.0, 2.0]), "six numbers"),
         (lambda: 3.0, "no external force"),
         (lambda: crane.Wrench(machine.model.frames[1].name, (1, 0, 0)), "does not move"),
     ):

@@ -239,7 +239,7 @@ def test_momentum_is_kept_while_a_drive_moves_what_floats(tmp_path):
 # --- nobody drives them ----------------------------------------------------------------------
 
 
-class Everywhere(crane.ControlLaw):
+class Everywhere(crane.control.ControlLaw):
     def law(self, inputs):
         return [-v for v in inputs.v_a], ()
 
@@ -320,14 +320,14 @@ def test_tables_and_files_say_free(machine, tmp_path):
     assert "# free: swing_x, swing_y" in lines
     (head,) = [line for line in lines if line.startswith("time")]
     assert "lift_force" in head and "swing_x_force" not in head
-    for read in (crane.Recording.from_csv(path), crane.read_measured(machine, path)):
+    for read in (crane.Recording.from_csv(path), crane.recordings.read_measured(machine, path)):
         assert read.free == machine.free and read.joints == machine.active
         assert not read.tau[:, 2:].any()
     wrong = tmp_path / "wrong.csv"
     more = {head: ",swing_x_force [N m]"} | {x: ",1.5" for x in lines if x[0].isdigit()}
     wrong.write_text("".join(f"{line}{more.get(line, '')}\n" for line in lines))
     with pytest.raises(CraneError, match="'swing_x' is free and has the force 1.5 at sample 0"):
-        crane.read_measured(machine, wrong)
+        crane.recordings.read_measured(machine, wrong)
     assert typed("view", out).returncode == typed("plot", out).returncode == 0
 
 

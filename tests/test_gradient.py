@@ -37,7 +37,7 @@ def test_a_damped_spring_as_its_closed_form(tmp_path):
     machine = block(tmp_path, spring=spring)
     by = ("start.x", "start.x_velocity", "block.mass", "spring.x.stiffness", "spring.x.damping")
     start = [0.3], [0.1]
-    found = crane.gradient(
+    found = crane.simulation.gradient(
         machine,
         None,
         start,
@@ -67,7 +67,7 @@ def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
     spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
     machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}", spring)
     by = ("start.x", "friction.x.coulomb", "spring.x.stiffness", "block.mass")
-    found = crane.gradient(
+    found = crane.simulation.gradient(
         machine, None, [x0], 4.0, 2e-3, functional=last(), parameters=by, outputs=("x",)
     )
     n = round((x0 * STIFFNESS / coulomb - 1.0) / 2.0 + 0.4999)
@@ -79,7 +79,7 @@ def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
     """A growing force c t moves a block from t = F / c on: x = c (t - F / c)^3 / (6 m)."""
     coulomb = 2.0
     machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}")
-    found = crane.gradient(
+    found = crane.simulation.gradient(
         machine, Ramp(machine), [0.0], 2.0, 2e-3, functional=last(),
         parameters=("friction.x.coulomb", "block.mass"), outputs=("x",),
     )  # fmt: skip
@@ -105,7 +105,7 @@ def hydraulic():
         valve = machine.hydraulics.valves[joint]
         ways = share * np.array([0.0, 0.0, 1.0, 1.0, -0.5])
         levers[joint] = valve.neutral + ways * (valve.full - valve.neutral)
-    signals = crane.ValveSignals(machine, [0, 0.1, 0.3, 0.6, 0.8], levers)
+    signals = crane.control.ValveSignals(machine, [0, 0.1, 0.3, 0.6, 0.8], levers)
     by = (*HYDRAULIC, "start.X_lift", "friction.X_tilt.coulomb", "tilt_boom.com.x",
           "end_stop.X_lift.stiffness")  # fmt: skip
     outputs = ("X_lift", "X_tilt_velocity", "pressure_X_lift_a", "inclination_lift_boom")
@@ -173,7 +173,7 @@ def test_differences_of_order_8_agree():
     controller = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
     variants, outputs = MachineVariants(machine), ("X1", "tip_z", "q2_velocity")
     by = ("link3.mass", "link3_G.x", "friction.X1.viscous", "link5.mass")
-    found = crane.gradient(
+    found = crane.simulation.gradient(
         machine,
         controller,
         None,
@@ -207,7 +207,7 @@ def test_differences_of_order_8_agree():
 @pytest.mark.slow
 def test_all_numbers_that_matter_are_found():
     machine, controller, initial, _, _, _ = forwarder()
-    found = crane.gradient(
+    found = crane.simulation.gradient(
         machine, controller, initial, 0.1, functional=last(), outputs=("X1_force",)
     )
     assert len(found.parameters) > 100
@@ -249,10 +249,10 @@ def test_several_at_once_are_each_by_itself(tmp_path):
     machine = block(tmp_path, f"{{x: {{coulomb: {1.7}}}}}", spring)
     given = {"parameters": ("start.x", "friction.x.coulomb"), "outputs": ("x", "x_velocity")}
     weights = np.random.default_rng(3).normal(size=(3, 1001, 2))
-    found = crane.gradient(machine, None, [0.3], 2.0, 2e-3, functional=weights, **given)
+    found = crane.simulation.gradient(machine, None, [0.3], 2.0, 2e-3, functional=weights, **given)
     assert found.functional_value.shape == (3,) and found.derivatives.shape == (3, 2)
     for i, one in enumerate(weights):
-        alone = crane.gradient(machine, None, [0.3], 2.0, 2e-3, functional=one, **given)
+        alone = crane.simulation.gradient(machine, None, [0.3], 2.0, 2e-3, functional=one, **given)
         assert alone.functional_value == pytest.approx(found.functional_value[i])
         assert alone.derivatives == pytest.approx(found.derivatives[i], rel=1e-6)
     assert "J3" in found.to_text()
@@ -301,8 +301,8 @@ def test_what_has_no_gradient_is_refused(tmp_path):
         ),
     ):
         with pytest.raises(CraneError, match=text):
-            crane.gradient(machine, None, start, 0.1, **options)
-    found = crane.gradient(machine, None, start, 0.1, functional=weights, parameters=by)
+            crane.simulation.gradient(machine, None, start, 0.1, **options)
+    found = crane.simulation.gradient(machine, None, start, 0.1, functional=weights, parameters=by)
     with pytest.raises(CraneError, match="'block.mas' is not among them"):
         found.derivative("block.mas")
     with pytest.raises(CraneError, match="where the machine has other equations"):

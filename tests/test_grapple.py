@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 
 import crane
 from crane.common.errors import CraneError
-from crane.control import largest_flow_share
+from crane.control.valve_feedforward import largest_flow_share
 from crane.motion.sway import Sway
 from crane.motion.sway_suppression import SWAY_METHODS, input_shaper, retime, suppress_sway
 
@@ -229,7 +229,7 @@ def test_equations_on_paper_say_so_too(loaded, quarter):
     np.testing.assert_allclose(found, flat.position(times)[:, -2:], rtol=0, atol=5e-6)
 
 
-class Shaped(crane.Trajectory):
+class Shaped(crane.motion.Trajectory):
     """A reference sent through impulses."""
 
     tip = None
@@ -295,7 +295,7 @@ def beside(joint):
         ),
         (lambda m, r: retime(r, 0.0), "the duration is 0"),
         (
-            lambda m, r: crane.ValveFeedforward(m, r, sway=-0.1),
+            lambda m, r: crane.control.ValveFeedforward(m, r, sway=-0.1),
             "the damping ratio of sway is -0.1",
         ),
         (lambda m, r: Sway(crane.load("patu655")), "nothing sways on 'patu655': it has no free"),
@@ -334,7 +334,7 @@ def test_any_machine_that_hangs(tmp_path):
 
 
 def test_the_fastest_motion_takes_all_of_the_flow(loaded, quarter):
-    none = crane.fastest_trajectory(loaded, quarter)
+    none = crane.control.fastest_trajectory(loaded, quarter)
     time = np.linspace(0, none.duration, 1000)
     circuit = loaded.hydraulics
     flow = np.zeros((len(time), len(circuit.joints)))
@@ -349,7 +349,7 @@ def test_the_fastest_motion_takes_all_of_the_flow(loaded, quarter):
         0.5, rel=2e-3
     )
     few = crane.load(NAME, changes={"payload.mass": 200.0, "supply.flow": 5e-4})
-    slow = crane.fastest_trajectory(few, quarter)
+    slow = crane.control.fastest_trajectory(few, quarter)
     assert slow.duration == pytest.approx(none.duration * flow.sum(axis=1).max() / 5e-4, rel=2e-3)
 
 
@@ -358,7 +358,7 @@ def test_valves_follow_what_the_circuit_turned_round_says(loaded, quarter):
     flat = suppress_sway(loaded, quarter)
     start = flat.position(0.0)
     errors = []
-    for control in (crane.ValveFeedforward(loaded, flat), crane.ValvePD(loaded, flat)):
+    for control in (crane.control.ValveFeedforward(loaded, flat), crane.ValvePD(loaded, flat)):
         run = crane.simulate(loaded, control, initial=(start, 0 * start), duration=7.0, step=1e-2)
         errors.append(np.abs(run.q - flat.position(run.time)).max(axis=0))
     assert (errors[0][:4] < [1.5e-3, 5e-4, 1e-3, 1e-3]).all()
@@ -381,7 +381,7 @@ def test_a_command_tells_what_sway_is_left():
 @pytest.mark.slow
 @pytest.mark.long
 def test_all_payloads_leave_a_tenth_of_the_sway():
-    found = crane.sway_study(NAME, "swing", (0.0, 125.0, 375.0, 500.0))
+    found = crane.studies.sway_study(NAME, "swing", (0.0, 125.0, 375.0, 500.0))
     assert len(found.rows) == 4 * 2 * len(SWAY_METHODS)
     for row in found.rows:
         if row.method == "flat":
@@ -401,7 +401,7 @@ def test_feedback_damps_what_is_left(payload, joint):
     after = []
     for ratio in (0.0, 0.2):
         start = home + np.radians(5) * (np.arange(len(home)) == which)
-        control = crane.ValveFeedforward(machine, stands, sway=ratio)
+        control = crane.control.ValveFeedforward(machine, stands, sway=ratio)
         run = crane.simulate(machine, control, initial=(start, 0 * start), duration=8.0, step=1e-2)
         size = np.abs(np.degrees(run.q[:, which] - home[which]))
         after.append(run.time[size > 0.5].max())
@@ -412,11 +412,11 @@ def test_feedback_damps_what_is_left(payload, joint):
 
 def test_feedback_takes_what_a_plan_did_not_know(loaded):
     """A reference planned for 200 kg still reduces sway with 160 kg."""
-    plan = crane.fastest_trajectory(loaded, crane.task_trajectory(loaded, "swing"), "flat")
+    plan = crane.control.fastest_trajectory(loaded, crane.task_trajectory(loaded, "swing"), "flat")
     lighter = carrying(160.0)
     sway, left = Sway(lighter), []
     for ratio in (0.0, 0.2):
-        control = crane.ValveFeedforward(loaded, plan, sway=ratio)
+        control = crane.control.ValveFeedforward(loaded, plan, sway=ratio)
         run = crane.simulate(lighter, control, duration=12.0, step=1e-2)
         after = run.q[run.time >= plan.duration]
         left.append(np.abs(after - sway.hanging_equilibrium(after))[:, -2:].max())

@@ -31,8 +31,10 @@ def block(tmp_path):
 
 
 def feet(slope=0.0, **options):
-    ground = crane.Ground(normal=(-np.sin(slope), 0.0, np.cos(slope)))
-    return [crane.Contact(f"c{i}", ground, name=f"foot{i}", **options) for i in range(4)]
+    ground = crane.description.Ground(normal=(-np.sin(slope), 0.0, np.cos(slope)))
+    return [
+        crane.description.Contact(f"c{i}", ground, name=f"foot{i}", **options) for i in range(4)
+    ]
 
 
 def start(machine, slope, above=0.0):
@@ -184,8 +186,8 @@ def test_a_ball_rolls_down_a_profile(tmp_path):
     )
     machine = crane.load(path)
     fall = 10.0 * np.tan(slope)
-    ground = crane.Ground(profile=((0.0, fall), (10.0, 0.0)))
-    ball = crane.Contact(
+    ground = crane.description.Ground(profile=((0.0, fall), (10.0, 0.0)))
+    ball = crane.description.Contact(
         "ball", ground, radius=radius, stiffness=1e5, damping=2.0, friction=0.8, smoothing=1e-4
     )
     q = np.zeros(6)
@@ -288,19 +290,22 @@ def test_a_root_has_the_freedoms_that_are_named(block, tmp_path):
 
 def test_what_is_no_ground_is_refused(block):
     for make, text in (
-        (lambda: crane.Ground(normal=(0, 0, -1)), "upwards"),
-        (lambda: crane.Ground(profile=((0, 0), (0, 1))), "goes back"),
-        (lambda: crane.Ground(profile=((0, 0, 1),)), "no list"),
-        (lambda: crane.Contact("c0", stiffness=0.0), "stiffness"),
-        (lambda: crane.Contact("c0", friction=-1.0), "must not be negative"),
-        (lambda: crane.Contact("c0", lateral_damping=1.0), "no lateral stiffness, give both"),
+        (lambda: crane.description.Ground(normal=(0, 0, -1)), "upwards"),
+        (lambda: crane.description.Ground(profile=((0, 0), (0, 1))), "goes back"),
+        (lambda: crane.description.Ground(profile=((0, 0, 1),)), "no list"),
+        (lambda: crane.description.Contact("c0", stiffness=0.0), "stiffness"),
+        (lambda: crane.description.Contact("c0", friction=-1.0), "must not be negative"),
+        (
+            lambda: crane.description.Contact("c0", lateral_damping=1.0),
+            "no lateral stiffness, give both",
+        ),
         (
             lambda: run(
                 block, feet(lateral_stiffness=1e5), start(block, 0.0), 0.1, method="Radau"
             ),
             "take DOP853",
         ),
-        (lambda: run(block, [crane.Contact("c9")], None, 0.1), "'c9'"),
+        (lambda: run(block, [crane.description.Contact("c9")], None, 0.1), "'c9'"),
     ):
         with pytest.raises(CraneError, match=text):
             make()

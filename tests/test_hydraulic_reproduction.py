@@ -207,7 +207,7 @@ def test_the_logger_s_file_comes_back(ideal, tmp_path):
         assert name in head
     for name in (",X_lift [", "force", "spool", "velocity"):
         assert name not in head
-    read = crane.read_measured(machine.machine, path)
+    read = crane.recordings.read_measured(machine.machine, path)
     assert read.joints == happened.joints
     np.testing.assert_allclose(read.q, happened.q, atol=1e-9)
     np.testing.assert_allclose(read.tau, happened.tau, rtol=1e-9, atol=1e-3)

@@ -7,7 +7,7 @@ from scipy.integrate import quad, solve_ivp
 
 import crane
 from crane.control import ValveDrive, ValveSignals
-from crane.hydraulics import CircuitEquations
+from crane.hydraulics.circuit_equations import CircuitEquations
 from crane.hydraulics.flow_equations import (
     LAMINAR_PRESSURE_DROP,
     series_coefficient,
@@ -212,7 +212,7 @@ def test_spool_moves_no_faster_than_its_rate(tmp_path):
 def test_closed_chambers_keep_their_oil(tmp_path):
     """With no flow (23) integrates to V e^(p / beta) = const, whatever the load does."""
     machine = rig(tmp_path)
-    machine = machine.replace(friction={"x": crane.Friction(viscous=3000.0)})
+    machine = machine.replace(friction={"x": crane.description.Friction(viscous=3000.0)})
     start = {"x": ((2000 * G + AREA_B * 4e6) / AREA_A, 4e6)}
     drive = ValveDrive(machine, ValveSignals(machine, [0.0], {}), start)
     recording = crane.simulate(machine, drive, ([0.25], [0.05]), duration=1.0)
@@ -231,7 +231,7 @@ def test_a_void_is_as_large_as_what_was_pulled_and_fills_again(tmp_path):
     def force(t):
         return pull * np.sin(np.pi * np.clip(t, 0, 1)) ** 2
 
-    machine = machine.replace(friction={"x": crane.Friction(viscous=2e4)})
+    machine = machine.replace(friction={"x": crane.description.Friction(viscous=2e4)})
 
     class Pulled(ValveDrive):
         """The load is pulled from outside."""

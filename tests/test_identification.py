@@ -243,8 +243,10 @@ def test_base_parameters_carry_everything(mini):
 def test_the_model_is_the_inverse_dynamics(mini):
     for machine in (
         mini,
-        mini.replace(forces=(crane.ForceElement("q3", stiffness=2.0, rest=1.0, damping=0.1),)),
-        mini.replace(gas_springs=(crane.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7),)),
+        mini.replace(
+            forces=(crane.description.ForceElement("q3", stiffness=2.0, rest=1.0, damping=0.1),)
+        ),
+        mini.replace(gas_springs=(crane.description.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7),)),
     ):
         model = IdentificationModel(machine)
         samples = random_samples(model, 40, seed=7)
@@ -254,7 +256,7 @@ def test_the_model_is_the_inverse_dynamics(mini):
 
 
 def test_gas_and_springs_of_unknown_scale(mini):
-    gas = crane.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7, 1.3)
+    gas = crane.description.GasSpring("q7", 1e-4, 1e5, 1e-4, 0.7, 1.3)
     machine = mini.replace(friction={}, gas_springs=(gas,))
     model = IdentificationModel(machine, [InertialTerm(machine), GasSpringTerm(machine, "q7")])
     samples = random_samples(model, 40, seed=8)
@@ -262,7 +264,9 @@ def test_gas_and_springs_of_unknown_scale(mini):
     found = model.regressor(samples) @ model.nominal + model.known_forces(samples)
     assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
     assert model.names[-1] == "q7.gas_scale" and model.nominal[-1] == 1.0
-    spring = mini.replace(friction={}, forces=(crane.ForceElement("q3", stiffness=2.0),))
+    spring = mini.replace(
+        friction={}, forces=(crane.description.ForceElement("q3", stiffness=2.0),)
+    )
     shaped = IdentificationModel(
         mini.replace(friction={}, forces=()),
         [InertialTerm(mini), ForceElementTerm(mini, "q3", lambda q: -q, "stiffness", 2.0)],

@@ -86,7 +86,7 @@ def random_states(machine, count=40):
 
 
 def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
-    file = crane.write_identified(found, tmp_path / "out")
+    file = crane.identification.write_identified(found, tmp_path / "out")
     assert file == tmp_path / "out" / "mini_forwarder.yaml"
     assert len(list(file.parent.iterdir())) == 6
     written = crane.load(file)
@@ -104,7 +104,7 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
 
 
 def test_only_inertials_change_in_a_urdf(mini, found, tmp_path):
-    crane.write_identified(found, tmp_path)
+    crane.identification.write_identified(found, tmp_path)
     for chain in mini.chains:
         before, after = (
             etree.parse(str(file)).getroot() for file in (chain.urdf, tmp_path / chain.urdf.name)
@@ -161,9 +161,9 @@ def test_one_urdf_with_a_loop_becomes_a_machine_file(tmp_path):
     given = Motion(time[:, 0], q, v, a, 1.1 * tau + 0.1 * noise)
     result = identify(arm, given, prior=0.3, feasible=True)
     with pytest.raises(OutputError) as caught:
-        crane.write_identified(result, tmp_path / "sub" / "..")
+        crane.identification.write_identified(result, tmp_path / "sub" / "..")
     assert "is what 'arm' was read from" in str(caught.value)
-    written = crane.load(crane.write_identified(result, tmp_path / "out"))
+    written = crane.load(crane.identification.write_identified(result, tmp_path / "out"))
     at = result.model.samples(q, v, a)
     wanted = result.model.regressor(at) @ result.parameters
     again = crane.Dynamics(written).inverse(q, v, a, friction=True)
@@ -183,7 +183,7 @@ def test_the_load_that_a_machine_names_comes_along(edited, tmp_path):
     tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
     given = Motion(time[:, 0], q, v, a, tau + 0.1 * np.random.default_rng(0).normal(size=q.shape))
     result = identify(machine, given, prior=0.3, feasible=True)
-    file = crane.write_identified(result, tmp_path / "out")
+    file = crane.identification.write_identified(result, tmp_path / "out")
     assert (file.parent / "load.urdf").read_bytes() == load.read_bytes()
     written, loaded = (crane.load(file, {"payload.mass": mass}) for mass in (0.0, 3.0))
     total = [sum(inertia.mass for inertia in m.model.inertias[1:]) for m in (written, loaded)]
@@ -222,7 +222,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
         ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
-            crane.write_identified(result, tmp_path / "out")
+            crane.identification.write_identified(result, tmp_path / "out")
         assert str(caught.value).startswith(message), str(caught.value)
         assert list(tmp_path.iterdir()) == []
 
@@ -233,7 +233,7 @@ def test_a_body_that_cannot_be_asks_for_feasible_ones(mini, found, tmp_path):
     bodies[4:10] = [-1.0, 0.0, 1.0, 0.0, 0.0, 1.0]
     parted = dataclasses.replace(found, parameters=bodies, feasible=False)
     with pytest.raises(InputError) as caught:
-        crane.write_identified(parted, tmp_path / "out")
+        crane.identification.write_identified(parted, tmp_path / "out")
     link = found.model.bodies[0]
     assert re.fullmatch(
         f"the identified machine is not valid: link '{link}' has the negative principal moment of "
@@ -261,7 +261,7 @@ def test_the_parameters_as_a_table(found, tmp_path):
 
 
 def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
-    path = crane.identification_report(
+    path = crane.view.identification_report(
         found, tmp_path / "report.html", "train <1>.csv", "judge.csv"
     )
     text = path.read_text(encoding="utf-8")
@@ -282,7 +282,7 @@ def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
     unobservable = " ".join(section.itertext())
     assert all(name in unobservable for name in found.base.unobservable)
     with pytest.raises(OutputError):
-        crane.identification_report(found, tmp_path / "report.pdf")
+        crane.view.identification_report(found, tmp_path / "report.pdf")
 
 
 # --- payload ---------------------------------------------------------------------------------
@@ -493,7 +493,7 @@ def test_a_locked_machine_is_written_with_all_its_joints(mini, tmp_path):
     noise = np.random.default_rng(0).normal(size=tau.shape) * NOISE[:2]
     given = Motion(time[:, 0], q, v, a, tau + noise)
     result = identify(locked, given, feasible=True)
-    file = crane.write_identified(result, tmp_path / "out")
+    file = crane.identification.write_identified(result, tmp_path / "out")
     written = crane.load(file)
     assert written.joints == mini.joints and written.active == mini.active
     assert written.friction["X2"] == mini.friction["X2"]
@@ -538,7 +538,7 @@ def simulated(mini, tmp_path_factory):
     """A machine that moves with a load, or without."""
     folder = tmp_path_factory.mktemp("simulated")
     given = motion(mini)
-    path = crane.Trajectory(CubicSpline(given.time[::10], given.q[::10]))
+    path = crane.motion.Trajectory(CubicSpline(given.time[::10], given.q[::10]))
     for name, machine in (("empty", mini), ("loaded", mini.with_payload(LOAD))):
         control = crane.ComputedTorque(machine, path)
         run = crane.simulate(machine, control, path(0.0)[:2])

@@ -143,10 +143,14 @@ def test_where_friction_settles_rows_begin_to_count(mini):
     given = noisy(motion(mini, step=4e-3, duration=12.0), 9)
     fastest = np.abs(given.v).max(axis=0)
     for joint, law, wanted in (
-        ("q1", crane.Friction(coulomb=0.1, smoothing=2e-2), 0.08),
-        ("q1", crane.Friction(coulomb=0.1, stiction=0.1, stribeck=0.03, smoothing=1e-3), 0.12),
-        ("q1", crane.Friction(coulomb=0.1, smoothing=10.0), 0.5 * fastest[0]),
-        ("q1", crane.Friction(viscous=0.1, smoothing=0.0), 0.02 * fastest[0]),
+        ("q1", crane.description.Friction(coulomb=0.1, smoothing=2e-2), 0.08),
+        (
+            "q1",
+            crane.description.Friction(coulomb=0.1, stiction=0.1, stribeck=0.03, smoothing=1e-3),
+            0.12,
+        ),
+        ("q1", crane.description.Friction(coulomb=0.1, smoothing=10.0), 0.5 * fastest[0]),
+        ("q1", crane.description.Friction(viscous=0.1, smoothing=0.0), 0.02 * fastest[0]),
     ):
         machine = mini.replace(friction={**mini.friction, joint: law})
         fit = identify(machine, given, bandwidth=20.0, prior=0.3).training
@@ -203,7 +207,7 @@ def test_a_resting_joint_is_left_out(mini):
 def test_recordings_of_simulations_serve(mini):
     """From strokes and forces alone, velocities by the smoother."""
     given = motion(mini)
-    path = crane.Trajectory(CubicSpline(given.time, given.q))
+    path = crane.motion.Trajectory(CubicSpline(given.time, given.q))
     recording = crane.simulate(mini, crane.ComputedTorque(mini, path), path(0.0)[:2])
     slow = [0.03, 5e-4, 5e-4]
     result = identify(mini, recording, prior=0.1, slow=slow)

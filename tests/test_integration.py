@@ -34,7 +34,9 @@ def springy(forwarder):
     middle = np.array([0.0, 0.015, 0.015])
     weight = crane.Dynamics(forwarder).gravity(middle)
     springs = tuple(
-        crane.ForceElement(joint, stiffness=k, damping=c, rest=float(middle[i] + weight[i] / k))
+        crane.description.ForceElement(
+            joint, stiffness=k, damping=c, rest=float(middle[i] + weight[i] / k)
+        )
         for i, (joint, k, c) in enumerate(
             zip(forwarder.active, (0.3, 2e3, 4e3), (0.01, 20.0, 30.0), strict=True)
         )
@@ -175,7 +177,7 @@ def test_energies_are_integrated_alike_and_balance(forwarder, path, steps):
 
 
 def test_what_dampers_and_end_stops_take_out_is_integrated_alike(springy, steps):
-    stops = tuple(crane.EndStop(joint, 2e4, damping=15.0) for joint in ("X1", "X2"))
+    stops = tuple(crane.description.EndStop(joint, 2e4, damping=15.0) for joint in ("X1", "X2"))
     machine = springy.replace(end_stops=stops)
     start = (np.array([0.0, 0.0295, 0.0005]), np.array([0.5, 0.3, -0.2]))
     one, two = (
@@ -189,13 +191,15 @@ def test_what_dampers_and_end_stops_take_out_is_integrated_alike(springy, steps)
     assert np.abs(lost - two.channels["dissipated"]).max() < 1e-11 * lost[-1]
     energy = one.channels["kinetic"] + one.channels["potential"]
     assert np.abs(energy - energy[0] + lost).max() < 1e-4 * lost[-1]
-    machine = springy.replace(end_stops=tuple(crane.EndStop(s.joint, 2e4) for s in stops))
+    machine = springy.replace(
+        end_stops=tuple(crane.description.EndStop(s.joint, 2e4) for s in stops)
+    )
     elastic = simulate(machine, None, start, duration=0.05, step=2e-4)
     assert elastic.channels["dissipated"][-1] < 0.9 * lost[-1]  # the stops' damping counts
 
 
 def test_a_function_moves_as_the_same_law_built_in(forwarder, path, steps):
-    gains = {joint: crane.PIGains(g.kp, 0.0) for joint, g in forwarder.control.items()}
+    gains = {joint: crane.description.PIGains(g.kp, 0.0) for joint, g in forwarder.control.items()}
     kp = np.array([gains[joint].kp for joint in forwarder.active])
     start = path(0.0)[0]
     one = simulate(forwarder, crane.PI(forwarder, path, gains), start, duration=0.2)

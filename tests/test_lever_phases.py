@@ -130,7 +130,7 @@ def test_recorded_signals_do_the_same_again(machine, found):
     earth = crane.Wrench("load_x", force, times=found.time, name="earth")
     again = crane.simulate(
         machine.with_external_forces(earth),
-        crane.ValveSignals(machine, found.time, signals),
+        crane.control.ValveSignals(machine, found.time, signals),
         step=2e-3,
     )
     np.testing.assert_allclose(again.q, found.q, atol=1e-6)
@@ -162,11 +162,11 @@ def test_a_batch_has_phases_of_its_own(machine):
     both = [under, with_more]
 
     def levers(machine):
-        return crane.ValveDrive(machine, crane.joystick(machine, "both"))
+        return crane.control.ValveDrive(machine, crane.joystick(machine, "both"))
 
     with pytest.raises(crane.CraneError, match="give one duration for all"):
-        crane.simulate_batch(both, levers, step=1e-2)
-    batch = crane.simulate_batch(both, levers, duration=6.0, step=1e-2, threads=2)
+        crane.simulation.simulate_batch(both, levers, step=1e-2)
+    batch = crane.simulation.simulate_batch(both, levers, duration=6.0, step=1e-2, threads=2)
     for i, one in enumerate(both):
         alone = crane.simulate(one, crane.joystick(one, "both"), duration=6.0, step=1e-2)
         np.testing.assert_array_equal(batch.q[i], alone.q)
@@ -208,7 +208,7 @@ def test_files_that_are_written_have_them(machine, tmp_path):
     again = crane.load(next((tmp_path / "again").glob("*.yaml")))
     one, other = machine.tasks["both"], again.tasks["both"]
     assert (one.phases, one.ramp, one.duration) == (other.phases, other.ramp, other.duration)
-    assert type(other.loads[0]) is crane.PhasedWrench
+    assert type(other.loads[0]) is crane.description.PhasedWrench
     np.testing.assert_array_equal(one.loads[0].times, other.loads[0].times)
     np.testing.assert_array_equal(run(again, step=1e-2).q, run(machine, step=1e-2).q)
 
@@ -279,19 +279,23 @@ def test_phases_belong_to_tasks_that_have_some(tmp_path):
 
 def test_phases_in_python(machine):
     """As in files; bad ones are refused as there."""
-    phases = [crane.Phase("out", {"x": 0.6}, {"x": 0.3}, 5.0)]
-    recording = crane.simulate(machine, crane.LeverPhases(machine, phases, ramp=0.0), step=1e-2)
+    phases = [crane.description.Phase("out", {"x": 0.6}, {"x": 0.3}, 5.0)]
+    recording = crane.simulate(
+        machine, crane.control.LeverPhases(machine, phases, ramp=0.0), step=1e-2
+    )
     assert 0.3 <= recording.q[-1, 0] < 0.33
     jump = recording.channels["voltage_x"]
     assert jump[1] == pytest.approx(0.1 + 0.9 * 0.6) and set(np.round(jump, 9)) <= {0.0, 0.64}
     with pytest.raises(crane.CraneError, match="no valve for 'z', known: x, y"):
-        crane.LeverPhases(machine, [crane.Phase("out", {"z": 0.6}, {"z": 0.3}, 5.0)])
-    command, rest = crane.LeverPhases(machine, phases), np.zeros((2, 2))
+        crane.control.LeverPhases(
+            machine, [crane.description.Phase("out", {"z": 0.6}, {"z": 0.3}, 5.0)]
+        )
+    command, rest = crane.control.LeverPhases(machine, phases), np.zeros((2, 2))
     for time in (0.0, 0.01, 0.01):
         command.update(time, np.array([0.2, 0.2]), np.zeros(2), rest)
     with pytest.raises(crane.CraneError, match="levers by positions do not go back"):
         command.update(0.005, np.array([0.2, 0.2]), np.zeros(2), rest)
     with pytest.raises(crane.CraneError, match="there are no phases of levers"):
-        crane.LeverPhases(machine, [])
+        crane.control.LeverPhases(machine, [])
     with pytest.raises(crane.CraneError, match="the ramp of the levers is -1 s, give at least 0"):
-        crane.LeverPhases(machine, phases, ramp=-1.0)
+        crane.control.LeverPhases(machine, phases, ramp=-1.0)

@@ -10,7 +10,11 @@ from scipy.integrate import solve_ivp
 import crane
 from crane.hydraulics.circuit_elements import Supply
 from crane.hydraulics.pump_equations import least_sensing_ratio, unstable_frequency_range
-from crane.recordings.limit_cycle_detection import limit_cycle_message, limit_cycles, sustained_oscillation
+from crane.recordings.limit_cycle_detection import (
+    limit_cycle_message,
+    limit_cycles,
+    sustained_oscillation,
+)
 from crane.recordings.recording_summary import summarize
 
 TIME = np.arange(0.0, 10.0, 2e-3)
@@ -24,7 +28,9 @@ MODULUS = 1.2e9  # of the rig's oil [Pa]
 
 def lifted(folder, mass=3000.0, level=0.8, duration=4.0, **supply):
     machine = rig(folder, valve=VALVE, mass=mass, supply=SENSING | supply)
-    lever = crane.ValveSignals(machine, [0.0, 0.1, 0.3, duration], {"x": [0.0, 0.0, level, level]})
+    lever = crane.control.ValveSignals(
+        machine, [0.0, 0.1, 0.3, duration], {"x": [0.0, 0.0, level, level]}
+    )
     return machine, crane.simulate(machine, lever, duration=duration, step=1e-3)
 
 

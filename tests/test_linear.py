@@ -54,7 +54,7 @@ def test_a_load_on_its_oil(tmp_path):
 def pulled(machine):
     """With a constant force, and one that grows with the way and the speed."""
 
-    class Held(crane.ExternalForce):
+    class Held(crane.description.ExternalForce):
         def wrench(self, here):
             return [-2e3 * here.position[0] - 50 * here.velocity[0], 0.0, -300.0], [0.0, 40.0, 0.0]
 
@@ -118,14 +118,16 @@ def test_on_valves_chambers_bear_forces_from_outside():
 
 def test_what_remembers_its_way_is_left_out_and_told():
     machine = crane.load("excavator")
-    foot = crane.Contact(machine.tip, lateral_stiffness=1e6)
+    foot = crane.description.Contact(machine.tip, lateral_stiffness=1e6)
     with pytest.warns(CraneWarning, match=f"remember their way .*left out: {machine.tip}"):
         crane.linearize(machine.with_external_forces(foot), drive="forces")
 
 
 def test_a_mass_on_a_spring_under_a_force(tmp_path):
     machine = rig(tmp_path, friction={"viscous": 300.0})
-    machine = machine.replace(forces=(crane.ForceElement("x", stiffness=5e4, rest=0.1),))
+    machine = machine.replace(
+        forces=(crane.description.ForceElement("x", stiffness=5e4, rest=0.1),)
+    )
     model = crane.linearize(machine, drive="forces", outputs=["x", "x_velocity", "x_force"])
     np.testing.assert_allclose(model.A, [[0, 1], [-5e4 / 2000, -300 / 2000]], rtol=1e-13)
     np.testing.assert_allclose(model.B, [[0], [1 / 2000]], rtol=1e-13)
@@ -168,7 +170,7 @@ def test_small_motions_under_forces_are_the_simulation(patu, velocity):
     for share in (1e-2, 1e-3):
         moved, inputs = share * state, share * np.array([0.0, push, 0.0, 0.0])
 
-        class Given(crane.ControlLaw):
+        class Given(crane.control.ControlLaw):
             def __init__(self, forces):
                 super().__init__(patu)
                 self.settings = forces
@@ -200,7 +202,9 @@ def test_small_motions_on_the_valves_are_the_simulation(patu):
     start[n + 1 : n + 3] = 1e-4, -2e-4
     at = dict(zip(model.states, model.x, strict=True))
     held = {j: (at[f"pressure_{j}_a"], at[f"pressure_{j}_b"]) for j in patu.active}
-    controllers = (crane.ValveDrive(patu, crane.ValveSignals(patu, [0.0], {}), held),) * 2
+    controllers = (
+        crane.control.ValveDrive(patu, crane.control.ValveSignals(patu, [0.0], {}), held),
+    ) * 2
     found = deviations(
         patu, model, controllers, (q_a, np.zeros(n)), (q_a, start[n : 2 * n]), times
     )
@@ -230,9 +234,9 @@ def test_a_valve_that_is_open_answers_its_signal(tmp_path):
     u = float(model.u[0])
     pressures = [model.x[model.states.index(f"pressure_x_{side}")] for side in "ab"]
     drives = [
-        crane.ValveDrive(
+        crane.control.ValveDrive(
             machine,
-            crane.ValveSignals(machine, [0.0, 1e-9, 1.0], {"x": [u, u + more, u + more]}),
+            crane.control.ValveSignals(machine, [0.0, 1e-9, 1.0], {"x": [u, u + more, u + more]}),
             {"x": tuple(pressures)},
         )
         for more in (0.0, step)
@@ -250,7 +254,9 @@ def test_over_strokes_and_loads(patu):
     """A larger load lowers the frequency; a machine loaded with it has the same model."""
     machine = crane.load("patu655")
     found = quiet(
-        crane.linear_models, machine, {"payload.mass": [0.0, 400.0], "X_lift": [0.15, 0.3]}
+        crane.simulation.linear_models,
+        machine,
+        {"payload.mass": [0.0, 400.0], "X_lift": [0.15, 0.3]},
     )
     assert [tuple(values.values()) for values, _ in found] == [
         (0.0, 0.15), (0.0, 0.3), (400.0, 0.15), (400.0, 0.3)
@@ -315,7 +321,7 @@ def test_no_valves_and_files(tmp_path):
     with pytest.raises(CraneError, match=r"written as .mat or .npz"):
         crane.linearize("tx40").save(tmp_path / "model.txt")
     with pytest.raises(CraneError, match="parameter 'payload.mas' is unknown"):
-        crane.linear_models("patu655", {"payload.mas": [1.0]})
+        crane.simulation.linear_models("patu655", {"payload.mas": [1.0]})
 
 
 def test_a_free_joint_that_hangs_still_and_one_that_does_not():

@@ -61,7 +61,7 @@ def energy_is_kept(name):
     weight = dynamics_of(name).gravity(home)
     mass = np.diag(dynamics_of(name).mass_matrix(home))
     springs = tuple(
-        crane.ForceElement(joint, stiffness=float(k), rest=float(x + w / k))
+        crane.description.ForceElement(joint, stiffness=float(k), rest=float(x + w / k))
         for joint, x, w, k in zip(machine.active, home, weight, 100 * mass, strict=True)
     )
     machine = machine.replace(friction={}, forces=springs, end_stops=())

@@ -202,7 +202,7 @@ def test_a_misspelt_quantity_is_refused_where_the_machine_is_named(log, tmp_path
     )
     assert not (tmp_path / "run.csv").exists()
     with pytest.raises(RecordingError, match=f"did you mean '{meant}'"):
-        crane.read_measured(crane.load("patu655"), log, columns=described)
+        crane.recordings.read_measured(crane.load("patu655"), log, columns=described)
 
 
 def test_channels_of_their_own_are_kept(log, tmp_path):

@@ -107,7 +107,10 @@ def test_a_machine_cannot_be_changed(mini):
         mini.tip = "link3"
     changed = mini.replace(friction={})
     assert changed.friction == {} and mini.friction and changed.end_stops == mini.end_stops
-    assert mini.replace(forces=[crane.ForceElement("q3", stiffness=1.0)]).forces[0].joint == "q3"
+    assert (
+        mini.replace(forces=[crane.description.ForceElement("q3", stiffness=1.0)]).forces[0].joint
+        == "q3"
+    )
 
 
 def test_limits_are_checked_where_asked(mini):
@@ -157,9 +160,18 @@ def test_unknown_names(mini):
         (lambda: mini.unit("q5"), "joint 'q5' is unknown"),
         (lambda: mini.frame("link7_tipp"), "did you mean 'link7_tip'"),
         (lambda: mini.frame("q1"), "frame 'q1' is unknown"),  # a joint is not a link
-        (lambda: mini.replace(friction={"q12": crane.Friction()}), "joint 'q12' is unknown"),
-        (lambda: mini.replace(forces=(crane.ForceElement("x1"),)), "joint 'x1' is unknown"),
-        (lambda: mini.replace(end_stops=(crane.EndStop("q2", 1.0),)), "'q2' has no limits"),
+        (
+            lambda: mini.replace(friction={"q12": crane.description.Friction()}),
+            "joint 'q12' is unknown",
+        ),
+        (
+            lambda: mini.replace(forces=(crane.description.ForceElement("x1"),)),
+            "joint 'x1' is unknown",
+        ),
+        (
+            lambda: mini.replace(end_stops=(crane.description.EndStop("q2", 1.0),)),
+            "'q2' has no limits",
+        ),
         (lambda: mini.check_limits([0.0, np.nan, 0.0]), "q_a is nan at X1"),
     ):
         with pytest.raises(InputError, match=text):

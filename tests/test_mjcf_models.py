@@ -164,7 +164,7 @@ def test_written_again_the_machine_is_the_same(name, tmp_path):
     machine = loaded(name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        crane.write_mjcf(machine, tmp_path / "again.xml")
+        crane.formats.write_mjcf(machine, tmp_path / "again.xml")
         again = crane.load(tmp_path / "again.xml")
     assert again.joints == machine.joints and set(again.active) == set(machine.active)
     assert {x.name: dict(x.factors) for x in again.drives} == {

@@ -259,7 +259,7 @@ def test_a_motor_of_two_joints_is_written_as_a_rotor_that_a_coupling_turns(arm, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         found = identify(arm, motion, terms=terms, feasible=True, bandwidth=40.0, trust=True)
-        machine = crane.load(crane.write_identified(found, tmp_path / "out"))
+        machine = crane.load(crane.identification.write_identified(found, tmp_path / "out"))
     assert machine.active == arm.active and "q5+q6" in machine.joints
     assert machine.tree.joints["q5+q6"].rotor_inertia == pytest.approx(0.2, rel=0.02)
     assert machine.friction["q5+q6"].coulomb == pytest.approx(5.0, rel=0.05)
@@ -362,7 +362,7 @@ def test_what_judges_nothing_is_told(tmp_path, crank, arguments, message):
 
 def test_a_rest_that_stands_still_does_not_judge(tmp_path, crank):
     machine, path = crank
-    moving = crane.read_measured(crane.load(machine), path)
+    moving = crane.recordings.read_measured(crane.load(machine), path)
     held = {name: getattr(moving, name).copy() for name in ("q", "v", "tau")}
     for values in held.values():
         values[1180:] = values[1180]

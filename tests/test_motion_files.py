@@ -25,7 +25,7 @@ def test_a_path_of_the_tip_with_its_inclination(tmp_path):
         "time [s],x [mm],y [m],z [m],inclination [deg]\n"
         "3,8000,0,0.3,-70\n5,7000,0.5,0.3,-80\n8,6000,0,0.3,-70\n",
     )
-    motion = crane.read_path(machine, path)
+    motion = crane.motion.read_path(machine, path)
     kinematics = crane.Kinematics(machine)
     q_a, v_a, _ = motion([0.0, 2.0, 5.0])
     places = kinematics.positions_at_configurations(machine.closure.solve(q_a))
@@ -44,7 +44,7 @@ def test_what_a_run_recorded_is_a_path(tmp_path):
     run.to_csv(tmp_path / "run.csv")
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)
-        motion = crane.read_path(machine, tmp_path / "run.csv")
+        motion = crane.motion.read_path(machine, tmp_path / "run.csv")
     np.testing.assert_allclose(motion.position(run.time), run.q, rtol=0, atol=1e-12)
     between = np.linspace(0.5, 1.5, 777)
     assert np.abs(motion.position(between) - task.position(between)).max() < 1e-6
@@ -60,7 +60,7 @@ def test_noise_is_taken_off(tmp_path):
     path = written(tmp_path, f"time [s],x [m]\n{rows}")
     told = r"path\.csv: 'x' scatters by (0\.0001|9\.\d+e-05) m, followed up to [\d.]+ Hz"
     with pytest.warns(CraneWarning, match=told):
-        motion = crane.read_path(machine, path)
+        motion = crane.motion.read_path(machine, path)
     inside = time[100:-100]
     x, v, a = (np.array(part)[:, 0] for part in motion(inside))
     x_true, v_true, a_true = (np.array(part)[:, 0] for part in truth(inside))
@@ -145,6 +145,6 @@ def test_levers_begin_where_their_task_says(tmp_path):
     with pytest.raises(LimitError, match="the start of task 'up': x = 0.635 is outside"):
         crane.joystick(far, "up")
     with pytest.raises(InputError):
-        crane.read_path(machine, written(tmp_path, "time [s],y\n0,1\n1,2\n"))
+        crane.motion.read_path(machine, written(tmp_path, "time [s],y\n0,1\n1,2\n"))
     with pytest.raises(CraneError):
         with_start("high")

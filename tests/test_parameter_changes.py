@@ -12,7 +12,8 @@ from broken_machines import DATA
 import crane
 import crane.cli
 from crane.common.errors import InputError
-from crane.description import apply_parameter_changes, bundled_machines, parameters
+from crane.description import bundled_machines, parameters
+from crane.description.parameter_changes import apply_parameter_changes
 from crane.formats import machine_loading, read_machine_spec
 from crane.formats.machine_loading import MachineVariants
 from crane.hydraulics.components import Spool
@@ -36,7 +37,10 @@ def test_without_changes_nothing_changes(mini):
     for name in ("mass_matrix", "gravity"):
         one, two = (getattr(crane.Dynamics(m), name)(POSE) for m in (mini, same))
         assert np.array_equal(one, two)
-    assert same.friction == {**dict.fromkeys(mini.joints, crane.Friction()), **mini.friction}
+    assert same.friction == {
+        **dict.fromkeys(mini.joints, crane.description.Friction()),
+        **mini.friction,
+    }
     assert same.control == mini.control
 
 
@@ -284,8 +288,11 @@ def test_numbers_of_springs_stops_and_ropes(tmp_path):
         crane.load("patu655", changes={"end_stop.slew.damping": 7.0}).end_stops[0].damping == 7.0
     )
     spec = read_machine_spec("mini_forwarder")
-    ropes = (crane.Rope(("link1", "link7"), 0.5, 1e4), crane.Rope(("link1", "link7"), 0.6, 2e4))
-    springs = (crane.ForceElement("q1", stiffness=3.0),)
+    ropes = (
+        crane.description.Rope(("link1", "link7"), 0.5, 1e4),
+        crane.description.Rope(("link1", "link7"), 0.6, 2e4),
+    )
+    springs = (crane.description.ForceElement("q1", stiffness=3.0),)
     spec = dataclasses.replace(spec, ropes=ropes, forces=springs)
     names = parameters(spec)
     assert names["rope.link1-link7.length"] == 0.5 and names["rope.link1-link7#2.length"] == 0.6

@@ -149,7 +149,7 @@ def test_task_in_active_coordinates(edited):
 
 
 def test_polynomial_and_its_derivatives():
-    path = crane.polynomial([[1.0, 2.0, 3.0, 4.0], [5.0]], 2.0)
+    path = crane.motion.polynomial([[1.0, 2.0, 3.0, 4.0], [5.0]], 2.0)
     position, velocity, acceleration = path(0.5)
     assert position == pytest.approx([1 + 1 + 0.75 + 0.5, 5])
     assert velocity == pytest.approx([2 + 3 + 3, 0])
@@ -160,7 +160,7 @@ def test_polynomial_and_its_derivatives():
 
 
 def test_before_and_after_it_stands_still():
-    path = crane.polynomial([[1.0, 2.0, 3.0]], 2.0)
+    path = crane.motion.polynomial([[1.0, 2.0, 3.0]], 2.0)
     position, velocity, acceleration = path(np.array([-1.0, -1e-9, 2.0 + 1e-9, 5.0]))
     assert position[:, 0] == pytest.approx([1, 1, 17, 17])
     assert np.all(velocity == 0) and np.all(acceleration == 0)
@@ -188,11 +188,14 @@ def test_bad_arguments(mini):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for call, text in (
-            (lambda: crane.polynomial([[1.0]], 0.0), "duration is 0.0 s, give a number above 0"),
-            (lambda: crane.polynomial([[1.0]], np.nan), "duration is nan s"),
-            (lambda: crane.polynomial([], 1.0), "coefficients"),
-            (lambda: crane.polynomial([[np.inf]], 1.0), "coefficients are not finite"),
-            (lambda: crane.polynomial([["a"]], 1.0), "coefficients"),
+            (
+                lambda: crane.motion.polynomial([[1.0]], 0.0),
+                "duration is 0.0 s, give a number above 0",
+            ),
+            (lambda: crane.motion.polynomial([[1.0]], np.nan), "duration is nan s"),
+            (lambda: crane.motion.polynomial([], 1.0), "coefficients"),
+            (lambda: crane.motion.polynomial([[np.inf]], 1.0), "coefficients are not finite"),
+            (lambda: crane.motion.polynomial([["a"]], 1.0), "coefficients"),
             (lambda: crane.point_to_point([0, 0], [1, 1], 0.0), "duration is 0.0 s"),
             (lambda: crane.point_to_point([0, 0], [1, 1], -1.0), "duration is -1.0 s"),
             (lambda: crane.point_to_point([0, 0], [1, 1, 1], 1.0), r"end has the shape \(3,\)"),
@@ -202,7 +205,10 @@ def test_bad_arguments(mini):
                 lambda: crane.task_trajectory(mini, "dance"),
                 "no task 'dance', known: lift, loading",
             ),
-            (lambda: crane.tip_trajectory(mini, crane.polynomial([[0.3], [0.0]], 1.0)), "shape"),
+            (
+                lambda: crane.tip_trajectory(mini, crane.motion.polynomial([[0.3], [0.0]], 1.0)),
+                "shape",
+            ),
         ):
             with pytest.raises(InputError, match=text):
                 call()

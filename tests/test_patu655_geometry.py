@@ -470,7 +470,7 @@ def test_it_rings_as_the_crane_did():
             "patu655", {"payload.mass": LOAD, **changes}, lock={"slew": 0.0, "X_ext": 0.0}
         )
         run = crane.simulate(
-            machine, crane.ValveSignals(machine, time, {"X_lift": log["U1_V"]}),
+            machine, crane.control.ValveSignals(machine, time, {"X_lift": log["U1_V"]}),
             initial=(start, [0.0, 0.0]), duration=13.5,
         )  # fmt: skip
         rings[name] = band(np.interp(time, run.time, run.channels["pressure_X_lift_a"]))

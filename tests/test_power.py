@@ -123,7 +123,7 @@ def mixed(tmp_path_factory):
     machine = network(tmp_path_factory.mktemp("network"))
     time = [0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.5]
     levers = {"x": [0, 0, 0.5, 0.5, -0.6, -0.6, 0, 0], "y": [0, 0, 0.7, 0.7, 0, -1, -1, 0.4]}
-    signals = crane.ValveSignals(machine, time, levers)
+    signals = crane.control.ValveSignals(machine, time, levers)
     return machine, crane.simulate(machine, signals, duration=1.5, step=2e-4)
 
 

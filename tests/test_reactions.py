@@ -10,8 +10,10 @@ from scipy.linalg import null_space
 from test_file_precision import four_bar, loaded, written
 
 import crane
-from crane import Dynamics, ForceElement, Reactions, Rope
+from crane import Dynamics
 from crane.common.errors import InputError, SingularConfigurationError
+from crane.description import ForceElement, Rope
+from crane.dynamics import Reactions
 
 G = 9.81
 

@@ -38,7 +38,7 @@ def rig_run(folder):
 
 def power_comparison(folder):
     balance = crane.power_balance(*rig_run(folder))
-    return crane.PowerComparison({"one": balance, "two": balance}, 3.0)
+    return crane.studies.PowerComparison({"one": balance, "two": balance}, 3.0)
 
 
 def valve_curve(_):
@@ -57,39 +57,48 @@ def orifices(folder):
 # By class: how a small result is made of the folder's files, options, and the files written.
 CASES = {
     "Breakout": (
-        lambda _: crane.breakout(crane.load("patu655"), bucket="X_tilt"), {}, "breakout.md",
+        lambda _: crane.ratings.breakout(crane.load("patu655"), bucket="X_tilt"),
+        {},
+        "breakout.md",
     ),
     "Calibration": (
-        lambda x: crane.calibrate(x / "rig.yaml", x / "rig.csv", {"load_x.mass": None}), {},
+        lambda x: crane.calibrate(x / "rig.yaml", x / "rig.csv", {"load_x.mass": None}),
+        {},
         "calibration.md calibration.png report.html machine/rig.yaml machine/rig/rig.urdf",
     ),
     "Capacity": (
-        lambda _: crane.capacity(mini(), step=0.3), {"parameters": ["link7.mass"]},
+        lambda _: crane.capacity(mini(), step=0.3),
+        {"parameters": ["link7.mass"]},
         "capacity.md capacity.csv capacity.png capacity.html sheet.pdf slopes.csv",
     ),
     "Comparison": (
-        lambda x: crane.replay(crane.load(x / "rig.yaml"), x / "rig.csv", 0.01)[1], {},
+        lambda x: crane.replay(crane.load(x / "rig.yaml"), x / "rig.csv", 0.01)[1],
+        {},
         "recording.csv summary.md comparison.md comparison.png",
     ),
     "CylinderFriction": (
-        lambda x: crane.identify_cylinder_friction(*rig_run(x), "x"), {},
+        lambda x: crane.identification.identify_cylinder_friction(*rig_run(x), "x"),
+        {},
         "friction.txt friction.png",
     ),
     "Design": (
         lambda _: crane.design(
             "mini_forwarder", {"link7.mass": (0.1, 0.2)}, minimise=["mass"], starts=1
         ),
-        {}, "design.md design.png solutions.csv machine/*",
+        {},
+        "design.md design.png solutions.csv machine/*",
     ),
     "Excitation": (
         lambda x: crane.excite(
             crane.load(x / "slider_crank.yaml"), harmonics=2, periods=1, step=0.1
         ),
-        {}, "reference.csv reference.png coefficients.yaml",
+        {},
+        "reference.csv reference.png coefficients.yaml",
     ),
     "Identification": (
         lambda x: crane.identify(mini(), [read_run(x / "mini.csv", mini())]),
-        {"recordings": "mini.csv"}, "report.html parameters.csv",
+        {"recordings": "mini.csv"},
+        "report.html parameters.csv",
     ),
     "LinearModel": (
         lambda x: crane.linearize(four_bar(x)),
@@ -98,46 +107,54 @@ CASES = {
     ),
     "OrificeCoefficients": (orifices, {"unit": "m"}, "orifices.txt orifices.png"),
     "PowerBalance": (
-        lambda x: crane.power_balance(*rig_run(x)), {},
+        lambda x: crane.power_balance(*rig_run(x)),
+        {},
         "power.md power.csv power.png sankey.png",
     ),
     "PowerComparison": (power_comparison, {}, "comparison.md comparison.png"),
     "Recording": (
         lambda _: crane.simulate(mini(), duration=0.02),
-        {"npz": True, "views": True}, "recording.npz summary.md figure.png view.html",
+        {"npz": True, "views": True},
+        "recording.npz summary.md figure.png view.html",
     ),
     "Sensitivities": (
         lambda x: crane.sensitivities(
             four_bar(x), None, duration=0.01, parameters=["crank_arm.mass"]
         ),
-        {}, "sensitivities.md sensitivities.csv sensitivities.png",
+        {},
+        "sensitivities.md sensitivities.csv sensitivities.png",
     ),
     "SignalExcitation": (
-        lambda x: crane.excite_valves(
+        lambda x: crane.identification.excite_valves(
             crane.load(x / "rig.yaml"), {"load_x.mass": None}, duration=4.0
         ),
-        {}, "signals.csv signals.png",
+        {},
+        "signals.csv signals.png",
     ),
     "Study": (
         lambda _: crane.study(
             "mini_forwarder", {"payload.mass": [1, 2]}, measures=["mass"], processes=1
         ),
-        {}, "study.csv study.png",
+        {},
+        "study.csv study.png",
     ),
     "ToolForce": (
-        lambda _: crane.tool_force(crane.load("patu655"), "up", step=2.0), {},
+        lambda _: crane.ratings.tool_force(crane.load("patu655"), "up", step=2.0),
+        {},
         "tool_force.md tool_force.csv tool_force.png",
     ),
     "ValveCurve": (valve_curve, {}, "valve.txt valve.png"),
     "WorkingRange": (
-        lambda _: crane.working_range(mini()), {},
+        lambda _: crane.working_range(mini()),
+        {},
         "working_range.md working_range.csv working_range.png",
     ),
     "Workspace": (
-        lambda x: crane.workspace(four_bar(x), 100), {},
+        lambda x: crane.workspace(four_bar(x), 100),
+        {},
         "workspace.md workspace.csv curves.csv workspace.png",
     ),
-}  # fmt: skip
+}
 SLOW = "Calibration", "SignalExcitation"
 
 

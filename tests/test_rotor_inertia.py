@@ -106,7 +106,7 @@ def test_machine_files_hold_rotors(rotors, tmp_path, edited):
         again = crane.load(crane.write_machine(rotors, tmp_path / "again"))
         locked = crane.load("mini_forwarder", {"X1.rotor_inertia": 3.0}, {"X1": 0.01})
         with pytest.warns(CraneWarning, match="tasks, gains, rotor inertias, left out"):
-            crane.write_urdf_plus(crane.load(again.path), tmp_path / "mini.urdf")
+            crane.formats.write_urdf_plus(crane.load(again.path), tmp_path / "mini.urdf")
     assert dict(zip(again.joints, again.model.armature, strict=True)) == {
         joint: ROTORS.get(joint, 0.0) for joint in rotors.joints
     }
@@ -159,7 +159,7 @@ def test_armature_is_mujoco_s_in_closed_loops(rotors, tmp_path):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        crane.write_mjcf(rotors, tmp_path / "rotors.xml")
+        crane.formats.write_mjcf(rotors, tmp_path / "rotors.xml")
         again = crane.load(tmp_path / "rotors.xml").with_active_joints(rotors.active)
     assert {x: again.tree.joints[x].rotor_inertia for x in ROTORS} == ROTORS
     oracle, dynamics = Oracle(tmp_path / "rotors.xml", rotors), crane.Dynamics(rotors)

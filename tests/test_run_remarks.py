@@ -44,7 +44,7 @@ def test_friction_that_sticks_and_steps_by_their_error_do_not_chatter(mini, smoo
 
 def test_a_stop_that_gains_energy_is_an_error(mini):
     """A block of steel against a stop that four steps go through."""
-    machine = mini.replace(friction={}, end_stops=(crane.EndStop("X1", 1e8),))
+    machine = mini.replace(friction={}, end_stops=(crane.description.EndStop("X1", 1e8),))
     start = np.array([0.0, 0.0295, 0.015]), np.array([0.0, 0.3, 0.0])
     with pytest.raises(SimulationError) as caught:
         crane.simulate(machine, None, start, 0.01, 1e-3, method="rk4")
@@ -57,13 +57,13 @@ def test_a_stop_that_gains_energy_is_an_error(mini):
 def test_a_piston_beyond_its_cylinder_is_told():
     machine = crane.load("patu655")
     soft = tuple(
-        crane.EndStop(stop.joint, 1e-2 * stop.stiffness, stop.damping)
+        crane.description.EndStop(stop.joint, 1e-2 * stop.stiffness, stop.damping)
         for stop in machine.end_stops
     )
     lift = machine.active.index("X_lift")
 
     def against(machine):
-        levers = crane.ValveSignals(machine, [0.0, 1.0], {"X_lift": [0.0, 4.0]})
+        levers = crane.control.ValveSignals(machine, [0.0, 1.0], {"X_lift": [0.0, 4.0]})
         return told(machine, levers, duration=16.0, step=2e-3)
 
     found, lines = against(machine.replace(end_stops=soft))

@@ -463,7 +463,7 @@ def test_what_is_drawn(tmp_path):
     with open_robots(machine) as (xml,):
         (drawn,) = xml.root.iter("visual")
     assert drawn.find("origin").get("xyz").split() == ["0.0", "0.0", "2.0"]
-    crane.write_urdf_plus(machine, tmp_path / "out.urdf")
+    crane.formats.write_urdf_plus(machine, tmp_path / "out.urdf")
     assert 'size="1 2 3"' in (tmp_path / "out.urdf").read_text()
     assert_same(machine, load(tmp_path / "out.urdf"), np.random.default_rng(1))
 

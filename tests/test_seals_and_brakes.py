@@ -57,7 +57,9 @@ def pressed(recording, joint, seal=SEAL):
 
 
 def closed(machine, pressures=None):
-    return crane.ValveDrive(machine, crane.ValveSignals(machine, [0.0], {}), pressures)
+    return crane.control.ValveDrive(
+        machine, crane.control.ValveSignals(machine, [0.0], {}), pressures
+    )
 
 
 def slewing(folder, brake=BRAKE, friction=None, valve=None, inertia=15.0, **cylinder):
@@ -93,7 +95,7 @@ def slewing(folder, brake=BRAKE, friction=None, valve=None, inertia=15.0, **cyli
 def test_a_locked_cylinder_holds_up_to_what_its_seals_press(tmp_path, coulomb, method):
     """To the last bit until the force is F_C + mu (p_A + p_B), from weight's equilibrium on."""
     machine = rig(tmp_path, cylinder={"seal_friction": SEAL})
-    laws = {} if coulomb is None else {"x": crane.Friction(coulomb=coulomb)}
+    laws = {} if coulomb is None else {"x": crane.description.Friction(coulomb=coulomb)}
     machine = machine.replace(friction=laws)
     p_b = 3e6
     p_a = (2000 * G + AREA_B * p_b) / AREA_A
@@ -121,7 +123,7 @@ def test_a_sliding_cylinder_loses_what_its_seals_press(tmp_path, method):
     """At constant speed and pressures A_A p_A - A_B p_B - F_V v = F_C + mu (p_A + p_B)."""
     machine = rig(tmp_path, axis="1 0 0", mass=300.0, cylinder={"seal_friction": SEAL},
                   friction={"coulomb": 400.0, "viscous": 900.0})  # fmt: skip
-    signals = crane.ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [0.0, 0.0, 0.3]})
+    signals = crane.control.ValveSignals(machine, [0.0, 0.1, 0.2], {"x": [0.0, 0.0, 0.3]})
     step = 1e-3 if method == "rosenbrock" else 1e-2
     found = run(machine, signals, [0.05], 1.5, step, method=method)
     v = found.v[-1, 0]
@@ -170,9 +172,9 @@ def test_a_brake_lets_go_as_the_lever_moves(tmp_path, way):
     """Under 1000 N m it starts where B (1 - (|u| - d) / e) is 1000 N m, released beyond d + e."""
     slight = dict.fromkeys(("c1", "c2", "c3", "c4"), 1e-12)  # pressures stay what they are
     machine = slewing(tmp_path, valve=slight, brake_release=0.2)
-    signals = crane.ValveSignals(machine, [0.0, 1.0], {"turn": [0.0, way]})
+    signals = crane.control.ValveSignals(machine, [0.0, 1.0], {"turn": [0.0, way]})
     push = crane.Wrench("pillar", moment=(0, 0, 1000.0))
-    borne = crane.ValveDrive(machine, signals, {"turn": (1e5, 1e5)})  # by the brake alone
+    borne = crane.control.ValveDrive(machine, signals, {"turn": (1e5, 1e5)})  # by the brake alone
     found = run(machine, borne, None, 0.5, 1e-3, loads=[push])
     starts = 0.1 + 0.2 * 0.5
     still = found.time < starts - 1e-9
@@ -192,7 +194,7 @@ def test_a_brake_stops_what_slews(tmp_path):
     machine = slewing(tmp_path, friction={"viscous": 100.0}, seal_friction=2e-5)
     corners = [(0.0, 0.0), (0.2, 0.0), (0.3, 0.5), (1.0, 0.5), (1.1, 0.0), (2.0, 0.0)]
     times, levers = zip(*corners, strict=True)
-    signals = crane.ValveSignals(machine, times, {"turn": levers})
+    signals = crane.control.ValveSignals(machine, times, {"turn": levers})
     found = run(machine, signals, None, 2.0, 1e-3)
     assert found.v[found.time < 1.0].max() > 0.1
     assert (found.q[-500:] == found.q[-1]).all() and (found.v[-500:] == 0).all()
@@ -218,7 +220,9 @@ def test_a_smooth_law_has_the_same_limit(tmp_path):
         machine = rig(tmp_path, ORIFICE | {"dead_band": 0.1}, friction=law,
                       cylinder={"seal_friction": SEAL, "brake": BRAKE})  # fmt: skip
         assert not find_stick_slip_columns(machine)
-        signals = crane.ValveSignals(machine, [0, 0.2, 0.5, 0.8, 1.2], {"x": [0, 0, 0.5, -0.5, 0]})
+        signals = crane.control.ValveSignals(
+            machine, [0, 0.2, 0.5, 0.8, 1.2], {"x": [0, 0, 0.5, -0.5, 0]}
+        )
         found = run(machine, signals, None, 1.5, 1e-3)
         spool = np.abs(found.channels["spool_x"])
         grip = pressed(found, "x") + BRAKE * np.clip(1 - (spool - 0.1) / 0.05, 0, 1)
@@ -272,7 +276,7 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
         f"friction.{joint}.smoothing": smoothing for joint in ("slew", "X_lift", "X_tilt", "X_ext")
     }
     machine = gripping(smooth if smoothing else ())
-    drive = crane.ValveDrive(machine, levers(machine))
+    drive = crane.control.ValveDrive(machine, levers(machine))
     compiled, plain = (
         Chart.from_dynamics(Dynamics(machine, backend=backend))
         for backend in ("compiled", "pinocchio")
@@ -319,7 +323,7 @@ def test_backends_agree_over_a_motion(tmp_path):
                   cylinder={"seal_friction": SEAL, "brake": 3000.0}, friction={"coulomb": 100.0},
                   supply={"flow": 1e-3})  # fmt: skip
     polygons = {"x": [0, 0.6, -0.5, 0], "y": [0, -0.4, 0.5, 0]}
-    signals = crane.ValveSignals(machine, [0.1, 0.3, 0.5, 0.8], polygons)
+    signals = crane.control.ValveSignals(machine, [0.1, 0.3, 0.5, 0.8], polygons)
     found = run(machine, signals, None, 1.0, 1e-2)
     other = run(machine, signals, None, 1.0, 1e-2, backend="pinocchio")
     assert np.ptp(found.q, axis=0).min() > 1e-3
@@ -338,7 +342,10 @@ def test_joints_that_hold_share_the_limits_of_the_moment():
     alone = {"X_ext": 0.1, "slew": 0.0, "X_lift": 0.117}
     changes = {"cylinder.X_tilt.seal_friction": SEAL}
     machine = crane.load("patu655", changes, lock=alone)
-    pins = {"q3": crane.Friction(coulomb=400.0), "X_tilt": crane.Friction(coulomb=200.0)}
+    pins = {
+        "q3": crane.description.Friction(coulomb=400.0),
+        "X_tilt": crane.description.Friction(coulomb=200.0),
+    }
     machine = machine.replace(friction=pins)
     q = machine.closure.solve([0.3])
     gamma = machine.closure.gamma(q)[:, 0]
@@ -375,7 +382,9 @@ def test_measured_pressures_of_the_tank_count(tmp_path, backend):
                   friction=law)  # fmt: skip
     times = [0.0, 0.01, 0.02, 0.2]
     tank = np.array([8e5, 8e5, 8e5, 4e5])
-    signals = crane.ValveSignals(machine, times, {"x": [0.0, 0.0, 0.3, 0.3]}, [8e6] * 4, tank)
+    signals = crane.control.ValveSignals(
+        machine, times, {"x": [0.0, 0.0, 0.3, 0.3]}, [8e6] * 4, tank
+    )
     found = run(machine, signals, [0.1], 0.12, 2e-3, backend=backend)
     late = found.time > 0.04
     p = [found.channels[f"pressure_x_{side}"] for side in "ab"]
@@ -391,8 +400,8 @@ def test_what_holds_nothing_beside_what_holds_much(tmp_path):
     slight = dict.fromkeys(("c1", "c2", "c3", "c4"), 1e-12)
     machine = rig(tmp_path, ORIFICE | slight, axis="1 0 0", joints=("x", "y"),
                   cylinder={"brake": BRAKE})  # fmt: skip
-    machine = machine.replace(friction={"x": crane.Friction(coulomb=1e6)})
-    signals = crane.ValveSignals(machine, [0.0], {"y": [0.5]})
+    machine = machine.replace(friction={"x": crane.description.Friction(coulomb=1e6)})
+    signals = crane.control.ValveSignals(machine, [0.0], {"y": [0.5]})
     found = run(machine, signals, None, 0.2, 1e-3)
     assert (found.q[:, 0] == found.q[0, 0]).all()
     assert np.abs(found.channels["rest_y"]).max() <= 2 * MIN_COULOMB_FRICTION
@@ -407,10 +416,10 @@ def test_seals_press_through_dead_centres(tmp_path):
     }
     machine = singular_linkages.slider_crank(tmp_path, "s", 0.3, 0.6)
     machine = machine.replace(
-        friction={"s": crane.Friction(coulomb=2.0)},
+        friction={"s": crane.description.Friction(coulomb=2.0)},
         hydraulics=Hydraulics(Supply(5e6), Oil(), **parts),
     )
-    signals = crane.ValveSignals(machine, [0.0], {"s": [0.3]})
+    signals = crane.control.ValveSignals(machine, [0.0], {"s": [0.3]})
     start = singular_linkages.start(machine, "a", 15.0)
     with pytest.warns(crane.CraneWarning, match=r"^'s' passes a dead centre"):
         found = crane.simulate(machine, signals, start, 0.8, 1e-3)
@@ -438,7 +447,7 @@ def test_forces_know_no_pressure(tmp_path, method):
     assert np.ptp(found.q) > 1e-3
     assert np.array_equal(found.q, other.q)
     assert found.channels.keys() == other.channels.keys()
-    batch = crane.simulate_batch(
+    batch = crane.simulation.simulate_batch(
         [with_], lambda m: lambda t, q, v: [300.0 * np.sin(9 * t)], [[0.2]], 0.5, method=method
     )
     assert np.array_equal(batch.q[0], found.q)
@@ -490,7 +499,7 @@ def test_sensitivities_know_seals_and_brake(tmp_path):
         return signals(other), other
 
     def signals(other):
-        return crane.ValveSignals(other, [0.0, 0.2, 0.4, 0.8], {"x": [0.0, 0.0, 0.5, 0.5]})
+        return crane.control.ValveSignals(other, [0.0, 0.2, 0.4, 0.8], {"x": [0.0, 0.0, 0.5, 0.5]})
 
     by, outputs = tuple(base), ("x", "x_velocity", "pressure_x_a")
     found = crane.sensitivities(machine, signals(machine), [0.2], 0.6, 1e-3, parameters=by,
@@ -508,7 +517,7 @@ def test_sensitivities_know_seals_and_brake(tmp_path):
         off = np.abs(found.derivatives[-100:, :, k] - true[-100:]) / sizes
         assert off.max() < 2e-3, name
     weights = np.random.default_rng(1).normal(size=found.derivatives.shape[:2]) * [1.0, 1.0, 1e-7]
-    back = crane.gradient(
+    back = crane.simulation.gradient(
         machine,
         signals(machine),
         [0.2],
@@ -570,7 +579,9 @@ def test_calibration_finds_seals(tmp_path, monkeypatch):
                   friction={"viscous": 900.0})  # fmt: skip
     time = np.arange(0.0, 4.0, 0.01)
     levers = 0.4 * np.array([0, 1, 0, -1, 1, -0.5, 0.7, 0])[(time / 0.5).astype(int)]
-    true = run(machine, crane.ValveSignals(machine, time, {"x": levers}), [0.2], 3.99, 1e-2)
+    true = run(
+        machine, crane.control.ValveSignals(machine, time, {"x": levers}), [0.2], 3.99, 1e-2
+    )
     random, columns = np.random.default_rng(3), true.columns()
     noise = {"x": 1e-4, "pressure_x_a": 1e4, "pressure_x_b": 1e4}
     values = [columns[name] + size * random.normal(size=len(time)) for name, size in noise.items()]
@@ -633,9 +644,9 @@ def test_a_written_machine_keeps_them(tmp_path):
 def test_optimal_control_asks_for_a_smooth_law(tmp_path):
     machine = slewing(tmp_path)
     with pytest.raises(CraneError, match=r"friction of 'turn' sticks.*friction.turn.smoothing"):
-        crane.casadi_function(machine, "simulation")
+        crane.simulation.casadi_function(machine, "simulation")
     smooth = slewing(tmp_path, friction={"smoothing": 0.1}, seal_friction=2e-5)
-    function = crane.casadi_function(smooth, "simulation")
+    function = crane.simulation.casadi_function(smooth, "simulation")
     inputs = {"q": [0.1], "v_a": [0.02], "circuit": [4e6, 3e6], "signals": [0.12]}
     found = function(**inputs)
     grip = BRAKE * (1 - (0.12 - 0.1) / 0.05) + 2e-5 * (7e6 + 2 * (1e3 - TANK))

@@ -82,7 +82,7 @@ def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
     )
 
 
-class Ramp(crane.ControlLaw):
+class Ramp(crane.control.ControlLaw):
     """A force that grows."""
 
     def references(self, times):
@@ -189,7 +189,7 @@ def test_ten_seconds_on_valves(sticks, share):
     def made(other):
         valve = other.hydraulics.valves["X_lift"]
         levers = valve.neutral + 0.4 * np.array([0, 0, 1, 1, 0, 0]) * (valve.full - valve.neutral)
-        signals = crane.ValveSignals(other, [0, 0.5, 1, 4, 4.5, 10.0], {"X_lift": levers})
+        signals = crane.control.ValveSignals(other, [0, 0.5, 1, 4, 4.5, 10.0], {"X_lift": levers})
         return signals, [0.2, 0.3]
 
     outputs = ("X_lift", "X_tilt", "pressure_X_lift_a", "tip_z")

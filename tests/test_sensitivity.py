@@ -101,7 +101,7 @@ def test_derivatives_are_differences(name, quantity):
 @pytest.mark.parametrize("smoothing", (0.0, 0.3))
 def test_with_friction_that_sticks_or_is_smooth(name, quantity, smoothing):
     machine = machine_of(name)
-    friction = crane.Friction(
+    friction = crane.description.Friction(
         coulomb=40.0, coulomb_offset=3.0, viscous=200.0, viscous_offset=9.0, smoothing=smoothing,
         stiction=15.0, stribeck=0.4,
     )  # fmt: skip

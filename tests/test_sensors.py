@@ -82,7 +82,7 @@ def told(machine, path, **options):
     """What is said of sensors while a recording is read."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CraneWarning)
-        crane.read_measured(machine, path, **options)
+        crane.recordings.read_measured(machine, path, **options)
     return [str(one.message) for one in caught if "sensors disagree" in str(one.message)]
 
 
@@ -119,7 +119,7 @@ def test_what_a_machine_knows_of_its_sensors_corrects_a_recording(machine, motio
     numbers = {"sensor.X_lift.zero": 0.005, "sensor.X_lift.scale": 1.02}
     knowing = crane.load("patu655", changes=numbers, lock=dict(machine.locked_joints))
     assert told(machine, path) and not told(knowing, path)
-    found = crane.read_measured(knowing, path)
+    found = crane.recordings.read_measured(knowing, path)
     np.testing.assert_allclose(found.q[:, 0], columns["X_lift"], atol=1e-15)
     # notes of the file say the same, and count before the machine's own
     noted = written(
@@ -129,7 +129,7 @@ def test_what_a_machine_knows_of_its_sensors_corrects_a_recording(machine, motio
     for one in (machine, crane.load("patu655", changes={"sensor.X_lift.zero": 1.0}, lock=LOCKED)):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", CraneWarning)
-            again = crane.read_measured(one, noted)
+            again = crane.recordings.read_measured(one, noted)
         assert np.array_equal(again.q, found.q)
         said = [str(x.message) for x in caught if "notes of the recording count" in str(x.message)]
         assert bool(said) == bool(one.sensors)
@@ -142,11 +142,13 @@ def test_quantities_are_corrected_once(machine, motion, tmp_path):
     """A recording that was corrected says so, and so does a simulated one."""
     path = written(tmp_path, motion, [], X_lift=lambda x: x + 0.005)
     knowing = crane.load("patu655", changes={"sensor.X_lift.zero": 0.005}, lock=LOCKED)
-    found = crane.read_measured(knowing, path)
+    found = crane.recordings.read_measured(knowing, path)
     found.to_csv(tmp_path / "again.csv")
     assert "# sensors: ideal" in (tmp_path / "again.csv").read_text()
-    assert np.array_equal(crane.read_measured(knowing, tmp_path / "again.csv").q, found.q)
-    assert not crane.read_measured(machine, path).ideal  # nothing was known of them
+    assert np.array_equal(
+        crane.recordings.read_measured(knowing, tmp_path / "again.csv").q, found.q
+    )
+    assert not crane.recordings.read_measured(machine, path).ideal  # nothing was known of them
     assert crane.simulate(machine, duration=0.01).ideal
 
 
@@ -198,7 +200,7 @@ def test_machine_files_keep_sensors(machine, tmp_path):
 def test_notes_that_are_none(machine, motion, tmp_path, notes, said):
     path = written(tmp_path, motion, ["q2"], notes)
     with pytest.raises(RecordingError) as error:
-        crane.read_measured(machine, path)
+        crane.recordings.read_measured(machine, path)
     assert said in str(error.value) and str(error.value).startswith(str(path))
 
 
@@ -390,7 +392,7 @@ def test_inclinometers_tell_the_posture(machine, motion, tmp_path, given):
     names = ["time", *given, "X_lift_force", "X_tilt_force"]
     table = Table({x: units[x] for x in names}, np.column_stack([columns[x] for x in names]), {})
     timeseries.write_table(tmp_path / "run.csv", table)
-    found = crane.read_measured(machine, tmp_path / "run.csv")
+    found = crane.recordings.read_measured(machine, tmp_path / "run.csv")
     for i, joint in enumerate(("X_lift", "X_tilt")):
         np.testing.assert_allclose(found.q[:, i], columns[joint], atol=1e-9)
     assert told(machine, tmp_path / "run.csv") == []
@@ -409,7 +411,7 @@ def test_what_is_not_finite_is_named(machine, motion, tmp_path):
         }
         np.savez(tmp_path / "run.npz", **held)
         with pytest.raises(RecordingError, match="'inclination_lift_boom' is nan at sample 5"):
-            crane.read_measured(machine, tmp_path / "run.npz")
+            crane.recordings.read_measured(machine, tmp_path / "run.npz")
 
 
 def test_one_sample_is_compared_and_its_rates_are_not(machine, motion, tmp_path):
@@ -435,7 +437,7 @@ def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
         table = Table({x: units[x] for x in names}, np.column_stack(values), {})
         timeseries.write_table(tmp_path / "run.csv", table)
         with pytest.raises(RecordingError) as error:
-            crane.read_measured(machine, tmp_path / "run.csv")
+            crane.recordings.read_measured(machine, tmp_path / "run.csv")
         assert said in str(error.value)
 
 
@@ -444,8 +446,8 @@ def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
 
 def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
     path = written(tmp_path, motion, [])
-    whole = crane.read_measured(machine, path)
-    part = crane.read_measured(machine, path, span=(3.0, 5.0))
+    whole = crane.recordings.read_measured(machine, path)
+    part = crane.recordings.read_measured(machine, path, span=(3.0, 5.0))
     some = (whole.time >= 3.0) & (whole.time <= 5.0)
     assert part.time[0] == 3.0 and part.time[-1] == pytest.approx(5.0)
     assert np.array_equal(part.q, whole.q[some])
@@ -458,7 +460,7 @@ def test_a_window_is_what_was_recorded_in_it(machine, motion, tmp_path):
         ((5.0, 3.0), InputError, "nothing lies from 5 to 3 s, give a later end"),
     ):
         with pytest.raises(error, match=re.escape(said)):
-            crane.read_measured(machine, path, span=span)
+            crane.recordings.read_measured(machine, path, span=span)
 
 
 def test_a_delay_reads_beyond_the_window(machine, motion, tmp_path):
@@ -502,13 +504,13 @@ def test_lengths_from_pin_to_pin_are_not_strokes(machine, motion, tmp_path):
     assert dead_length(crane.load("patu655"), "X_ext") is None  # it has no pins on its axis
     lengths = {"X_lift": lambda x: x + 0.82, "X_tilt": lambda x: x + 1.05}
     with pytest.raises(RecordingError) as error:
-        crane.read_measured(machine, written(tmp_path, motion, [], **lengths))
+        crane.recordings.read_measured(machine, written(tmp_path, motion, [], **lengths))
     line = str(error.value)
     assert "from pin to pin it is 0.82 m longer, subtract that (sensor.X_lift.zero = 0.82)" in line
     assert "(sensor.X_tilt.zero = 1.05)" in line
     numbers = {"sensor.X_lift.zero": 0.82, "sensor.X_tilt.zero": 1.05}
     knowing = crane.load("patu655", changes=numbers, lock=LOCKED)
-    found = crane.read_measured(knowing, tmp_path / "run.csv")
+    found = crane.recordings.read_measured(knowing, tmp_path / "run.csv")
     np.testing.assert_allclose(found.q[:, 0], motion[0]["X_lift"], atol=1e-12)
 
 

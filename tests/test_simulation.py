@@ -24,7 +24,7 @@ def springy(forwarder):
     middle = np.array([0.0, 0.015, 0.015])
     weight = crane.Dynamics(forwarder).gravity(middle)
     springs = tuple(
-        crane.ForceElement(joint, stiffness=k, rest=float(middle[i] + weight[i] / k))
+        crane.description.ForceElement(joint, stiffness=k, rest=float(middle[i] + weight[i] / k))
         for i, (joint, k) in enumerate(zip(forwarder.active, (0.3, 2000.0, 4000.0), strict=True))
     )
     return forwarder.replace(friction={}, forces=springs, end_stops=())
@@ -219,7 +219,7 @@ def test_passive_joints_beyond_their_limits_are_told_in_the_same_line(tmp_path):
     assert "'crank' passes its limit" in line
     assert f"'rocker' passes its limit -0.1 rad at t = 0.001 s, by up to {past:.3g} rad" in line
     assert line.endswith("nothing stops them there, give them end stops")
-    batch = crane.simulate_batch([machine], lambda machine: push, duration=0.5)
+    batch = crane.simulation.simulate_batch([machine], lambda machine: push, duration=0.5)
     assert batch.warnings[0].startswith(line)
 
 

@@ -10,9 +10,9 @@ import crane
 from crane.common.errors import CraneError
 from crane.description.external_forces import FrameMotion
 
-SANDY, CLAY = crane.SOILS["sandy loam"], crane.SOILS["lean clay"]
-STICKY = crane.Soil(18e3, 9e3, np.radians(25), np.radians(14), 4e3, 2e3)
-UNDRAINED = crane.Soil(18e3, 30e3, 0.0, 0.0, 10e3)
+SANDY, CLAY = crane.description.SOILS["sandy loam"], crane.description.SOILS["lean clay"]
+STICKY = crane.description.Soil(18e3, 9e3, np.radians(25), np.radians(14), 4e3, 2e3)
+UNDRAINED = crane.description.Soil(18e3, 30e3, 0.0, 0.0, 10e3)
 
 
 def wedge(soil, rake, beta, depth):
@@ -42,7 +42,9 @@ def flattest(soil, rake):
 
     Without friction its weight tells none, and cohesion does.
     """
-    bare = crane.Soil(1.0, 0.0 if soil.friction else 1.0, soil.friction, soil.tool_friction)
+    bare = crane.description.Soil(
+        1.0, 0.0 if soil.friction else 1.0, soil.friction, soil.tool_friction
+    )
     low, high = 1e-3, np.pi - rake - soil.friction - soil.tool_friction - 1e-3
     for _ in range(9):
         angles = np.linspace(low, high, 41)
@@ -52,7 +54,9 @@ def flattest(soil, rake):
     return 0.5 * (low + high)
 
 
-@pytest.mark.parametrize("soil", [SANDY, CLAY, STICKY, UNDRAINED, *crane.SOILS.values()])
+@pytest.mark.parametrize(
+    "soil", [SANDY, CLAY, STICKY, UNDRAINED, *crane.description.SOILS.values()]
+)
 def test_factors_are_those_of_a_wedge_in_balance_that_resists_least(soil):
     for rake in np.linspace(0.2, min(1.5, soil.max_rake), 5):
         factors, cot_beta = soil.cutting_factors(np.cos(rake), np.sin(rake))
@@ -71,7 +75,7 @@ def test_factors_are_those_of_a_wedge_in_balance_that_resists_least(soil):
 )  # fmt: skip
 def test_an_upright_blade_is_a_wall_under_passive_pressure(friction, tool, coefficient):
     """2 N_gamma is Coulomb's coefficient (tables of B. M. Das, Principles of Foundation Eng.)."""
-    soil = crane.Soil(1.0, 0.0, np.radians(friction), np.radians(tool))
+    soil = crane.description.Soil(1.0, 0.0, np.radians(friction), np.radians(tool))
     (of_weight, *_), _ = soil.cutting_factors(0.0, 1.0)
     assert 2 * of_weight == pytest.approx(coefficient, rel=5e-4)
 
@@ -81,10 +85,10 @@ def test_a_strip_bears_what_tables_say():
     for degrees, of_cohesion, of_pressure in (
         (0, 5.14, 1.0), (10, 8.35, 2.47), (20, 14.83, 6.40), (30, 30.14, 18.40), (40, 75.31, 64.20)
     ):  # fmt: skip
-        found = crane.Soil(0.0, 0.0, np.radians(degrees)).bearing_factors
+        found = crane.description.Soil(0.0, 0.0, np.radians(degrees)).bearing_factors
         assert found == pytest.approx((of_cohesion, of_pressure), abs=6e-3)
-    near = crane.Soil(0.0, 0.0, 1e-9).bearing_factors
-    assert near == pytest.approx(crane.Soil(0.0, 0.0, 0.0).bearing_factors, rel=1e-8)
+    near = crane.description.Soil(0.0, 0.0, 1e-9).bearing_factors
+    assert near == pytest.approx(crane.description.Soil(0.0, 0.0, 0.0).bearing_factors, rel=1e-8)
 
 
 def seen(depth, rake, velocity, lean=0.0):
@@ -99,7 +103,9 @@ def seen(depth, rake, velocity, lean=0.0):
 
 def cutter(soil=STICKY, frame="blade", **options):
     options = {"width": 1.2, "length": 0.8, "smoothing": 1e-4} | options
-    return crane.SoilCutting(frame, soil, blade=(0, 0, 1), cutting=(1, 0, 0), **options)
+    return crane.description.SoilCutting(
+        frame, soil, blade=(0, 0, 1), cutting=(1, 0, 0), **options
+    )
 
 
 @pytest.mark.parametrize("soil", [STICKY, UNDRAINED, SANDY])
@@ -123,7 +129,7 @@ def test_ahead_it_resists_with_the_wedge_and_withdrawn_it_only_rubs(soil):
         force = np.array(thick.wrench(seen(depth, rake, way))[0])
         assert force == pytest.approx(-expected * way, rel=1e-6, abs=1e-6 * rubs)
     # deeper than its blade, what is above it weighs on the wedge
-    deep = crane.Soil(*(getattr(soil, key) for key in (
+    deep = crane.description.Soil(*(getattr(soil, key) for key in (
         "unit_weight", "cohesion", "friction", "tool_friction", "adhesion"
     )), soil.surcharge + soil.unit_weight * 0.5)  # fmt: skip
     filled = 0.8 * np.sin(rake)
@@ -139,7 +145,7 @@ def test_beyond_the_bounds_of_the_rake_it_cuts_with_their_wedges():
         np.array(cutter().wrench(seen(depth, rake, ahead))[0]) for rake in (np.pi / 2, 1.9)
     )
     assert over == pytest.approx(upright, rel=1e-6)
-    steep = crane.Soil(15e3, 0.0, 1.0, 1.0)
+    steep = crane.description.Soil(15e3, 0.0, 1.0, 1.0)
     heap, within = (
         np.array(cutter(steep).wrench(seen(depth, rake, ahead))[0])
         for rake in (1.5, steep.max_rake)
@@ -158,7 +164,7 @@ def test_it_never_drives_the_edge_and_is_always_a_number():
     for _ in range(4000):
         phi = random.uniform(0, 1.05) * random.integers(0, 2)
         cohesion = 10 ** random.uniform(0, 5)
-        soil = crane.Soil(
+        soil = crane.description.Soil(
             random.uniform(1e4, 2e4), cohesion, phi, phi * random.uniform(), cohesion
             * random.uniform(), random.uniform(0, 1e4),
         )  # fmt: skip
@@ -238,7 +244,7 @@ def test_pulled_as_the_equation_says_it_goes_on_at_its_speed(sled, tmp_path):
 
 @pytest.mark.parametrize("soil", [STICKY, UNDRAINED])
 def test_a_dig_keeps_the_balance_and_is_in_machine_code_what_it_is_in_python(sled, soil):
-    ground = crane.Ground(profile=((-2.0, -0.6), (0.4, -0.6), (3.0, -0.2)))
+    ground = crane.description.Ground(profile=((-2.0, -0.6), (0.4, -0.6), (3.0, -0.2)))
     digging = cutter(soil, ground=ground, thickness=0.01, smoothing=0.05)
 
     def in_python(time, *where):
@@ -249,7 +255,7 @@ def test_a_dig_keeps_the_balance_and_is_in_machine_code_what_it_is_in_python(sle
     start = [0.0, -0.25, -0.4], [2.0, -1.0, 0.3]
     runs = [
         run(sled, [load, push], start, 0.3, step=1e-3, method="rk4")
-        for load in (digging, crane.WrenchFunction("blade", in_python))
+        for load in (digging, crane.description.WrenchFunction("blade", in_python))
     ]
     assert runs[0].q == pytest.approx(runs[1].q, abs=1e-11)
     assert runs[0].channels["depth_blade"].max() > 0.05
@@ -312,7 +318,7 @@ def test_machine_files_dig(sled, tmp_path):
 
 def test_the_documented_soils_are_those_of_the_table():
     page = (Path(__file__).parents[1] / "docs" / "machine_file.md").read_text(encoding="utf-8")
-    for name, soil in crane.SOILS.items():
+    for name, soil in crane.description.SOILS.items():
         (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
         told = [float(word.split()[0]) for word in row.split("|")[2:7]]
         told[2:4] = np.radians(told[2:4])
@@ -321,12 +327,24 @@ def test_the_documented_soils_are_those_of_the_table():
 
 def test_what_cuts_nothing_is_refused():
     for make, text in (
-        (lambda: crane.Soil(-1.0, 0.0, 0.5), "unit_weight of the soil is -1, it must not"),
-        (lambda: crane.Soil(1.0, 0.0, 30.0), "30 rad, give at most 1.05 rad"),
-        (lambda: crane.Soil(1.0, 0.0, 0.3, 0.4), "tool_friction .* above its friction 0.3"),
-        (lambda: crane.Soil(1.0, 5.0, 0.3, 0.1, 6.0), "adhesion .* above its cohesion 5"),
-        (lambda: crane.Soil(1.0, np.nan, 0.3), "cohesion of the soil is nan Pa"),
-        (lambda: cutter("sand"), "soil of the cutter at 'blade' is 'sand', give a crane.Soil"),
+        (
+            lambda: crane.description.Soil(-1.0, 0.0, 0.5),
+            "unit_weight of the soil is -1, it must not",
+        ),
+        (lambda: crane.description.Soil(1.0, 0.0, 30.0), "30 rad, give at most 1.05 rad"),
+        (
+            lambda: crane.description.Soil(1.0, 0.0, 0.3, 0.4),
+            "tool_friction .* above its friction 0.3",
+        ),
+        (
+            lambda: crane.description.Soil(1.0, 5.0, 0.3, 0.1, 6.0),
+            "adhesion .* above its cohesion 5",
+        ),
+        (lambda: crane.description.Soil(1.0, np.nan, 0.3), "cohesion of the soil is nan Pa"),
+        (
+            lambda: cutter("sand"),
+            "soil of the cutter at 'blade' is 'sand', give a crane.description.Soil",
+        ),
         (lambda: cutter(width=0.0), "the width of the cutter at 'blade'"),
         (lambda: cutter(thickness=-1.0), "must not be negative"),
     ):

@@ -26,8 +26,8 @@ def block(folder, slope=0.0, mass=2.0, spring=0.0, **friction):
     )
     machine = crane.load(folder / "block.urdf")
     return machine.replace(
-        friction={"x": crane.Friction(**friction)},
-        forces=(crane.ForceElement("x", stiffness=spring),) if spring else (),
+        friction={"x": crane.description.Friction(**friction)},
+        forces=(crane.description.ForceElement("x", stiffness=spring),) if spring else (),
     )
 
 
@@ -118,8 +118,8 @@ def test_a_stick_slip_oscillator(tmp_path, method, tolerance):
     k, m, speed = 50.0, 2.0, 0.1
     law = {"coulomb": 4.0, "stiction": 2.0, "stribeck": 0.2}
     machine = block(tmp_path, 0.0, m, **law)
-    path = crane.polynomial([[0.0, speed]], 10.0)
-    pull = crane.PI(machine, path, {"x": crane.PIGains(k, 0.0)}, np.zeros(1))
+    path = crane.motion.polynomial([[0.0, speed]], 10.0)
+    pull = crane.PI(machine, path, {"x": crane.description.PIGains(k, 0.0)}, np.zeros(1))
     found = run(machine, pull, step=1e-3, method=method)
     wanted, rests = np.zeros(len(found.time)), np.zeros(len(found.time), dtype=bool)
     phases = stick_slip(k, m, speed, **law, until=10.0)
@@ -144,7 +144,7 @@ def test_many_joints_that_stick_give_way_together(tmp_path, method):
     machine = singular_linkages.four_bar(tmp_path, "a")
     limits = {"a": 3.0, "b": 1.0, "c": 2.0}
     machine = machine.replace(
-        friction={joint: crane.Friction(coulomb=x) for joint, x in limits.items()}
+        friction={joint: crane.description.Friction(coulomb=x) for joint, x in limits.items()}
     )
     q_a = machine.home[machine.closure.active]
     gamma = machine.closure.gamma(machine.home)[:, 0]
@@ -183,7 +183,10 @@ def test_a_loaded_crane_stands_still_for_an_hour(mini):
     loaded = mini.replace(
         friction={
             **mini.friction,
-            **{joint: crane.Friction(coulomb=60.0, viscous=500.0) for joint in ("X1", "X2")},
+            **{
+                joint: crane.description.Friction(coulomb=60.0, viscous=500.0)
+                for joint in ("X1", "X2")
+            },
         }
     ).with_payload(crane.Payload(mass=0.3, frame="link7_tip"))
     start = [0.3, 0.015, 0.02]

@@ -65,7 +65,7 @@ def test_an_explosion_leaves_finite_numbers(mini, backend):
 
 
 def test_a_stop_that_gains_energy_ends_it_before_the_stop_is_met(mini):
-    machine = mini.replace(friction={}, end_stops=(crane.EndStop("X1", 1e8),))
+    machine = mini.replace(friction={}, end_stops=(crane.description.EndStop("X1", 1e8),))
     start = np.array([0.0, 0.0295, 0.015]), np.array([0.0, 0.3, 0.0])
     found, text = broken(SimulationError, machine, None, start, 0.01, 1e-3, method="rk4")
     assert found.stopped == text and "gives back" in text

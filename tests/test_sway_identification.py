@@ -12,7 +12,7 @@ from crane.common.errors import CraneError, CraneWarning
 from crane.control import ComputedTorque
 
 
-class Sines(crane.Trajectory):
+class Sines(crane.motion.Trajectory):
     """Both driven joints, each by three sines."""
 
     duration, tip = 10.0, None
@@ -128,7 +128,9 @@ def test_sway_tells_a_load(machine):
     heavy = still(machine, **{"payload.mass": 120.0})
     run = crane.simulate(heavy, initial=([0.9, 0.5], [0, 0]), duration=20.0, step=2e-3)
     for angle, share in ((0.0, 1e-4), (2e-4, 0.02)):
-        found = crane.identify_payload(still(machine), noisy(run, angle), inertia=False)
+        found = crane.identification.identify_payload(
+            still(machine), noisy(run, angle), inertia=False
+        )
         assert found.mass == pytest.approx(120.0, rel=share)
 
 
@@ -141,7 +143,7 @@ def test_files_need_no_column_of_force(machine, driven, tmp_path):
     rows = np.column_stack([columns[x] for x in kept])[::2]
     head = ",".join(f"{x} [{units.get(x, 'rad')}]" for x in kept)
     np.savetxt(path, rows, delimiter=",", header=head, comments="", fmt="%.15g")
-    read = crane.read_measured(machine, path)
+    read = crane.recordings.read_measured(machine, path)
     assert read.free == machine.free
     plain = crane.Recording.from_csv(path)
     assert plain.joints == ("slew", "lift") and "swing_x" in plain.channels

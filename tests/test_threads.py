@@ -131,7 +131,9 @@ def stacked(dynamics, q_a, v_a, x):
 def held(machine):
     """The machine with a spring between frames, and friction that is smooth."""
     tip, root = machine.tip, machine.tree.root_link
-    spring = crane.ForceElement(between=(root, tip), stiffness=50.0, damping=1.0, rest=0.2)
+    spring = crane.description.ForceElement(
+        between=(root, tip), stiffness=50.0, damping=1.0, rest=0.2
+    )
     return machine.replace(forces=(*machine.forces, spring))
 
 
@@ -204,7 +206,7 @@ def swayed(sway, q_a, v_a, x):
 
 def test_sway():
     grapple = crane.load("patu655_grapple")
-    assert wrong(lambda: crane.Sway(grapple), swayed, grapple) == 0
+    assert wrong(lambda: crane.motion.Sway(grapple), swayed, grapple) == 0
 
 
 def controlled(controllers, q_a, v_a, x):
@@ -237,7 +239,10 @@ def circled(drive, q_a, v_a, x):
 
 
 def test_circuit(patu):
-    assert wrong(lambda: ValveDrive(patu, crane.ValveSignals(patu, [0.0], {})), circled, patu) == 0
+    assert (
+        wrong(lambda: ValveDrive(patu, crane.control.ValveSignals(patu, [0.0], {})), circled, patu)
+        == 0
+    )
 
 
 def program(time, q_a, v_a, pressures):
@@ -253,4 +258,4 @@ def simulated(shared, q_a, v_a, x):
 
 @pytest.mark.slow
 def test_simulations(patu):
-    assert wrong(lambda: (patu, crane.SampledCommand(program, patu)), simulated, patu) == 0
+    assert wrong(lambda: (patu, crane.control.SampledCommand(program, patu)), simulated, patu) == 0

@@ -58,8 +58,8 @@ def by_pinocchio(text, state):
 def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(name, tmp_path):
     machine, rng = loaded(name), np.random.default_rng(5)
     path = tmp_path / "tree.urdf"
-    path.write_text(crane.robot_description(machine))
-    transmission = crane.Transmission(machine)
+    path.write_text(crane.formats.robot_description(machine))
+    transmission = crane.motion.Transmission(machine)
     own = crane.Kinematics(machine, machine.tip or machine.closure.equations.loops[0].successor)
     tree = yourdfpy.URDF.load(path, load_meshes=False)
     names = {x for x in machine.joints if not x.startswith("base_")}
@@ -84,9 +84,9 @@ def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(nam
 @pytest.mark.parametrize("name", BUNDLED, ids=lambda name: Path(name).stem)
 def test_urdfdom_takes_the_tree_without_a_word(name, capfd):
     machine = loaded(name)
-    pin.buildModelFromXML(crane.robot_description(machine))  # its parser is urdfdom's
+    pin.buildModelFromXML(crane.formats.robot_description(machine))  # its parser is urdfdom's
     assert capfd.readouterr().err == ""
-    root = etree.fromstring(crane.robot_description(machine))
+    root = etree.fromstring(crane.formats.robot_description(machine))
     tags = {element.tag for element in root.iterchildren(etree.Element)}
     assert tags <= {"link", "joint", "material"}
     assert not list(root.iter("mimic"))
@@ -98,10 +98,10 @@ def test_urdfdom_takes_the_tree_without_a_word(name, capfd):
 def test_torques_of_the_tree_become_the_forces_of_the_actuators(name):
     machine = loaded(name)
     machine = machine.replace(forces=(), gas_springs=(), friction={})
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     q_a = near_home(machine, np.random.default_rng(3), 0.02)
     state = transmission.update(machine.active, q_a)
-    model, data, q = by_pinocchio(crane.robot_description(machine), state)
+    model, data, q = by_pinocchio(crane.formats.robot_description(machine), state)
     weight = pin.computeGeneralizedGravity(model, data, q)
     torques = {x: weight[model.joints[model.getJointId(x)].idx_v] for x in state.name}
     held = transmission.joint_to_actuator(torques)
@@ -112,7 +112,7 @@ def test_torques_of_the_tree_become_the_forces_of_the_actuators(name):
 
 def test_velocities_are_derivatives_and_power_is_the_same_on_both_sides():
     machine, rng = loaded("patu655_grapple"), np.random.default_rng(8)
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     q_a = near_home(machine, rng, 0.02)
     v_a, tau = rng.normal(size=len(q_a)), rng.normal(size=len(machine.joints))
     h = 1e-5
@@ -141,7 +141,7 @@ def test_velocities_are_derivatives_and_power_is_the_same_on_both_sides():
 )
 def test_forces_of_actuators_are_forces_at_other_joints_and_back(name, joints):
     machine, rng = loaded(name), np.random.default_rng(2)
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     q_a = near_home(machine, rng, 0.02)
     state = transmission.update(machine.active, q_a)
     forces = dict(zip(machine.active, rng.normal(size=len(q_a)).tolist(), strict=True))
@@ -159,7 +159,7 @@ def test_forces_of_actuators_are_forces_at_other_joints_and_back(name, joints):
 
 def test_messages_name_some_joints_in_any_order_and_others_too():
     machine = loaded("patu655")
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     home = dict(zip(machine.joints, machine.home.tolist(), strict=True))
     assert transmission.update(["X_tilt", "engine"], [home["X_tilt"], 180.0], [0.1, 0.0]) is None
     assert transmission.unknown_actuators == ("slew", "X_lift", "X_ext")
@@ -185,7 +185,7 @@ def test_messages_name_some_joints_in_any_order_and_others_too():
 
 def test_a_vehicle_that_floats_is_placed_by_others_and_its_crane_is_as_on_the_ground():
     machine, same = loaded(FLOATING), loaded("excavator")
-    transmission, other = crane.Transmission(machine), crane.Transmission(same)
+    transmission, other = crane.motion.Transmission(machine), crane.motion.Transmission(same)
     assert transmission.actuators == transmission.unknown_actuators == same.active
     assert transmission.update(["base_x", "slew"], [3.0, 0.4], [1.0, 0.1]) is None
     strokes = near_home(same, np.random.default_rng(6), 0.02)
@@ -203,7 +203,7 @@ def test_a_vehicle_that_floats_is_placed_by_others_and_its_crane_is_as_on_the_gr
 
 def test_what_is_out_of_reach_is_an_error_and_the_state_stays():
     machine = loaded("patu655")
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     home = machine.home[machine.closure.active]
     before = transmission.update(machine.active, home)
     with pytest.raises(OutOfReachError, match="loop 'lift_eye' cannot be closed at slew = 1, X_l"):
@@ -216,7 +216,7 @@ def test_what_is_out_of_reach_is_an_error_and_the_state_stays():
 
 def test_jumps_all_over_the_strokes_stay_on_the_branch_of_home():
     machine, rng = loaded("excavator"), np.random.default_rng(4)
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     q_a = rng.uniform(machine.lower, machine.upper, (200, len(machine.active)))
     expected = machine.closure.solve(q_a)
     found = [transmission.update(machine.active, one).position for one in q_a]
@@ -225,7 +225,7 @@ def test_jumps_all_over_the_strokes_stay_on_the_branch_of_home():
 
 def test_an_update_is_little_work_so_that_a_thousand_fit_into_a_second():
     machine = loaded("patu655_grapple")
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     q_a = machine.home[machine.closure.active]
     for k in range(3):
         with at_most(10**6 if k < 2 else 250):  # what is made once is made by then
@@ -248,13 +248,13 @@ def test_an_update_is_little_work_so_that_a_thousand_fit_into_a_second():
          "lift_barrel, X_ext do not determine the motion of the machine here, give 4 independent"),
         (lambda t: t.wrench_to_actuator([1.0, 0, 0]), "the wrench on 'tip' has the shape (3,)"),
         (lambda t: t.wrench_to_actuator([0.0] * 6, "hook"), "frame 'hook' is unknown, "),
-        (lambda t: crane.Transmission(t.machine).wrench_to_actuator([0.0] * 6),
+        (lambda t: crane.motion.Transmission(t.machine).wrench_to_actuator([0.0] * 6),
          "the configuration is not known yet, update it with slew, X_lift, X_tilt, X_ext"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_one_line(act, error):
     machine = loaded("patu655")
-    transmission = crane.Transmission(machine)
+    transmission = crane.motion.Transmission(machine)
     transmission.update(machine.active, machine.home[machine.closure.active])
     with pytest.raises(InputError) as caught:
         act(transmission)
@@ -273,7 +273,7 @@ def test_meshes_have_uris_and_packages_keep_theirs(tmp_path):
     )
     path = tmp_path / "bar.urdf"
     path.write_text(text.replace('<link name="crank_arm">', f'<link name="crank_arm">{shapes}'))
-    root = etree.fromstring(crane.robot_description(crane.load(path)))
+    root = etree.fromstring(crane.formats.robot_description(crane.load(path)))
     first, *rest = [mesh.get("filename") for mesh in root.iter("mesh")]
     assert urlparse(first).scheme == "file"
     assert Path(unquote(urlparse(first).path)) == (tmp_path / "a rod.stl").resolve()
@@ -283,7 +283,7 @@ def test_meshes_have_uris_and_packages_keep_theirs(tmp_path):
 def test_the_command_line_writes_the_tree(tmp_path):
     path = tmp_path / "crane.urdf"
     assert typed("convert", "patu655", path, "--to", "urdf").returncode == 0
-    assert path.read_text() == crane.robot_description(crane.load("patu655"))
+    assert path.read_text() == crane.formats.robot_description(crane.load("patu655"))
 
 
 class _Message:
@@ -361,7 +361,7 @@ def test_the_node_of_the_example_publishes_by_rclpy(monkeypatch):
     runpy.run_path(str(ROOT / "examples" / "ros2_joint_states.py"), run_name="__main__")
     _, qos, (description,) = ros.topics["robot_description"]
     assert qos == {"depth": 1, "durability": 1}  # who comes later gets it, too
-    assert description.data == crane.robot_description(machine)
+    assert description.data == crane.formats.robot_description(machine)
     _, _, (first, second) = ros.topics["joint_states"]
     assert (first.header, second.header) == (stamps[1], stamps[3])
     assert type(first.position) is list and first.name == list(machine.joints)

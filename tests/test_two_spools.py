@@ -156,10 +156,10 @@ def test_levers_and_programs_move_the_second_spool_alone(tmp_path):
     assert run.channels["voltage_x_b"][-1] == pytest.approx(1.0 - 4.0 * (0.1 + 0.9 * 0.25))
     alike = crane.simulate(machine, crane.joystick(machine, {"x": lever["x"]}), duration=0.3)
     assert alike.channels["voltage_x_b"][-1] == pytest.approx(1.0 + 4.0 * (0.1 + 0.9 * 0.5))
-    program = crane.SampledCommand(lambda t, q, v, p: [0.3, 2.0], machine, period=0.01)
+    program = crane.control.SampledCommand(lambda t, q, v, p: [0.3, 2.0], machine, period=0.01)
     run = crane.simulate(machine, program, duration=0.1)
     assert (run.channels["voltage_x"][-1], run.channels["voltage_x_b"][-1]) == (0.3, 2.0)
-    short = crane.SampledCommand(lambda t, q, v, p: [0.3], machine, period=0.01)
+    short = crane.control.SampledCommand(lambda t, q, v, p: [0.3], machine, period=0.01)
     with pytest.raises(CraneError, match=r"the signals at t = 0 s .*x_b"):
         crane.simulate(machine, short, duration=0.1)
 
@@ -177,7 +177,7 @@ def test_a_task_of_levers_goes_with_its_joints(tmp_path):
     crane.simulate(locked, crane.joystick(locked, "lower"), duration=0.05)
     for path, what in ((tmp_path / "machine.png", "sketch"), (tmp_path / "run.png", "plot")):
         if what == "sketch":
-            crane.sketch_circuit(machine, path)
+            crane.view.sketch_circuit(machine, path)
         else:
             run = crane.simulate(machine, crane.joystick(machine, "lower"), duration=0.05)
             plot_result(run, path)
@@ -269,9 +269,9 @@ def test_what_knows_one_spool_alone_says_so(tmp_path):
     machine = rig(tmp_path, APART, control={"kp": 20.0, "kd": 0.5})
     reference = crane.via_points([0.0, 1.0], [[0.2], [0.3]])
     with pytest.raises(CraneError, match="'x' has a valve with two spools: take valve-pd"):
-        crane.ValveFeedforward(machine, reference)
+        crane.control.ValveFeedforward(machine, reference)
     run = crane.simulate(machine, crane.ValvePD(machine, reference), duration=0.1)
-    with pytest.raises(CraneError, match="two spools, which this does not tell apart"):
-        crane.identify_orifices(machine, [run], "x")
+    with pytest.raises(CraneError, match="two spools, which this method does not separate"):
+        crane.identification.identify_orifices(machine, [run], "x")
     with pytest.raises(CraneError, match="no valve for 'x_c'"):
         ValveSignals(machine, [0.0], {"x_c": [0.0]})

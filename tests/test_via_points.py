@@ -157,7 +157,7 @@ def test_bad_points(time, points, rates, line):
 
 def test_two_attitudes_are_joined_by_the_shortest_turn():
     first, last = [0.4, -0.2, 1.0], [2.0, 0.7, -2.5]
-    path = crane.via_attitudes([0.0, 2.0], [first, last])
+    path = crane.motion.via_attitudes([0.0, 2.0], [first, last])
     pace = crane.point_to_point([0.0], [1.0], 2.0)
     ends = Rotation.from_euler("xyz", [first, last])
     time = np.linspace(0, 2, 41)
@@ -169,7 +169,7 @@ def test_attitudes_turn_as_they_say():
     angles = np.array([[0, 0, 0], [1, 0.5, -2], [np.nan] * 3, [0.2, 3.0, 1.0]])
     rates = np.full((4, 3), np.nan)
     rates[1] = 0.3, -0.2, 0.5
-    path = crane.via_attitudes([0, 1, 1.5, 2], angles, rates)
+    path = crane.motion.via_attitudes([0, 1, 1.5, 2], angles, rates)
     rotation, velocity, _ = path(np.array([0.0, 1.0, 2.0]))
     assert np.abs(rotation - roll_pitch_yaw(angles[[0, 1, 3]])).max() < 1e-13
     step = 1e-6
@@ -190,13 +190,13 @@ def test_attitudes_turn_as_they_say():
 
 def test_attitudes_go_on_beyond_half_a_turn():
     """0, 2, 4 rad about one axis is a turn of 4 rad, not one of 2 back."""
-    path = crane.via_attitudes([0, 1, 2], [[0, 0, 0], [0, 0, 2.0], [0, 0, 4.0]])
+    path = crane.motion.via_attitudes([0, 1, 2], [[0, 0, 0], [0, 0, 2.0], [0, 0, 4.0]])
     rate = path(np.linspace(0, 2, 50))[1]
     assert rate[1:-1, 2].min() > 0 and np.abs(rate[:, :2]).max() < 1e-12
     with pytest.raises(InputError, match=r"the attitude at 2 s is 6\.1 rad from the first one"):
-        crane.via_attitudes([0, 1, 2], [[0, 0, 0], [0, 0, 3.1], [0, 0, 6.1]])
+        crane.motion.via_attitudes([0, 1, 2], [[0, 0, 0], [0, 0, 3.1], [0, 0, 6.1]])
     with pytest.raises(InputError, match=r"attitudes have the shape \(1, 2\)"):
-        crane.via_attitudes([0], [[0, 0]])
+        crane.motion.via_attitudes([0], [[0, 0]])
 
 
 # --- inverse kinematics ----------------------------------------------------------------------
@@ -361,7 +361,7 @@ def test_a_robot_turns_its_flange_on_the_way(robot):
     ends += robot.home[robot.closure.active] - robot.home[robot.closure.active]
     tip = crane.via_points([0.0, 2.0], kinematics.position(ends))
     angles = [pin.rpy.matrixToRpy(rotation) for rotation in kinematics.rotation(ends)]
-    turning = crane.via_attitudes([0.0, 2.0], angles)
+    turning = crane.motion.via_attitudes([0.0, 2.0], angles)
     path = crane.tip_trajectory(robot, tip, ends[0], turning)
     time = np.random.default_rng(0).uniform(0, 2, 60)
     q_a, v_a, a_a = path(time)

@@ -9,7 +9,8 @@ from rig import Converter, Rig, Sensors, Tolerances, converter, rig
 
 import crane
 from crane.common.errors import InputError, LimitError
-from crane.description import Friction, apply_parameter_changes, parameters
+from crane.description import Friction, parameters
+from crane.description.parameter_changes import apply_parameter_changes
 from crane.formats import read_machine_spec
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -140,7 +141,7 @@ def test_a_joint_sticks_until_the_force_breaks_it_away(mini):
     """
     slow = crane.load("mini_forwarder", {"control.q1.ki": 0.0})
     rate = 0.03  # [rad/s]
-    ramp = crane.polynomial([[0.0, rate], [0.012], [0.010]], 0.5)
+    ramp = crane.motion.polynomial([[0.0, rate], [0.012], [0.010]], 0.5)
     stuck = Rig(slow, 1, Tolerances(0, 0, 0, 0, 0, 0.2), ideal(slow))
     law = stuck.plant.friction["q1"]
     assert law.coulomb == 0.1010 and law.stiction == pytest.approx(0.2 * 0.1010)
@@ -352,8 +353,10 @@ def test_a_machine_of_spherical_loops_keeps_its_pins(stewart):
 
 
 def test_what_was_put_on_the_model_is_on_the_plant(mini):
-    spring = crane.GasSpring("X2", area=1e-4, pressure=1e5, volume=1e-5, rest=0.01, exponent=1.2)
-    push = crane.ForceElement("X1", force=3.0)
+    spring = crane.description.GasSpring(
+        "X2", area=1e-4, pressure=1e5, volume=1e-5, rest=0.01, exponent=1.2
+    )
+    push = crane.description.ForceElement("X1", force=3.0)
     other = mini.replace(
         friction={"X1": Friction(viscous=100.0)},
         forces=(push,),

@@ -136,7 +136,7 @@ def with_toggle(tmp_path_factory):
 
 
 def test_break_out_is_what_moments_about_the_pins_give(loader):
-    found = crane.breakout(loader, bucket="X_tilt")
+    found = crane.ratings.breakout(loader, bucket="X_tilt")
     assert (found.bucket.joint, found.arm.joint) == ("X_tilt", "X_lift")
     home = Linkage(wheel_loader.LIFTED, wheel_loader.TILTED)
     for one in (found.bucket, found.arm):
@@ -154,7 +154,7 @@ def test_break_out_is_what_moments_about_the_pins_give(loader):
 
 def test_the_radius_is_about_the_centre_that_the_lip_turns_about(loader):
     """The bucket about its pin; with the boom about no pin, as its tilt cylinder turns it, too."""
-    found = crane.breakout(loader, bucket="X_tilt")
+    found = crane.ratings.breakout(loader, bucket="X_tilt")
     reach = math.dist(wheel_loader.PIN, wheel_loader.LIP)
     assert found.bucket.radius == pytest.approx(reach, rel=1e-12)
     assert found.bucket.turn.offset < 1e-9
@@ -173,7 +173,7 @@ def test_the_radius_is_about_the_centre_that_the_lip_turns_about(loader):
 @pytest.mark.slow
 def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
     """Bellcrank and link in line: the cylinder moves and the bucket does not."""
-    found = crane.breakout(with_toggle, bucket="X_tilt")
+    found = crane.ratings.breakout(with_toggle, bucket="X_tilt")
     assert found.bucket.isolated_force == np.inf
     at = Linkage(*found.bucket.lever, wheel_loader.TOGGLE)
     line = unit(at.eye - at.link)
@@ -219,7 +219,7 @@ def test_vertical_break_out_of_loaders(loader):
     at = Linkage(wheel_loader.LIFTED, wheel_loader.TILTED)
     for working in (["X_tilt"], ["X_lift"]):
         by_hand = min(at.most([0.0, 1.0], working).values())
-        field = crane.tool_force(
+        field = crane.ratings.tool_force(
             loader, "up", working=working, weights=False,
             radii=[wheel_loader.LIP[0]], heights=[wheel_loader.LIP[1]],
         )  # fmt: skip
@@ -228,9 +228,9 @@ def test_vertical_break_out_of_loaders(loader):
 
 def test_a_machine_with_one_stroke_left_digs():
     """`--lock` of all but the bucket: its force alone, nothing about charts."""
-    whole = crane.breakout(crane.load("excavator"))
+    whole = crane.ratings.breakout(crane.load("excavator"))
     locked = crane.load("excavator", lock={"X_boom": 0.8, "X_arm": 0.5})
-    found = crane.breakout(locked, bucket="X_bucket")
+    found = crane.ratings.breakout(locked, bucket="X_bucket")
     assert found.bucket.force == pytest.approx(found.bucket.isolated_force, rel=1e-9)
     assert found.bucket.isolated_force == pytest.approx(whole.bucket.isolated_force, rel=1e-9)
     assert found.arm is None

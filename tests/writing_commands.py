@@ -117,7 +117,9 @@ def read(folder):
         machine = rig(folder, COMPENSATED, friction={"viscous": 600.0})
         time = np.arange(0.0, 4.0, 0.01)
         signals = {"x": 5.8 + 2.8 * np.array([0.3, -0.3, 0.4, -0.4])[time.astype(int)]}
-        run = crane.simulate(machine, crane.ValveSignals(machine, time, signals), [0.2], 4.0, 0.01)
+        run = crane.simulate(
+            machine, crane.control.ValveSignals(machine, time, signals), [0.2], 4.0, 0.01
+        )
         run.to_csv(folder / "rig.csv")
     (folder / "log.csv").write_text("t,x\n" + "".join(f"{i / 10},{i}\n" for i in range(20)))
     (folder / "columns.txt").write_text("time [s] = t\nx [m] = x\n")

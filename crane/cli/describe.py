@@ -16,7 +16,7 @@ from crane.common.errors import InputError
 from crane.common.package_search import NEAREST_ASSEMBLY
 
 if TYPE_CHECKING:
-    from crane.machine import Machine
+    from crane.machine.machine import Machine
 
 
 @command("list")
@@ -27,8 +27,7 @@ def list_machines(
 ) -> None:
     """List the bundled machines."""
     from crane.common.one_line_repr import format_count
-    from crane.description import bundled_machines, example_robots
-    from crane.description.machine_lookup import machine_summary
+    from crane.description.machine_lookup import bundled_machines, example_robots, machine_summary
 
     others = example_robots()
     if robots:
@@ -69,7 +68,7 @@ def info(
     ] = False,
 ) -> None:
     """Show joints, loops, forces and parameters of a machine."""
-    from crane.formats import load
+    from crane.formats.machine_loading import load
 
     if parameters or pattern is not None:
         _print_names(machine, assembly, pattern)
@@ -80,9 +79,9 @@ def info(
 
 def _print_names(machine: str, assembly: AssemblyOptions, pattern: str | None) -> None:
     from crane.common.package_search import check_package_folders, use_load_options
-    from crane.description import parameters
+    from crane.description.machine_parameters import parameters
     from crane.description.name_search import names_by_kind, search_names
-    from crane.formats import read_machine_spec
+    from crane.formats.machine_file.machine_reader import read_machine_spec
 
     files = assembly.package_values()
     with use_load_options(check_package_folders(files["packages"]), files["arguments"]):
@@ -127,8 +126,8 @@ def check(
 
     The exit status is 0 without findings, 1 with warnings only, 2 with errors.
     """
-    from crane.formats import write_home as write
     from crane.formats.checks import check as check_machine
+    from crane.formats.home_writer import write_home as write
 
     values = assembly.assembly()
     driven = values["active"], values["free"]

@@ -51,7 +51,7 @@ def study(
     seed: Seed = 0,
 ) -> None:
     """Compute measures of variants, on a grid or at random."""
-    from crane.studies import study as compute
+    from crane.studies.variant_study import study as compute
 
     axes = parse_grids(vary) if draws is None else parse_ranges(vary)
     with progress_bar("computing variants") as progress:

@@ -42,7 +42,7 @@ All commands take --strict (refuse inertias that no body has) and --debug.
 """
 
 
-class _Program(TyperGroup):
+class _CommandGroup(TyperGroup):
     """The commands, with a help of one screen."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -125,7 +125,7 @@ def _show_version(is_given: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(cls=_Program)
+@app.callback(cls=_CommandGroup)
 def _options(
     version: Annotated[
         bool,

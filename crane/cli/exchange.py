@@ -43,7 +43,9 @@ def convert(
 ) -> None:
     """Convert a machine to URDF, MJCF or a machine file."""
     from crane.common.atomic_output import replace_file
-    from crane.formats import robot_description, write_machine, write_mjcf, write_urdf_plus
+    from crane.formats.machine_file.machine_writer import write_machine
+    from crane.formats.mjcf.mjcf_writer import write_mjcf
+    from crane.formats.urdf.urdf_writer import robot_description, write_urdf_plus
 
     kind = _output_format(out, to)
     check = check_folder_is_writable if kind == "machine" else check_file_is_writable
@@ -94,7 +96,7 @@ def import_log(
     output: RequiredOutputFile,
 ) -> None:
     """Convert a log of another program to a recording."""
-    from crane.formats import load_from_expression
+    from crane.formats.machine_loading import load_from_expression
     from crane.recordings import timeseries
     from crane.recordings.logs import read_log_columns
     from crane.recordings.recording_reader import read_sensor_readings, select_time_span

@@ -42,7 +42,7 @@ from crane.common.errors import CraneWarning, InputError, RecordingError, sugges
 if TYPE_CHECKING:
     from crane.common.result import Result
     from crane.identification.signals.signal_processing import Motion
-    from crane.machine import Machine
+    from crane.machine.machine import Machine
     from crane.recordings.recording import Recording
 
 _MIN_HELD_OUT_SAMPLES = 50
@@ -50,7 +50,7 @@ _CIRCUIT_MODELS = ("orifices", "valve", "friction")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionOptions(OptionBlock):
+class PeriodicMotionOptions(OptionBlock):
     """A periodic excitation motion."""
 
     panel = "Options of a motion"
@@ -89,7 +89,7 @@ class SignalOptions(OptionBlock):
     ] = 0.1
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of `crane.excite_valves` by name."""
+        """Arguments of `crane.identification.excite_valves` by name."""
         return {
             "duration": self.duration, "sensors": parse_names(self.sensors), "rate": self.rate,
             "margin": self.margin,
@@ -99,7 +99,7 @@ class SignalOptions(OptionBlock):
 @command()
 def excite(
     machine: MachineName,
-    motion: MotionOptions,
+    motion: PeriodicMotionOptions,
     signals: SignalOptions,
     options: ParameterOptions,
     output: OutputFolder,

@@ -15,7 +15,7 @@ from crane.common.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from crane.common.result import Result
-    from crane.machine import Machine
+    from crane.machine.machine import Machine
     from crane.recordings.recording import Recording
 
 # Arguments and options of several commands that are not part of a block.
@@ -175,7 +175,7 @@ class ParameterOptions(ChangeOptions):
 
     def load(self, name: str) -> "Machine":
         """Load a machine by its name or path."""
-        from crane.formats import load
+        from crane.formats.machine_loading import load
 
         held = parse_values("--lock", self.lock)
         return load(name, self.changed_values(), held, **self.assembly())

@@ -66,7 +66,7 @@ def working_range(
     ] = 2.44,
 ) -> None:
     """Compute reach, digging depth and dump height (ISO 7135)."""
-    from crane.ratings import working_range as compute
+    from crane.ratings.working_ranges import working_range as compute
 
     loaded = options.load(machine)
     with status("measuring"):
@@ -98,8 +98,8 @@ def breakout(
     step: ChartStep = None,
 ) -> None:
     """Compute break-out forces (ISO 6015) or tool forces."""
-    from crane.ratings import breakout as compute
-    from crane.ratings import tool_force
+    from crane.ratings.breakout_forces import breakout as compute
+    from crane.ratings.tool_forces import tool_force
 
     if direction is None and step is not None:
         raise InputError("--step is for the reach, add --direction")
@@ -158,7 +158,7 @@ class RatingOptions(OptionBlock):
     ] = False
 
     def arguments(self) -> dict[str, Any]:
-        """Arguments of `crane.capacity` and `crane.torques` by name.
+        """Arguments of `crane.capacity` and `crane.ratings.torques` by name.
 
         Raises:
             InputError: The rule is unknown, or a number is out of range.
@@ -209,8 +209,8 @@ def capacity(
 ) -> None:
     """Compute rated loads over the reach (load chart)."""
     from crane.dynamics.tipping_stability import has_supports
-    from crane.ratings import capacity as compute
-    from crane.ratings import torques
+    from crane.ratings.lifting_capacity import capacity as compute
+    from crane.ratings.lifting_capacity import torques
 
     conditions = rating.arguments()
     loaded, tipping_share = options.load(machine), conditions["rule"].tipping

@@ -20,7 +20,7 @@ from crane.common.errors import InputError, suggest_names
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
-    from crane.machine import Machine
+    from crane.machine.machine import Machine
     from crane.recordings.recording import Recording
 
 ShownName = Annotated[

@@ -36,10 +36,11 @@ from crane.common.errors import CraneError, InputError, SimulationError, suggest
 
 if TYPE_CHECKING:
     from crane.common.result import Result
-    from crane.control import Controller, ValveCommand
-    from crane.machine import Machine
-    from crane.motion import Trajectory
-    from crane.simulation import Progress
+    from crane.control.control_law import Controller
+    from crane.control.valve_commands import ValveCommand
+    from crane.machine.machine import Machine
+    from crane.motion.trajectory import Trajectory
+    from crane.simulation.simulation_run import Progress
 
     Control = Controller | ValveCommand
 
@@ -83,8 +84,8 @@ def write_demo(folder: Path, progress: "Progress") -> str:
     Returns:
         The summaries of all tasks, Markdown.
     """
-    from crane.formats import load
-    from crane.simulation import simulate as run
+    from crane.formats.machine_loading import load
+    from crane.simulation.simulation_run import simulate as run
     from crane.view.result_files import SUMMARY
 
     tasks = [(machine, task) for machine in map(load, DEMO_MACHINES) for task in machine.tasks]
@@ -204,8 +205,8 @@ def simulate(
 
     Without these it simulates the home configuration, held by a controller or released.
     """
-    from crane.simulation import simulate as run
     from crane.simulation.recording_replay import replay
+    from crane.simulation.simulation_run import simulate as run
 
     loaded = add_task_loads(options.load(machine), motion.task)
     loaded = loaded.with_external_forces(*parse_loads(load))
@@ -234,7 +235,7 @@ def _write_stopped_run(output: OutputFolder, npz: bool) -> Iterator[None]:
     Raises:
         CraneError: The error, with the folder of the run.
     """
-    from crane.simulation import InterruptedRun
+    from crane.simulation.recorded_run import InterruptedRun
 
     try:
         yield
@@ -258,7 +259,8 @@ def task_control(
     Raises:
         InputError: There is no such task or controller.
     """
-    from crane.control import joystick, make_controller
+    from crane.control.controller_registry import make_controller
+    from crane.control.levers import joystick
     from crane.motion.task_trajectories import task_trajectory
     from crane.motion.trajectory import point_to_point
 
@@ -284,7 +286,7 @@ def tracking_control(
     machine: "Machine", reference: "Trajectory", controller: str | None, sway: str | None = None
 ) -> "Control":
     """The controller that tracks a reference, see `task_control`."""
-    from crane.control import default_controller_name, make_controller
+    from crane.control.controller_registry import default_controller_name, make_controller
     from crane.motion.sway_suppression import suppress_sway
 
     if sway is not None:
@@ -328,7 +330,7 @@ def sway(
     ] = 0.2,
 ) -> None:
     """Compare methods that suppress the sway of a load."""
-    from crane.studies import sway_study
+    from crane.studies.residual_sway_study import sway_study
 
     masses = parse_numbers(payload.split(","), f"--payload {payload}: give masses as 0,200,500")
     with progress_bar("simulating") as progress:

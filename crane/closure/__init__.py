@@ -1,6 +1,8 @@
-"""Loops and their closure."""
+"""Loops of a machine and their closure: configurations, gamma and its drift.
 
-from crane.closure.closure import Closure
-from crane.closure.loop_equations import frame_id
+For programs that close a machine's loops themselves; `Machine.closure` is one.
+"""
 
-__all__ = ["Closure", "frame_id"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -39,7 +39,7 @@ from crane.common.errors import (
 )
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples
-from crane.description import Coupling, LoopSpec
+from crane.description.specification import Coupling, LoopSpec
 
 # least singular value of the independent equations over that of all, for the same coordinates
 _MIN_SINGULAR_VALUE_SHARE = 0.1

@@ -12,7 +12,7 @@ from crane.closure.active_joint_selection import Indices, characteristic_length,
 from crane.closure.coordinates import Coordinates
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
-from crane.description import LOOP_TYPES, Coupling, LoopSpec
+from crane.description.specification import LOOP_TYPES, Coupling, LoopSpec
 
 
 def frame_id(model: pin.Model, link: str) -> int:

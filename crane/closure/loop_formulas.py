@@ -24,7 +24,7 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )  # fmt: skip
 from crane.common.samples import Array
-from crane.description import LOOP_TYPES
+from crane.description.specification import LOOP_TYPES
 
 
 @dataclass(frozen=True)

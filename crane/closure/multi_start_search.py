@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from crane.closure.active_joint_selection import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
-from crane.description import LOOP_TYPES
+from crane.description.specification import LOOP_TYPES
 
 _RESIDUAL_TOLERANCE = 1e-11  # scaled
 _MAX_ITERATIONS = 80

@@ -37,7 +37,7 @@ _FORMULA_PACKAGES = (
 )
 _CODE_TYPES, _METHOD_TYPES = (FunctionType, type), (staticmethod, classmethod)
 _TRUSTED_PACKAGES = sys.stdlib_module_names | {
-    "crane", "llvmlite", "numpy", "pinocchio", "scipy",
+    "crane", "lazy_loader", "llvmlite", "numpy", "pinocchio", "scipy",
 }  # fmt: skip
 
 

@@ -1,49 +1,8 @@
-"""Controllers: active forces, or signals of valves, from time and motion."""
+"""Controllers: forces of the active joints or valve signals, from time and motion.
 
-from crane.control.control_law import (
-    PI,
-    ComputedTorque,
-    ControlLaw,
-    Controller,
-    ControllerInputs,
-    FunctionController,
-    TracedController,
-    ZeroForce,
-    controller_reference,
-)
-from crane.control.controller_registry import CONTROLLERS, default_controller_name, make_controller
-from crane.control.levers import LeverPhases, joystick
-from crane.control.tip_velocity import TipVelocity
-from crane.control.valve_commands import SampledCommand, ValveCommand, ValvePD, ValveSignals
-from crane.control.valve_drive import ValveDrive
-from crane.control.valve_feedforward import (
-    ValveFeedforward,
-    fastest_trajectory,
-    largest_flow_share,
-)
+For simulations with a controller other than `PI` and `ComputedTorque`, or with one of your own.
+"""
 
-__all__ = [
-    "CONTROLLERS",
-    "PI",
-    "ControllerInputs",
-    "ValveCommand",
-    "ComputedTorque",
-    "Controller",
-    "FunctionController",
-    "ZeroForce",
-    "ControlLaw",
-    "LeverPhases",
-    "SampledCommand",
-    "ValveSignals",
-    "TipVelocity",
-    "TracedController",
-    "ValveDrive",
-    "ValveFeedforward",
-    "ValvePD",
-    "make_controller",
-    "fastest_trajectory",
-    "largest_flow_share",
-    "joystick",
-    "controller_reference",
-    "default_controller_name",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,11 +14,11 @@ from crane.codegen.symbolic import subtract_vectors
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
-from crane.description import PIGains
-from crane.dynamics import Dynamics
+from crane.description.specification import PIGains
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import static_active_forces
 from crane.dynamics.hybrid_dynamics import hybrid_dynamics
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 
@@ -253,8 +253,8 @@ class PI(ControlLaw):
     Args:
         machine: The machine.
         reference: Trajectory of the driven joints, see `add_free_joints`.
-        gains: `PIGains` by driven joint, as {"X1": crane.PIGains(kp, ki)}; those of the machine
-            file if not given.
+        gains: `PIGains` by driven joint, as {"X1": crane.description.PIGains(kp, ki)}; those of
+            the machine file if not given.
         integral: (k,) initial values of int e dt of the driven joints [m s], [rad s]. By default
             they balance gravity, as those of a controlled machine that stands still. With zeros
             the machine falls until the integrals have grown.
@@ -402,4 +402,4 @@ class ComputedTorque(ControlLaw):
 
 def _gains_example(joint: str) -> str:
     """Example of the argument `gains`."""
-    return f"gains={{'{joint}': crane.PIGains(kp, ki)}}"
+    return f"gains={{'{joint}': crane.description.PIGains(kp, ki)}}"

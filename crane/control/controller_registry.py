@@ -7,7 +7,7 @@ from crane.control.control_law import PI, ComputedTorque, Controller
 from crane.control.tip_velocity import TipVelocity
 from crane.control.valve_commands import ValveCommand, ValvePD
 from crane.control.valve_feedforward import ValveFeedforward
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.trajectory import Trajectory
 
 CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | ValveCommand]] = {

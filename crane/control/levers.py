@@ -14,7 +14,7 @@ from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValveCommand, ValveSignals, lever_signals, require_circuit
 from crane.description.specification import DEFAULT_RAMP_TIME
 from crane.description.task_phases import Phase
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _SAMPLING_PERIOD = 0.01  # sampling period of the joints [s]
 

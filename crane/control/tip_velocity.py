@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_sample
 from crane.control.valve_commands import SampledCommand, require_circuit
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory
 

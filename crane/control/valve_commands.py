@@ -15,9 +15,9 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.plausible_ranges import suggested_units_text
 from crane.common.samples import Array, as_number, as_sample
 from crane.control.control_law import ControllerInputs
-from crane.hydraulics import Hydraulics, PDGains, Valve
-from crane.hydraulics.components import Spool
-from crane.machine import Machine
+from crane.hydraulics.components import Spool, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
+from crane.machine.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory
 
@@ -271,7 +271,7 @@ class ValvePD(ValveCommand, OneLineRepr):
         return out
 
 
-class _HeldSignals(threading.local):
+class _SampledSignals(threading.local):
     """Signals (s,) that are held until the next sample, separate in each thread.
 
     Attributes:
@@ -310,7 +310,7 @@ class SampledCommand(ValveCommand, OneLineRepr):
         self._active_columns = machine.closure.active
         self.period = as_number(period, "the period", "s", greater_than=0)
         neutral = np.array([spool.neutral for spool in circuit.spools.values()])
-        self._held_signals = _HeldSignals(neutral)  # a run is in one thread
+        self._held_signals = _SampledSignals(neutral)  # a run is in one thread
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `ValveCommand`."""

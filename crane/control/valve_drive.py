@@ -15,9 +15,8 @@ from crane.control.valve_commands import (
     ValveSignals,
     require_circuit,
 )
-from crane.hydraulics import CircuitEquations
-from crane.hydraulics.circuit_equations import CircuitValues
-from crane.machine import Machine
+from crane.hydraulics.circuit_equations import CircuitEquations, CircuitValues
+from crane.machine.machine import Machine
 
 _SAMPLING_PERIOD = 1e-3  # sampling period of a law with delayed valves [s]
 # states of the circuit that are recorded: compressions of springs, oil in accumulators

@@ -11,11 +11,11 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValvePD, require_circuit
-from crane.dynamics import Dynamics
-from crane.hydraulics import Hydraulics, PDGains
+from crane.dynamics.dynamics import Dynamics
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.flow_equations import LAMINAR_PRESSURE_DROP
-from crane.machine import Machine
+from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
+from crane.machine.machine import Machine
 from crane.motion.sway import Sway
 from crane.motion.sway_suppression import retime, suppress_sway
 from crane.motion.task_trajectories import add_free_joints

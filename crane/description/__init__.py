@@ -1,52 +1,8 @@
-"""The description of a machine, independent of file formats, and changes of it."""
+"""Description of a machine: force elements, external forces, contacts, tasks, sensors.
 
-from crane.description.inertia_feasibility import inertia_problem
-from crane.description.machine_lookup import bundled_machines, example_robots
-from crane.description.machine_parameters import parameters
-from crane.description.parameter_changes import (
-    apply_parameter_changes,
-    lock_joints,
-    set_active_joints,
-)
-from crane.description.sensors import Sensor
-from crane.description.specification import (
-    LOOP_TYPES,
-    AnyForceElement,
-    Chain,
-    Coupling,
-    Drive,
-    EndStop,
-    ForceElement,
-    Friction,
-    GasSpring,
-    LoopSpec,
-    MachineSpec,
-    PIGains,
-    Rope,
-    Task,
-)
+For programs that add forces, loads or contacts to a machine, or read what a file says of it.
+"""
 
-__all__ = [
-    "LOOP_TYPES",
-    "Chain",
-    "Coupling",
-    "Drive",
-    "AnyForceElement",
-    "EndStop",
-    "ForceElement",
-    "Friction",
-    "GasSpring",
-    "LoopSpec",
-    "MachineSpec",
-    "PIGains",
-    "Rope",
-    "Sensor",
-    "Task",
-    "bundled_machines",
-    "apply_parameter_changes",
-    "set_active_joints",
-    "example_robots",
-    "inertia_problem",
-    "lock_joints",
-    "parameters",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

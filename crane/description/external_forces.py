@@ -40,7 +40,8 @@ class ExternalForce(OneLineRepr):
     """A wrench at a frame. A subclass overrides `wrench` if it depends on more than time.
 
     `wrench` is called with numbers, and once with symbolic expressions to compile its formulas.
-    `crane.Wrench` is a function of time, `crane.WrenchFunction` calls a function in Python.
+    `crane.Wrench` is a function of time, `crane.description.WrenchFunction` calls a function in
+    Python.
 
     Args:
         frame: A link of the machine.

@@ -215,7 +215,7 @@ class SoilCutting(ExternalForce):
         self.soil, self.ground = soil, Ground() if ground is None else ground
         label = f"of the cutter at '{frame}'"
         if not isinstance(soil, Soil):
-            raise InputError(f"the soil {label} is {soil!r}, give a crane.Soil")
+            raise InputError(f"the soil {label} is {soil!r}, give a crane.description.Soil")
         self.width = as_number(width, f"the width {label}", "m", greater_than=0)
         self.length = as_number(length, f"the length {label}", "m", greater_than=0)
         self.smoothing = as_number(smoothing, f"the smoothing {label}", "m/s", greater_than=0)

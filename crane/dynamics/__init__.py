@@ -1,6 +1,8 @@
-"""Equations of motion in the active coordinates."""
+"""Equations of motion in the active coordinates, and reactions in joints and pins.
 
-from crane.dynamics.dynamics import Dynamics
-from crane.dynamics.joint_forces import JointForces
+For forces, accelerations, mass matrices, reactions, buckling and tipping of a machine.
+"""
 
-__all__ = ["Dynamics", "JointForces"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

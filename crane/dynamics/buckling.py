@@ -10,7 +10,7 @@ from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_samples
 from crane.hydraulics.components import Cylinder
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 YOUNGS_MODULUS_STEEL = 2.1e11  # [Pa] Young's modulus
 _PIN_LOOP_TYPES = ("revolute", "spherical", "cylindrical")  # loop types that act like a pin
@@ -61,7 +61,7 @@ class CylinderColumn:
         """Length from the tube's pin to its gland [m].
 
         The retracted length without what sticks out: one bore, or a quarter of the dead length if
-        that is less, as `crane.add_cylinder` builds cylinders.
+        that is less, as `crane.formats.add_cylinder` builds cylinders.
         """
         ends = self.pin_distance([self.lower_limit, self.upper_limit])
         least, stroke = float(ends.min()), self.upper_limit - self.lower_limit

@@ -40,7 +40,7 @@ from crane.closure.spatial_vectors import (
 from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import Scalar, dot
 from crane.dynamics.spatial_inertia import ClusterMassColumns, SpatialInertia, forward_substitute
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 ArticulatedInertia = tuple[
     SpatialInertia, SpatialVector

@@ -17,7 +17,7 @@ from crane.dynamics.dynamics_derivatives import DynamicsDerivatives
 from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
 from crane.dynamics.formula_structure import FormulaStructure
 from crane.dynamics.spatial_inertia import Matrix
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 def _state_rates(

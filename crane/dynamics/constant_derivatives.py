@@ -8,7 +8,7 @@ from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 UNIT_OF_ZERO_PARAMETER = 0.1  # magnitude assumed for a parameter that is 0
 _RELATIVE_STEP = 1e-3  # step as a fraction of the parameter

@@ -23,7 +23,7 @@ from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS, ExternalForce, FrameMotion
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _CALLBACK_INPUT_SIZE = 19  # inputs of a Python function
 

@@ -15,7 +15,7 @@ from crane.dynamics.cluster_recursion import (
 )
 from crane.dynamics.joint_force_formulas import LAW_SIZE, SLIP_INDEX, DistanceBodies
 from crane.dynamics.joint_forces import JointForces
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 BODY_SIZE = 10  # inertia constants of a body
 _UPPER_TRIANGLE = np.triu_indices(3)

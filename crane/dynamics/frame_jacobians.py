@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 class FrameJacobians:

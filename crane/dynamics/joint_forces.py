@@ -9,9 +9,9 @@ from collections import Counter
 import numpy as np
 
 from crane.common.samples import Array
-from crane.description import ForceElement, Friction, GasSpring, Rope
+from crane.description.specification import ForceElement, Friction, GasSpring, Rope
 from crane.dynamics.frame_jacobians import FrameDistances, FramePair
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _LAW_FIELDS = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",

@@ -12,7 +12,7 @@ from crane.common.samples import Array, solve_linear
 from crane.common.threads import ThreadLocal
 from crane.dynamics.frame_jacobians import point_jacobian
 from crane.dynamics.joint_forces import REST_VELOCITY, JointForces
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 class ClosedState(NamedTuple):

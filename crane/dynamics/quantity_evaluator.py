@@ -25,7 +25,7 @@ from crane.dynamics.formula_structure import (
 )
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.machine.machine_checks import has_mass
 
 BACKENDS = ("compiled", "pinocchio")

@@ -14,7 +14,7 @@ from crane.common.samples import Array, as_samples
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.frame_jacobians import MIN_LENGTH
 from crane.dynamics.joint_forces import JointForces
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 # relative pivot below which the closure checks for a singular configuration
 _SINGULAR_TOLERANCE = 1e-10

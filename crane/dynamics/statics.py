@@ -11,7 +11,7 @@ from crane.codegen import Layout
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 class StaticQuantities(NamedTuple):

@@ -13,7 +13,7 @@ from crane.common.threads import ThreadLocal
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.description.ground_contact import Contact
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _NEGATIVE_LOAD_TOLERANCE = -1e-9  # force over weight of an unloaded support
 

@@ -6,20 +6,20 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure import Closure
 from crane.closure.active_joint_selection import translational_coordinates
 from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly_modes
+from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
 from crane.closure.home_search import HomeSearchResult
 from crane.common.errors import CraneWarning, MechanismError
 from crane.common.package_search import NEAREST_ASSEMBLY, asked
 from crane.common.samples import Array
-from crane.description import MachineSpec
 from crane.description.findings import report_error
+from crane.description.specification import MachineSpec
 from crane.formats.robot_files import is_robot_file, is_sdf_file, is_simulator_file
-from crane.machine import Machine
 from crane.machine.drive_selection import select_free_joints
+from crane.machine.machine import Machine
 from crane.machine.misfit import misfit
 
 _MAX_LISTED = 4

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from crane.common.errors import CraneWarning
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 class ConversionNotes:

@@ -18,7 +18,7 @@ from crane.common.package_search import NEAREST_ASSEMBLY
 from crane.description.machine_lookup import bundled_machines, example_robots
 from crane.formats.machine_loading import load
 from crane.formats.robot_files import is_sdf_file, is_simulator_file
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 TextEdit = tuple[int, int, str]  # start, end, new text
 

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 
 import pinocchio as pin
 
-from crane.closure import Closure
+from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.common.errors import CraneWarning, DescriptionError, InputError, summarize_warnings
 from crane.common.package_search import (
@@ -20,17 +20,15 @@ from crane.common.package_search import (
     use_load_options,
 )
 from crane.common.samples import read_only_copy
-from crane.description import (
-    Coupling,
-    LoopSpec,
-    MachineSpec,
-    apply_parameter_changes,
-    lock_joints,
-    parameters,
-    set_active_joints,
-)
 from crane.description.floating_bases import add_floating_base, check_freedoms
 from crane.description.machine_lookup import CHANGES_SEPARATOR, find_machine_file
+from crane.description.machine_parameters import parameters
+from crane.description.parameter_changes import (
+    apply_parameter_changes,
+    lock_joints,
+    set_active_joints,
+)
+from crane.description.specification import Coupling, LoopSpec, MachineSpec
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.machine.drive_selection import select_free_joints, select_motors

@@ -24,7 +24,7 @@ from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_op
 from crane.description.specification import ForceElement
 from crane.formats import xacro_process
 from crane.formats.xml_file import SourceLocations, XmlFile
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _XACRO_NAMESPACE = "http://www.ros.org/wiki/xacro"
 _INSTALL_HINT = f"is written with xacro, {installation_hint('xacro')}"

@@ -9,11 +9,11 @@ from pathlib import Path
 from lxml import etree
 
 from crane.common.errors import format_one_line
-from crane.description import Coupling
 from crane.description.kinematic_tree import Tree
+from crane.description.specification import Coupling
 from crane.formats.robot_files import open_robots
 from crane.formats.visuals.mesh_files import find_mesh_file
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 def with_floating_joints(machine: Machine) -> Tree:

@@ -70,12 +70,12 @@ class _ReadFiles:
         self.names.append(file)
         files = self
 
-        class Marking(expatbuilder.ExpatBuilderNS):
+        class LocationBuilder(expatbuilder.ExpatBuilderNS):
             def start_element_handler(self, name: str, attributes: list[str]) -> None:
                 super().start_element_handler(name, attributes)
                 files.set_location(self.curNode, number, self.getParser().CurrentLineNumber)
 
-        return Marking().parseString(Path(file).read_bytes())
+        return LocationBuilder().parseString(Path(file).read_bytes())
 
     def set_location(self, element: Any, number: int, line: int) -> None:
         """Record where an element is written."""

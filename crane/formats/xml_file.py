@@ -49,19 +49,19 @@ class SourceLocations:
 class _RootDetector:
     """Parser target that stops at the root element or document type, in any encoding."""
 
-    class RootFound(Exception):  # noqa: N818
+    class RootElementReached(Exception):  # noqa: N818
         """The root element was reached."""
 
-    class DocumentTypeFound(Exception):  # noqa: N818
+    class DocumentTypeReached(Exception):  # noqa: N818
         """A document type was reached."""
 
     def doctype(self, *_: object) -> None:
         """Called before the declarations of the document type."""
-        raise self.DocumentTypeFound
+        raise self.DocumentTypeReached
 
     def start(self, *_: object) -> None:
         """Called at each element."""
-        raise self.RootFound
+        raise self.RootElementReached
 
     def end(self, *_: object) -> None:
         """Never called."""
@@ -74,13 +74,13 @@ def _refuse_document_type(file: Path, data: bytes) -> None:
     """Raise for <!DOCTYPE>, whose entities can expand without bounds or read other files."""
     try:
         etree.fromstring(data, etree.XMLParser(target=_RootDetector(), no_network=True))
-    except _RootDetector.DocumentTypeFound:
+    except _RootDetector.DocumentTypeReached:
         line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
         raise DescriptionError(
             f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
         ) from None
     except (
-        _RootDetector.RootFound,
+        _RootDetector.RootElementReached,
         etree.XMLSyntaxError,
     ):  # errors are reported by the actual parsing
         pass

@@ -1,29 +1,8 @@
-"""The hydraulic circuit of a machine: components, flows, and equations of the circuit."""
+"""Components of the hydraulic circuit: pumps, valves, cylinders, accumulators, lines.
 
-from crane.hydraulics.circuit_elements import (
-    Accumulator,
-    CircuitElement,
-    CircuitLine,
-    Engine,
-    Supply,
-)
-from crane.hydraulics.circuit_equations import CircuitEquations
-from crane.hydraulics.components import CounterbalanceValve, Cylinder, OpeningCurve, Spool, Valve
-from crane.hydraulics.hydraulic_circuit import Hydraulics, Oil, PDGains
+For programs that build or change a circuit; a machine has one as `Machine.hydraulics`.
+"""
 
-__all__ = [
-    "Accumulator",
-    "CircuitEquations",
-    "CounterbalanceValve",
-    "OpeningCurve",
-    "Cylinder",
-    "CircuitElement",
-    "Engine",
-    "Hydraulics",
-    "CircuitLine",
-    "Oil",
-    "PDGains",
-    "Spool",
-    "Supply",
-    "Valve",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,8 @@
-"""Machine: what was described, assembled and closed."""
+"""The machine: its description, assembled and closed.
 
-from crane.machine.machine import Machine
-from crane.machine.payload import Payload
+`crane.load` returns one; everything else in the package takes it.
+"""
 
-__all__ = ["Machine", "Payload"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,7 +9,7 @@ import pinocchio as pin
 from crane.closure.loop_equations import LoopEquations, frame_id
 from crane.common.errors import CraneError, MechanismError
 from crane.common.samples import Array
-from crane.description import LoopSpec, MachineSpec
+from crane.description.specification import LoopSpec, MachineSpec
 
 _PARALLEL_TOLERANCE = 1e-6  # sine of an angle that counts as zero
 _REVOLUTE_LOOP_TYPES = (

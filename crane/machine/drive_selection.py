@@ -19,8 +19,8 @@ from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
-from crane.description import Drive, MachineSpec
 from crane.description.floating_bases import floating_series
+from crane.description.specification import Drive, MachineSpec
 
 _SECTIONS_OF_ACTIVE_JOINTS = {
     "tasks",

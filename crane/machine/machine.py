@@ -13,13 +13,25 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from crane.closure import Closure, frame_id
+from crane.closure.closure import Closure
 from crane.closure.coordinates import Coordinates
+from crane.closure.loop_equations import frame_id
 from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
-from crane.description import (
+from crane.description.estimation_settings import EstimationSettings
+from crane.description.external_forces import ExternalForce, PhasedWrench
+from crane.description.kinematic_tree import Tree
+from crane.description.machine_lookup import (
+    CHANGES_SEPARATOR,
+    bundled_machines,
+    command_line_arguments,
+    example_robots,
+)
+from crane.description.pinocchio_conversion import add_rigid_load
+from crane.description.sensors import Sensor
+from crane.description.specification import (
     AnyForceElement,
     Chain,
     Drive,
@@ -29,17 +41,9 @@ from crane.description import (
     GasSpring,
     PIGains,
     Rope,
-    Sensor,
     Task,
-    bundled_machines,
-    example_robots,
 )
-from crane.description.estimation_settings import EstimationSettings
-from crane.description.external_forces import ExternalForce, PhasedWrench
-from crane.description.kinematic_tree import Tree
-from crane.description.machine_lookup import CHANGES_SEPARATOR, command_line_arguments
-from crane.description.pinocchio_conversion import add_rigid_load
-from crane.hydraulics import Hydraulics
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
 from crane.machine.payload import Payload
 

@@ -6,17 +6,18 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure import Closure, frame_id
+from crane.closure.closure import Closure
 from crane.closure.constraint_structure import ActiveJointError, OpenLoopError
 from crane.closure.coordinates import Coordinates
-from crane.closure.loop_equations import LoopEquations
+from crane.closure.loop_equations import LoopEquations, frame_id
 from crane.common.errors import DescriptionError, MechanismError, prefix_location
 from crane.common.samples import Array
-from crane.description import LoopSpec, MachineSpec, inertia_problem
 from crane.description.findings import error_recovery, is_strict, report_error
 from crane.description.floating_bases import floating_bases
+from crane.description.inertia_feasibility import inertia_problem
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.pinocchio_conversion import inertia_from_inertial, se3_from_xyz_rpy
+from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.axis_diagnosis import find_wrong_axis
 from crane.machine.drive_selection import (
     complete_active_joints,

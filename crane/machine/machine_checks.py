@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure import Closure, frame_id
+from crane.closure.closure import Closure
 from crane.closure.coordinates import Coordinates
+from crane.closure.loop_equations import frame_id
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.samples import Array
-from crane.description import AnyForceElement, GasSpring, MachineSpec
 from crane.description.findings import is_strict, report_error
 from crane.description.inertia_feasibility import (
     InertiaProblem,
@@ -23,7 +23,7 @@ from crane.description.inertia_feasibility import (
     nearest_inertia,
 )
 from crane.description.kinematic_tree import Joint, Link
-from crane.description.specification import element_name
+from crane.description.specification import AnyForceElement, GasSpring, MachineSpec, element_name
 from crane.machine.machine_assembly import assemble_tree
 
 _DEFINITE_TOLERANCE = 1e-12  # least eigenvalue of M_A scaled to unit diagonal

@@ -24,8 +24,8 @@ from crane.closure.constraint_structure import Indices
 from crane.closure.constraint_tolerances import FILE_PRECISION
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
-from crane.description import LoopSpec, MachineSpec
 from crane.description.machine_parameters import tree_parameters, value_at
+from crane.description.specification import LoopSpec, MachineSpec
 from crane.machine.drive_selection import specified_active_joints
 from crane.machine.machine_assembly import assemble_tree
 

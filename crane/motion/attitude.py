@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.trajectory import AttitudeTrajectory, via_points
 
 ROLL_PITCH_YAW = ("roll", "pitch", "yaw")

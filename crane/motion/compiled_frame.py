@@ -7,7 +7,7 @@ from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
 from crane.codegen import Program, Scalar, Tape
 from crane.codegen.symbolic import add_vectors, cross, dot, matvec, scale_vector, subtract_vectors
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _BLOCK_SAMPLES = 1000  # samples of a stack at once
 

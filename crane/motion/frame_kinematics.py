@@ -12,7 +12,7 @@ from crane.common.errors import ClosureError, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples
 from crane.common.threads import ThreadLocal
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.attitude import (
     INCLINATION,
     AttitudeCoordinates,

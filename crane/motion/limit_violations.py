@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.trajectory import Trajectory
 
 _LIMIT_TOLERANCE = 1e-6  # [rad], of the characteristic length

@@ -17,7 +17,7 @@ from crane.common.errors import (
 )
 from crane.common.samples import Array
 from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.attitude import INCLINATION, via_attitudes
 from crane.motion.limit_violations import limit_violation_message
 from crane.motion.quintic_splines import estimate_noise, quintic_polynomials, smooth_samples

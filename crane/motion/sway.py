@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.dynamics import Dynamics
-from crane.machine import Machine
+from crane.dynamics.dynamics import Dynamics
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 
 _EQUILIBRIUM_TOLERANCE = 1e-12  # of the equilibrium of the free joints

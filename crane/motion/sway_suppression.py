@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import ClosureError, InputError, LimitError, suggest_names
 from crane.common.samples import Array, as_number
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_violation_message
 from crane.motion.quintic_splines import quintic_polynomials
 from crane.motion.sway import MAX_ITERATIONS, Sway

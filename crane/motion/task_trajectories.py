@@ -9,7 +9,7 @@ from crane.codegen import cached_result
 from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.samples import Array
 from crane.description.specification import TIP_COORDINATES, Task, ViaPoint
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.attitude import INCLINATION, via_attitudes
 from crane.motion.kinematics import Kinematics
 from crane.motion.limit_violations import limit_violation_message

@@ -11,7 +11,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _FIELD_NAMES = ("position", "velocity", "effort")
 # least singular value of the map from actuators to joints, per the largest

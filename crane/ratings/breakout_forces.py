@@ -11,7 +11,7 @@ from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_quantity
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_patch import fill_patch, last_closed_configuration
 from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.ratings.drive_force_limits import drive_force_limits

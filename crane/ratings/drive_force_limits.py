@@ -11,7 +11,7 @@ from crane.common.samples import Array
 from crane.dynamics.reactions import Reactions
 from crane.hydraulics.components import Cylinder
 from crane.hydraulics.hydraulic_circuit import Hydraulics
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 WORKING_PRESSURE, HOLDING_PRESSURE, MOTOR_EFFORT = "working pressure", "holding pressure", "effort"
 

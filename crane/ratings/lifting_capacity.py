@@ -13,7 +13,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.common.units import format_quantity
 from crane.dynamics.statics import StaticsEvaluator
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import find_slewing_joint
 from crane.ratings.capacity_report import LoadTable, load_table, to_markdown
 from crane.ratings.configuration_search import ConfigurationSearch

@@ -11,7 +11,7 @@ from crane.common.result import Result
 from crane.common.samples import Array
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
 from crane.dynamics.tipping_stability import TippingStability, has_supports
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import DriveForceLimits, PinForces, drive_force_limits

@@ -44,8 +44,8 @@ def buckling_margins(chart: RatingChart) -> dict[str, Array]:
         chart: A load chart.
 
     Returns:
-        By cylinder that `crane.Buckling` evaluates, an array (s, b, a): infinite where the
-        cylinder is pulled, NaN where there is no finite load. Empty without a circuit.
+        By cylinder that `crane.dynamics.Buckling` evaluates, an array (s, b, a): infinite where
+        the cylinder is pulled, NaN where there is no finite load. Empty without a circuit.
     """
     machine = chart.machine
     if machine.hydraulics is None:

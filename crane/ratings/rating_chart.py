@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_sample
 from crane.dynamics.statics import StaticQuantities, StaticsEvaluator
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.limiting_factors import (
     TIPPING,

@@ -12,7 +12,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.dynamics.constant_derivatives import ConstantDerivatives
 from crane.dynamics.statics import StaticQuantities
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.ratings.limiting_factors import (
     LimitBound,
     LoadLimits,

@@ -8,7 +8,7 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_number
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.statics import StaticQuantities
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
 
 MAX_GROUND_SLOPE = np.deg2rad(45.0)

@@ -8,7 +8,7 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.statics import StaticsEvaluator
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces.workspace_mapping import moving_strokes, stroke_limits
 from crane.motion.workspaces.workspace_patch import last_closed_configuration

@@ -10,7 +10,7 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_sample
 from crane.common.units import format_quantity
 from crane.dynamics.statics import StaticsEvaluator
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from crane.common.samples import Array
 from crane.description.soil_cutting import SoilCutting
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces import Workspace
 from crane.motion.workspaces.workspace_extremes import (

@@ -9,7 +9,7 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.result import Result
 from crane.common.samples import as_number
 from crane.dynamics.statics import StaticsEvaluator
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
 from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, check_drives, find_pivot

@@ -1,5 +1,8 @@
-"""Recordings of machines: columns, files, logs of other programs, checks and summaries."""
+"""Recordings of a motion, simulated or measured.
 
-from crane.recordings.recording import Recording
+For programs that read logs, compare runs or look for limit cycles in them.
+"""
 
-__all__ = ["Recording"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

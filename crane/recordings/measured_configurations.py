@@ -10,11 +10,11 @@ from functools import cached_property
 
 import numpy as np
 
-from crane.closure import Closure
+from crane.closure.closure import Closure
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.missing_measurements import MissingMeasurementError
 from crane.recordings.recording_columns import time_derivative
 from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives

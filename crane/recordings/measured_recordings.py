@@ -22,7 +22,7 @@ import pinocchio as pin
 from crane.common.errors import CraneWarning, RecordingError, prefix_location
 from crane.common.samples import Array
 from crane.description.sensors import PRESSURE_PREFIX, SENSOR_PREFIX, Sensor
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import (
     add_inclination_angles,
     determining_joints,

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from crane.common.errors import RecordingError
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.timeseries import Table, table_column
 
 AGREEMENT_TOLERANCE = {"rad": 5e-3, "m": 5e-4}  # between sensors of one quantity

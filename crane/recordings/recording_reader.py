@@ -34,7 +34,7 @@ from crane.description.sensors import (
     with_sensor_parameters,
 )
 from crane.description.sensors import quantity_names as quantity_names
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
 from crane.recordings.timeseries import Table, table_column

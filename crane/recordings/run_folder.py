@@ -5,8 +5,8 @@ from pathlib import Path
 
 from crane.common.errors import DescriptionError, InputError, RecordingError
 from crane.description.machine_lookup import find_machine_file, without_changes
-from crane.formats import load_from_expression
-from crane.machine import Machine
+from crane.formats.machine_loading import load_from_expression
+from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import complete_recording, is_measured
 from crane.recordings.recording import Recording
 from crane.recordings.recording_reader import (

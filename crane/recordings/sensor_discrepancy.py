@@ -21,7 +21,7 @@ from crane.description.sensors import (
     Sensor,
     quantity_unit,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import MeasuredConfigurations, add_inclination_angles
 from crane.recordings.missing_measurements import AGREEMENT_TOLERANCE, tolerance
 from crane.recordings.recording_reader import known_sensors

@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 def ideal_readings(machine: Machine, q: Array, v: Array, names: Sequence[str]) -> dict[str, Array]:

@@ -1,7 +1,8 @@
-"""Machines in time: runs here; batches, replays, sensitivities, linear models in their modules."""
+"""Simulation in time: single runs, batches, replays, sensitivities and linear models.
 
-from crane.simulation.recorded_run import InterruptedRun
-from crane.simulation.simulation_run import Progress, integrate, simulate
-from crane.simulation.simulation_setup import Force
+For all that integrates the equations of motion or differentiates the result.
+"""
 
-__all__ = ["Force", "InterruptedRun", "Progress", "integrate", "simulate"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -12,9 +12,9 @@ from crane.common.errors import CraneError, InputError
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
-from crane.control import Controller
-from crane.dynamics import Dynamics
-from crane.machine import Machine
+from crane.control.control_law import Controller
+from crane.dynamics.dynamics import Dynamics
+from crane.machine.machine import Machine
 from crane.simulation.run_checks import run_warnings
 from crane.simulation.simulation_run import Progress, has_fixed_steps, integrate
 from crane.simulation.simulation_setup import (

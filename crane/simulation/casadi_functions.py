@@ -11,15 +11,15 @@ from crane.codegen.casadi_expressions import casadi_expressions
 from crane.codegen.symbolic import add_vectors, matvec, subtract_vectors, transpose
 from crane.common.errors import InputError, MechanismError, suggest_names
 from crane.common.optional_libraries import import_optional_library
-from crane.control import ValveDrive, ValveSignals
-from crane.dynamics import Dynamics
+from crane.control.valve_commands import ValveSignals
+from crane.control.valve_drive import ValveDrive
 from crane.dynamics.compiled_dynamics import QUANTITIES, WITH_FRICTION
-from crane.dynamics.dynamics import QUANTITY_ARGUMENTS
+from crane.dynamics.dynamics import QUANTITY_ARGUMENTS, Dynamics
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.dynamics.joint_forces import find_stick_slip_columns
-from crane.formats import load
+from crane.formats.machine_loading import load
 from crane.hydraulics.circuit_states import BALANCE_UNITS
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import controller_settings, trace_machine
 

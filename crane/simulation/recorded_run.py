@@ -11,7 +11,8 @@ from crane.common import scratch_arrays
 from crane.common.errors import CraneError, RecordingError, format_one_line, suggest_names
 from crane.common.one_line_repr import shorten_to_line
 from crane.common.samples import MAX_QUANTITY, Array
-from crane.control import Controller, ValveDrive, ZeroForce, controller_reference
+from crane.control.control_law import Controller, ZeroForce, controller_reference
+from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.description.sensors import (
     FORCE_SUFFIX,
@@ -27,7 +28,7 @@ from crane.description.sensors import (
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.dynamics.tipping_stability import TippingStability, has_supports
 from crane.hydraulics.circuit_states import BALANCE_UNITS
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory
 from crane.recordings.recording import Recording

@@ -18,9 +18,10 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
-from crane.control import ValveDrive, ValveSignals
+from crane.control.valve_commands import ValveSignals
+from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import (
     add_inclination_angles,
     determining_joints,

@@ -8,7 +8,7 @@ from crane.common.scratch_arrays import release_pages
 from crane.description.ground_contact import Contact
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
 
 _MAX_CONTACT_FORCE_RATIO = 3.0  # largest initial force of a contact over the weight of the machine

@@ -20,19 +20,19 @@ from crane.common.errors import (
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
-from crane.control import (
+from crane.control.control_law import (
     ControlLaw,
     Controller,
     TracedController,
-    ValveCommand,
-    ValveDrive,
     controller_reference,
 )
+from crane.control.valve_commands import ValveCommand
+from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import ExternalForce
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
-from crane.formats import load
-from crane.machine import Machine
+from crane.formats.machine_loading import load
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
 from crane.simulation.integration.chart_switching import ChartIntegrator, ChartSwitchingIntegrator
@@ -127,8 +127,8 @@ def simulate(
             rosenbrock, 1e-9 for others if not given.
         formulation: "exact" or "decoupled", see `Dynamics`.
         loads: External forces besides those of the machine file: `crane.Wrench` over time,
-            `crane.WrenchFunction` by a function in Python, `crane.ExternalForce` in machine
-            code.
+            `crane.description.WrenchFunction` by a function in Python,
+            `crane.description.ExternalForce` in machine code.
         progress: Function that is called with the finished share, 0 to 1.
 
     Returns:

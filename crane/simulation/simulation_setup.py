@@ -11,21 +11,20 @@ from crane.common.errors import (
     InputError,
 )
 from crane.common.samples import Array, as_number, as_sample
-from crane.control import (
+from crane.control.control_law import (
     ControlLaw,
     Controller,
     FunctionController,
-    ValveCommand,
-    ValveDrive,
-    ValveSignals,
     ZeroForce,
     controller_reference,
 )
+from crane.control.valve_commands import ValveCommand, ValveSignals
+from crane.control.valve_drive import ValveDrive
 from crane.description.ground_contact import Contact
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import static_active_forces
 from crane.dynamics.frame_jacobians import FrameJacobians
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_violation_message, passive_limit_violation_message
 
 _MAX_STEPS = 4_000_000  # steps of one recording

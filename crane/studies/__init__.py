@@ -1,12 +1,8 @@
-"""Measures of a machine over its parameters, and of its runs."""
+"""Studies of variants of a machine: measures over parameters, optimization, power balance.
 
-from crane.studies.hydraulic_power_balance import power_balance
-from crane.studies.power_balance_result import PowerBalance, PowerComparison
-from crane.studies.residual_sway_study import SwayRow, SwayStudy, sway_study
-from crane.studies.study_table import Study
-from crane.studies.variant_study import study
+For design decisions: what a parameter changes, which values are best, where the power goes.
+"""
 
-__all__ = [
-    "PowerBalance", "PowerComparison", "Study", "SwayRow", "SwayStudy", "power_balance", "study",
-    "sway_study",
-]  # fmt: skip
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

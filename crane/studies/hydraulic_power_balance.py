@@ -7,16 +7,17 @@ import numpy as np
 from crane.codegen import Program, Tape
 from crane.common.errors import RecordingError, suggest_names
 from crane.common.samples import Array
-from crane.control import ValveDrive, ValveSignals
-from crane.description import Friction
+from crane.control.valve_commands import ValveSignals
+from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import VELOCITY_SUFFIX
-from crane.dynamics import Dynamics
-from crane.hydraulics import CircuitEquations, Engine
-from crane.hydraulics.circuit_elements import MAIN_PUMP
+from crane.description.specification import Friction
+from crane.dynamics.dynamics import Dynamics
+from crane.hydraulics.circuit_elements import MAIN_PUMP, Engine
+from crane.hydraulics.circuit_equations import CircuitEquations
 from crane.hydraulics.power_balance import ROD_POWER, SHAFT_POWER, component_powers
-from crane.machine import Machine
-from crane.recordings import Recording
+from crane.machine.machine import Machine
 from crane.recordings.missing_measurements import check_columns_present
+from crane.recordings.recording import Recording
 from crane.recordings.timeseries import check_unit
 from crane.studies.power_balance_result import (
     JOINT_FRICTION,

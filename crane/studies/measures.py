@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control import ComputedTorque, joystick
-from crane.dynamics import Dynamics
-from crane.machine import Machine
+from crane.control.control_law import ComputedTorque
+from crane.control.levers import joystick
+from crane.dynamics.dynamics import Dynamics
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.task_trajectories import task_trajectory
 from crane.motion.workspaces.workspace_extremes import maximize_on_branch
 from crane.motion.workspaces.workspace_section import up_direction
 from crane.recordings.recording import FORCE_UNITS
-from crane.simulation import simulate
+from crane.simulation.simulation_run import simulate
 
 _SAMPLES_PER_SECOND = 200  # of a task
 _LEVER_TASK_STEP = 5e-3  # between samples of a task of levers [s]

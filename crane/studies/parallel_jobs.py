@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 from crane.common.errors import CraneWarning, InputError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import as_count
-from crane.formats import load
-from crane.machine import Machine
+from crane.formats.machine_loading import load
+from crane.machine.machine import Machine
 
 _CONNECTION_TIMEOUT = 10.0  # [s] for the scheduler to answer
 

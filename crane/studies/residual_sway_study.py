@@ -11,13 +11,13 @@ from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.units import format_table
-from crane.control import ValveFeedforward, fastest_trajectory
-from crane.formats import load
-from crane.machine import Machine
+from crane.control.valve_feedforward import ValveFeedforward, fastest_trajectory
+from crane.formats.machine_loading import load
+from crane.machine.machine import Machine
 from crane.motion.sway import Sway
 from crane.motion.sway_suppression import SWAY_METHODS
 from crane.motion.task_trajectories import task_trajectory
-from crane.simulation import simulate
+from crane.simulation.simulation_run import simulate
 
 _OBSERVATION_TIME = 10.0  # after the motion [s]
 _STEP = 1e-2  # [s]

@@ -7,13 +7,14 @@ import numpy as np
 from scipy.optimize import brentq
 
 from crane.common.errors import CraneWarning, InputError, suggest_names
-from crane.control import ComputedTorque, joystick
+from crane.control.control_law import ComputedTorque
+from crane.control.levers import joystick
 from crane.dynamics.tipping_stability import TippingStability
 from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.task_trajectories import task_trajectory
 from crane.recordings.recording import Recording
-from crane.simulation import simulate
+from crane.simulation.simulation_run import simulate
 
 PAYLOAD_MASS = "payload.mass"
 _STEP = 5e-3  # between instants at which tipping is checked [s]

@@ -20,11 +20,18 @@ from crane.common.errors import (
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
 from crane.description.parameter_units import parameter_unit
-from crane.dynamics import Dynamics
-from crane.formats import load
-from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
+from crane.dynamics.dynamics import Dynamics
+from crane.formats.machine_loading import MachineVariants, load
+from crane.machine.machine import Machine
 from crane.ratings.rating_rules import Rule, find_rule
+from crane.studies.measures import (
+    combine_task_measures,
+    measure_strokes,
+    measure_task,
+    resolution_notes,
+    stroke_measures,
+    task_measures,
+)
 from crane.studies.optimization.measure_expressions import (
     MeasureExpression,
     MeasureFunction,
@@ -38,14 +45,6 @@ from crane.studies.optimization.variant_measures import (
     VariantEvaluation,
     check_unique_names,
     load_positions,
-)
-from crane.studies.measures import (
-    combine_task_measures,
-    measure_strokes,
-    measure_task,
-    resolution_notes,
-    stroke_measures,
-    task_measures,
 )
 from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
 from crane.studies.study_table import Study

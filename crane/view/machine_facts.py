@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from crane.common.units import format_quantity
 from crane.description.sensors import Sensor
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.frame_jacobians import FrameDistances
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 
 

@@ -14,7 +14,7 @@ import matplotlib as mpl
 from markdown_it import MarkdownIt
 
 from crane.common.errors import CraneError
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import summarize
 from crane.view.machine_facts import MachineFact, machine_facts

@@ -14,8 +14,9 @@ from typing import Any
 from crane.common.atomic_output import check_folder_is_writable, replace_folder
 from crane.common.errors import CraneWarning, InputError
 from crane.common.result import Result
-from crane.formats import load_from_expression, write_machine
-from crane.machine import Machine
+from crane.formats.machine_file.machine_writer import write_machine
+from crane.formats.machine_loading import load_from_expression
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import heading, result_title, summarize
 from crane.recordings.run_folder import RECORDING, RECORDING_NPZ

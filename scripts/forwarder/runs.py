@@ -46,7 +46,7 @@ class Pushed(PI):
         integral: (3,) see `PI`.
     """
 
-    def __init__(self, machine: crane.Machine, path: crane.Trajectory, integral: Array):
+    def __init__(self, machine: crane.Machine, path: crane.motion.Trajectory, integral: Array):
         super().__init__(machine, path, integral=integral)
         table = np.array([FRICTION[joint] for joint in JOINTS])
         self.settings = np.concatenate([self.settings, np.ravel(table)])
@@ -114,12 +114,12 @@ def percentage_error(time: Array, measured: Array, simulated: Array) -> tuple[Ar
 def without_active_friction(machine: crane.Machine) -> crane.Machine:
     """The crane with the viscous friction mu_v of Table 1 alone."""
     others = {j: f for j, f in machine.friction.items() if j not in machine.active}
-    viscous = {joint: crane.Friction(viscous=mu) for joint, mu in VISCOUS.items()}
+    viscous = {joint: crane.description.Friction(viscous=mu) for joint, mu in VISCOUS.items()}
     return machine.replace(friction=others | viscous)
 
 
 def simulate(
-    machine: crane.Machine, path: crane.Trajectory, formulation: str, reading: str
+    machine: crane.Machine, path: crane.motion.Trajectory, formulation: str, reading: str
 ) -> Run:
     """A task under the PI controllers, whose integrals carry the weight at the start."""
     q, v, _ = path(0.0)
@@ -137,13 +137,13 @@ def simulate(
     return run_of(recording, path, tau)
 
 
-def run_of(recording: crane.Recording, path: crane.Trajectory, tau: Array) -> Run:
+def run_of(recording: crane.Recording, path: crane.motion.Trajectory, tau: Array) -> Run:
     """A recording with its reference."""
     tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
     return Run(recording.time, recording.q, recording.v, tau, tip, path.tip(recording.time)[0])
 
 
-def tip_errors(machine: crane.Machine, path: crane.Trajectory) -> dict[str, Array]:
+def tip_errors(machine: crane.Machine, path: crane.motion.Trajectory) -> dict[str, Array]:
     """Distance of the tip from its reference (N,) [m], and what remains of it without its causes.
 
     Without inertia and start, K_p e + K_i int e dt = F(t) gives K_p e' + K_i e = F': an error
@@ -251,7 +251,7 @@ class Coarse:
 def coarse(machine: crane.Machine, task: str) -> Coarse:
     """Forces of a task without control errors: inverse dynamics along its reference."""
     polynomials = machine.tasks[task].coefficients
-    tip = crane.polynomial([polynomials[axis] for axis in "xyz"], DURATION)
+    tip = crane.motion.polynomial([polynomials[axis] for axis in "xyz"], DURATION)
     time = np.linspace(0.0, DURATION, 101)
     x, x_rate, x_second = tip(time)
     kinematics = crane.Kinematics(machine)

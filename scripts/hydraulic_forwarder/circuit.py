@@ -284,7 +284,7 @@ def friction_strokes(folder: Path, share: float, masses: float = 1.0) -> Cylinde
     pieces[2] = start
     pieces[:, :, 0] = rise / 2, v[:-1], start[0] + way[:-1]
     gains = {"X_lift": PDGains(20, 0.1), "X_tilt": PDGains(10, 0.05), "X_ext": PDGains(10, 0.1)}
-    path = crane.Trajectory(PPoly(pieces, t))
+    path = crane.motion.Trajectory(PPoly(pieces, t))
     run = crane.simulate(
         machine, crane.ValvePD(machine, path, gains), duration=round(t[-1], 1), step=STEP
     )

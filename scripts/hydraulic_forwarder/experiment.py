@@ -172,7 +172,7 @@ def perform(plant: Crane, motion: FourierTrajectory, step: float = STEP) -> cran
     The joints' reference is mapped to strokes by the closed loops.
     """
     time = np.linspace(0.0, motion.duration, round(motion.duration / 0.02) + 1)
-    path = crane.Trajectory(CubicSpline(time, plant.strokes(motion(time)[0])))
+    path = crane.motion.Trajectory(CubicSpline(time, plant.strokes(motion(time)[0])))
     control = crane.ValvePD(plant.machine, path, GAINS)
     whole = crane.simulate(plant.machine, control, step=step)
     first, count = round(motion.lead / step), round(motion.periods * motion.period / step)
@@ -246,7 +246,7 @@ def measured(
     """
     path = folder / "logger.csv"
     log(recording, path, np.random.default_rng(seed), share, spool)
-    return crane.read_measured(plant.machine, path)
+    return crane.recordings.read_measured(plant.machine, path)
 
 
 def averaged(recording: crane.Recording, period: float) -> crane.Recording:

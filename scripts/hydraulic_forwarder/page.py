@@ -133,7 +133,7 @@ def setting(found: Results) -> str:
             "kg and is near level. Rates are those of the figures to 5 to 20 %.",
             "What is recorded is what a crane's logger has, at "
             f"{1 / experiment.STEP:.0f} Hz as CSV in deg, mm, bar and V, "
-            "read back by `crane.read_measured`: angles of q2 and q3 (white noise of "
+            "read back by `crane.recordings.read_measured`: angles of q2 and q3 (white noise of "
             f"{NOISE['deg']:g} deg, about two steps of a 16 bit encoder), the extension's stroke "
             f"({NOISE['mm']:g} mm, a draw-wire sensor), eight pressures ({NOISE['bar']:g} bar, "
             "0.08 % of a 250 bar transmitter, then 12 bits), and the valves' voltages "

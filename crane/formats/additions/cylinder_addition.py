@@ -21,7 +21,7 @@ from crane.formats.additions.loop_addition import check_files_are_new, machine_f
 from crane.formats.additions.steel_cylinder import SteelCylinder, add_barrel_and_rod
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.machine_loading import load
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 def replace_drive(draft: MachineDraft, machine: Machine, name: str, joint: str | None) -> None:

@@ -18,7 +18,7 @@ from crane.formats.additions.attachment_points import (
     vector_between,
 )
 from crane.formats.additions.steel_cylinder import SteelCylinder
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _FINE_SAMPLES = 400  # over the range of the joint
 _COARSE_SAMPLES = 24  # over the range of each candidate

@@ -9,12 +9,12 @@ from typing import Any
 from crane.common.atomic_output import check_file_is_writable, fill_folder, portable_file_name
 from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError, OutputError
 from crane.common.package_search import use_load_options
-from crane.description import MachineSpec
+from crane.description.specification import MachineSpec
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.machine_loading import load
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 def machine_file_path(out: str | Path | None, default: str) -> Path:

@@ -15,9 +15,9 @@ import pinocchio as pin
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import frame_id
 from crane.common.samples import Array
-from crane.description import LoopSpec, MachineSpec
 from crane.description.kinematic_tree import Joint, Vector
 from crane.description.pinocchio_conversion import to_vector
+from crane.description.specification import LoopSpec, MachineSpec
 from crane.formats.machine_file.open_loop_warning import loop_end_pairs
 
 # largest gaps relative to the characteristic length, the second without a common normal

@@ -25,7 +25,7 @@ from crane.formats.additions.attachment_points import (
 )
 from crane.formats.machine_file.machine_writer import MachineDraft
 from crane.formats.urdf_elements import add_joint, add_link, format_numbers
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 STEEL_DENSITY = 7850.0  # [kg/m3]
 RELIEF_PRESSURE = 35e6  # [Pa] usual in mobile machines; determines the effort of the joint

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from crane.closure import Closure
+from crane.closure.closure import Closure
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import CraneWarning, message_kind
 from crane.common.package_search import (
@@ -16,10 +16,11 @@ from crane.common.package_search import (
     load_options,
     use_load_options,
 )
-from crane.description import MachineSpec, set_active_joints
 from crane.description.findings import Findings, collect_findings, error_recovery
 from crane.description.floating_bases import add_floating_base
 from crane.description.machine_lookup import command_line_arguments, find_machine_file
+from crane.description.parameter_changes import set_active_joints
+from crane.description.specification import MachineSpec
 from crane.formats.additions.open_loop_search import LoopProposal, propose_loops
 from crane.formats.checks.circuit_check import flow_shortages, warn_about_circuit
 from crane.formats.checks.mechanism_check import check_mechanism

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 
 from crane.common.errors import CraneWarning
-from crane.description import MachineSpec
+from crane.description.specification import MachineSpec
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.components import Valve
 from crane.hydraulics.hydraulic_circuit import (

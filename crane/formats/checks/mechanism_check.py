@@ -6,16 +6,15 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pinocchio as pin
 
-from crane.closure import Closure
+from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
 from crane.closure.constraint_tolerances import least_squares_step
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
-from crane.description import MachineSpec, Task
 from crane.description.findings import Findings, report_error
-from crane.description.specification import TIP_COORDINATES
+from crane.description.specification import TIP_COORDINATES, MachineSpec, Task
 from crane.formats.assembly_warnings import add_remedy, check_home, warn_about_assembly_modes
 from crane.machine.machine_assembly import assemble_tree, build_closure, home_initial_guess
 from crane.machine.machine_checks import (

@@ -14,7 +14,8 @@ from lxml import etree
 from crane.common.errors import CraneWarning
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
-from crane.description import MachineSpec, inertia_problem
+from crane.description.inertia_feasibility import inertia_problem
+from crane.description.specification import MachineSpec
 from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
 

@@ -7,7 +7,7 @@ from crane.common.errors import InputError
 from crane.description.estimation_settings import EstimationSettings, ParameterPrior, TermValues
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.machine_file.yaml_values import as_boolean, as_float
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _TERM_HINT = "on, off, a number or a list of numbers"
 

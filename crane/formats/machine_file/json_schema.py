@@ -29,7 +29,7 @@ def schema_text() -> str:
 
     A file with the key `extends` needs no other key, and may remove keys by empty values.
     """
-    definitions = _Definitions()
+    definitions = _SchemaDefinitions()
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "machine file of crane",
@@ -42,7 +42,7 @@ def schema_text() -> str:
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 
-class _Definitions:
+class _SchemaDefinitions:
     """Schemas of sections, each once.
 
     Attributes:

@@ -50,8 +50,9 @@ from crane.formats.urdf_output import (
     rotor_inertias,
     with_floating_joints,
 )
-from crane.hydraulics import Cylinder, Hydraulics, Valve
-from crane.machine import Machine
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics
+from crane.machine.machine import Machine
 
 
 def write_machine(

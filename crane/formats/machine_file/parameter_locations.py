@@ -15,8 +15,8 @@ from crane.description.machine_parameters import (
 )
 from crane.description.sensors import SENSOR_PREFIX
 from crane.formats.machine_file.yaml_text import KeyPath
-from crane.hydraulics import Spool
-from crane.machine import Machine
+from crane.hydraulics.components import Spool
+from crane.machine.machine import Machine
 
 _LIST_SECTIONS = ("forces", "ropes")  # of which a machine file has lists, of the rest mappings
 _ELEMENT_PATHS = {"mass": "inertial/mass", "com": "inertial/origin", "tensor": "inertial/inertia",

@@ -10,12 +10,18 @@ from lxml import etree
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
-from crane.description import Coupling, Drive, ForceElement, LoopSpec, Rope
-from crane.description.specification import element_name
+from crane.description.specification import (
+    Coupling,
+    Drive,
+    ForceElement,
+    LoopSpec,
+    Rope,
+    element_name,
+)
 from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
 from crane.formats.urdf_elements import finite_limits, format_numbers
 from crane.formats.urdf_output import format_document, origin_text, solve_coupling
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
 _ROUNDING_TOLERANCE = 1e-9  # relative to the largest moment

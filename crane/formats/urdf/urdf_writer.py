@@ -7,8 +7,8 @@ from lxml import etree
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError
-from crane.description import Coupling, LoopSpec
 from crane.description.kinematic_tree import Tree
+from crane.description.specification import Coupling, LoopSpec
 from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
 from crane.formats.urdf_elements import (
     add_friction,
@@ -26,7 +26,7 @@ from crane.formats.urdf_output import (
     solve_coupling,
     with_floating_joints,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 def write_urdf_plus(machine: Machine, path: str | Path) -> None:
@@ -174,11 +174,11 @@ def robot_description(machine: Machine) -> str:
     """Return the whole machine as one plain URDF, a tree that every reader of URDF accepts.
 
     Its joints are those of `Machine.joints` with their names, zeros and signs, so joint states of
-    all of them determine the pose of every link; `crane.Transmission` computes them from the
-    coordinates of the actuators. A floating base is a joint of type "floating", which joint states
-    do not contain. Loops are cut: the two frames of a loop are links that coincide where the loop
-    is closed. No joint mimics another. Meshes are named by URIs, `file://` or the `package://` of
-    the machine's own files.
+    all of them determine the pose of every link; `crane.motion.Transmission` computes them from
+    the coordinates of the actuators. A floating base is a joint of type "floating", which joint
+    states do not contain. Loops are cut: the two frames of a loop are links that coincide where
+    the loop is closed. No joint mimics another. Meshes are named by URIs, `file://` or the
+    `package://` of the machine's own files.
 
     Args:
         machine: The machine with its parameter changes, locked joints and payload.

@@ -81,20 +81,20 @@ def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]
     import numpy as np
     import trimesh
 
-    class Beside(trimesh.resolvers.FilePathResolver):
+    class SiblingFileResolver(trimesh.resolvers.FilePathResolver):
         """Opens materials, textures and buffers, and records that it did."""
 
         asked = False
 
         def get(self, name: str) -> bytes:
-            Beside.asked = True
+            SiblingFileResolver.asked = True
             return super().get(name)
 
     kind = file.rpartition(".")[2].lower()
     if kind not in _MESH_FORMATS:
         raise ValueError(f"no mesh ends in .{kind}, known: {', '.join(_MESH_FORMATS)}")
     # unmerged vertices keep the edges of the drawing sharp
-    scene = trimesh.load_scene(file, resolver=Beside(file), process=False)
+    scene = trimesh.load_scene(file, resolver=SiblingFileResolver(file), process=False)
     unique_triangles = sum(len(getattr(part, "faces", ())) for part in scene.geometry.values())
     max_repeated = max(_MAX_REPEATED, _MAX_REPETITION_FACTOR * unique_triangles)
     by_colour: dict[tuple[float, ...] | None, list[tuple[Any, Any]]] = {}
@@ -132,7 +132,7 @@ def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]
         )
         parts.append({"vertices": len(vertices), "faces": len(faces), "colour": colour})
         arrays += [vertices, faces]
-    return {"parts": parts, "alone": not Beside.asked}, arrays
+    return {"parts": parts, "alone": not SiblingFileResolver.asked}, arrays
 
 
 def _part_colour(part: Any) -> tuple[float, ...] | None:

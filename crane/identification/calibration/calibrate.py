@@ -22,8 +22,7 @@ from crane.description.sensors import (
     sensor_parameters,
     with_sensor_parameters,
 )
-from crane.formats import load
-from crane.formats.machine_loading import MachineVariants
+from crane.formats.machine_loading import MachineVariants, load
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.calibration_result import (
     Calibration,
@@ -42,7 +41,7 @@ from crane.identification.calibration.parameter_selection import (
 )
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
 from crane.identification.calibration.unknowns import Unknown, build_unknowns
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.logs import read_log_columns
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
 from crane.recordings.recording_reader import (

@@ -9,19 +9,19 @@ from scipy.interpolate import CubicSpline
 
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
-from crane.description import Friction
 from crane.description.sensors import (
     SENSOR_PREFIX,
     VALVE_SIGNAL_PREFIX,
     Sensor,
     with_sensor_parameters,
 )
-from crane.dynamics import Dynamics
+from crane.description.specification import Friction
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.recording_case import RecordingCase
 from crane.identification.calibration.unknowns import SENSOR_PARAMETER_DEFAULTS, Unknown
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.simulation.recorded_run import read_simulation
 from crane.simulation.recorded_run import record_run as recording_of
 from crane.simulation.recording_replay import ReplayInputs

@@ -17,7 +17,7 @@ from crane.identification.calibration.calibration_statistics import (
     correlated_directions,
 )
 from crane.identification.calibration.recording_case import noise_std
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _DEGRADATION_FACTOR = 1.1  # times the residual before
 LOWER_MINIMUM_WARNING = (

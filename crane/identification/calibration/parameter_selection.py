@@ -7,11 +7,12 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.description.sensors import INCLINATION_PREFIX, SENSOR_PREFIX
-from crane.hydraulics import Hydraulics, Spool, Valve
+from crane.hydraulics.components import Spool, Valve
+from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
 from crane.identification.calibration.recording_case import RecordingCase
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _MIN_SPOOL_STROKE = 0.05  # of the stroke of a spool, from which a valve counts as open
 _MIN_BANDWIDTH, _MAX_BANDWIDTH = 5.0, 200.0  # bandwidths of spools [1/s]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.description.sensors import VALVE_SIGNAL_PREFIX, Sensor
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, correct_readings
 from crane.recordings.timeseries import TIME, Table, table_column
 from crane.simulation.recording_replay import ReplayInputs, replay_inputs

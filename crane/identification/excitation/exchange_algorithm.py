@@ -11,7 +11,7 @@ from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
 from crane.identification.excitation.pulse_signals import PulseSignals
 from crane.identification.excitation.signal_information import SignalInformation
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.simulation.simulation_run import simulate
 

@@ -15,7 +15,7 @@ from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.threads import with_single_threaded_blas
 from crane.common.units import format_table
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import (
     CRITERIA,
     FisherInformation,
@@ -40,7 +40,7 @@ from crane.identification.mechanics.base_parameters import (
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_term import MotionSamples
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
 from crane.recordings.timeseries import TIME, Table

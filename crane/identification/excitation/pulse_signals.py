@@ -10,7 +10,7 @@ from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValveCommand, require_circuit
 from crane.hydraulics.circuit_elements import Supply
 from crane.hydraulics.components import Cylinder, Valve
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 class PulseSignals(ValveCommand):

@@ -20,7 +20,7 @@ from crane.identification.calibration.unknowns import Unknown
 from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm, SignalLimits
 from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
 from crane.identification.excitation.signal_information import SignalInformation
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE, Recording
 from crane.recordings.timeseries import Table
@@ -80,7 +80,7 @@ class SignalExcitation(Result):
 
     @property
     def signals(self) -> dict[str, Array]:
-        """Signals (N,) by joint at `run.time` [V], as for `crane.ValveSignals`."""
+        """Signals (N,) by joint at `run.time` [V], as for `crane.control.ValveSignals`."""
         joints = require_circuit(self.machine).joints
         return {joint: self.run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
 

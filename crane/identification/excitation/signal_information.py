@@ -19,7 +19,7 @@ from crane.identification.excitation.fisher_information import (
     InformationMeasures,
     information_measures,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import TIME, Table
 from crane.simulation.recorded_run import read_simulation, simulated_columns, simulated_units

@@ -9,7 +9,7 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_number
 from crane.identification.mechanics.base_parameters import stroke_limits
 from crane.identification.mechanics.model_term import MotionSamples
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 QUANTITIES = ("stroke", "velocity", "acceleration", "force", "flow")
 _SINGULARITY_GAIN = 5.0  # ratio of gamma to that at home, near the end of the branch

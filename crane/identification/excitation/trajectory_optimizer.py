@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import FisherInformation
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory, fourier_basis
 from crane.identification.excitation.trajectory_limits import (

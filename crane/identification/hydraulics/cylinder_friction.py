@@ -17,13 +17,13 @@ from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.description import Friction
-from crane.dynamics import Dynamics
+from crane.description.specification import Friction
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation import estimators
 from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.steady_samples import steady_samples
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 PARAMETER_NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")

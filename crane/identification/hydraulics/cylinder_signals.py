@@ -12,7 +12,7 @@ from crane.identification.signals.signal_processing import (
     differentiate,
     sampling_step,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.missing_measurements import check_columns_present
 from crane.recordings.recording import Recording

@@ -28,7 +28,7 @@ from crane.identification.hydraulics.orifice_equations import (
     chamber_terms,
 )
 from crane.identification.signals.signal_processing import differentiate
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 PARAMETER_NAMES = ("1/beta", "c1", "c2", "c3", "c4")

@@ -28,7 +28,7 @@ from crane.identification.hydraulics.cylinder_signals import (
     opening_regions,
     shift_signal,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _EXPONENT = 6
 _MIN_HALF_WIDTH = 32  # least number of steps to either side of a centre

@@ -26,7 +26,7 @@ from crane.identification.hydraulics.cylinder_signals import (
     joint_velocity,
 )
 from crane.identification.signals.steady_samples import steady_means
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 PARAMETER_NAMES = ("edge up", "edge down", "slope up", "slope down")

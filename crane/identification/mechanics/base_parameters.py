@@ -12,7 +12,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_term import MotionSamples
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _RANK_TOLERANCE = 1e-8  # independent part of a column, relative to its norm
 _ZERO_TOLERANCE = 1e-10  # norm of a zero column, relative to the largest

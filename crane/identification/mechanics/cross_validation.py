@@ -19,7 +19,7 @@ from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.priors import prior_from_names, read_priors
 from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
 from crane.identification.signals.signal_processing import Motion
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 FOLD_COUNT = 5
 _MIN_FOLD_SAMPLES = 50  # least number of samples of a fold

@@ -18,7 +18,7 @@ from crane.identification.mechanics.regression_equations import (
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
 from crane.identification.signals.signal_quality import spectral_edge_frequency
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 RecordingOrMotion = Recording | Motion

@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.description import Friction
+from crane.description.specification import Friction
 from crane.dynamics.joint_forces import JointForces
 from crane.identification.mechanics.model_term import (
     ForceDirection,
@@ -15,7 +15,7 @@ from crane.identification.mechanics.model_term import (
     MotionSamples,
     resolve_direction,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 ForceShape = Callable[[Array], Array]
 

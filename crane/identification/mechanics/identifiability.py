@@ -9,7 +9,7 @@ from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import body_size
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.signals.signal_processing import Motion
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _MIN_NAMED_SHARE = 0.25  # least component that a text names
 _MAX_NAMED = 4  # parameters that a text names

@@ -27,7 +27,7 @@ from crane.identification.mechanics.model_term import (
     RotorInertiaTerm,
     body_names,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 TermChanges = Mapping[str, TermValues | None]
 """Values of a term by name, () if it has none; None removes the term."""

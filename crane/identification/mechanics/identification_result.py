@@ -19,7 +19,7 @@ from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _IMPOSSIBLE_FACTOR = 10.0  # times the magnitude, above which a parameter is impossible
 _MAX_SHOWN = 3  # directions in a table

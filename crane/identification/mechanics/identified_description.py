@@ -13,8 +13,8 @@ from lxml import etree
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.description import Friction
-from crane.dynamics import Dynamics
+from crane.description.specification import Friction
+from crane.dynamics.dynamics import Dynamics
 from crane.formats.visuals.mesh_files import find_mesh_file
 from crane.identification.mechanics.feasible_estimate import thicken_body
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
@@ -24,7 +24,7 @@ from crane.identification.mechanics.force_terms import (
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.model_term import ForceDirection, body_names
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 SpeedRanges = Mapping[str, tuple[float, float]]
 _FRICTION_PARAMETERS = tuple(item.name for item in fields(Friction))

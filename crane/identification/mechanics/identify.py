@@ -52,7 +52,7 @@ from crane.identification.mechanics.regression_equations import (
     is_long_enough,
 )
 from crane.identification.signals.signal_processing import Motion
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 METHODS = {"ols": least_squares, "wls": weighted_least_squares, "huber": huber}
 _MIN_COMPARED_ROWS = 50  # least number of rows for a comparison of forces with the model

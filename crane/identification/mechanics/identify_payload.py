@@ -11,7 +11,7 @@ from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.regression_problem import Estimate
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
@@ -37,7 +37,7 @@ from crane.identification.mechanics.regression_equations import (
 )
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_processing import Motion
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 _IDENTIFIABLE_TOLERANCE = 1e-6  # part of a direction outside of the identifiable ones

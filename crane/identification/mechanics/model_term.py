@@ -9,9 +9,9 @@ import numpy as np
 from crane.common.errors import InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.frame_jacobians import FrameDistances
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 BODY_PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 

@@ -8,7 +8,7 @@ from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.common.units import format_table
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.regression_problem import confidence_intervals
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison
@@ -20,7 +20,7 @@ from crane.identification.mechanics.model_term import (
     inertial_regressor,
 )
 from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _REST_SPEED_SHARE = 0.05  # of a joint's largest velocity, below which it is at rest
 _MIN_REST_DURATION = 0.25  # [s], least duration of rest

@@ -8,7 +8,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.identification.mechanics.force_delays import motion_frequency
 from crane.identification.mechanics.recording_checks import (
     check_recording,
@@ -25,7 +25,7 @@ from crane.identification.signals.signal_processing import (
     resample_evenly,
 )
 from crane.identification.signals.signal_quality import outlier_mask, replace_outliers
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
 from crane.recordings.recording_columns import time_derivative

@@ -14,13 +14,14 @@ from lxml import etree
 from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.samples import Array
-from crane.description import Chain, Friction, MachineSpec, lock_joints
 from crane.description.inertia_feasibility import inertia_problem
-from crane.dynamics import Dynamics
-from crane.formats import load, read_machine_spec
-from crane.formats.machine_file.machine_reader import read_plain_data
+from crane.description.parameter_changes import lock_joints
+from crane.description.specification import Chain, Friction, MachineSpec
+from crane.dynamics.dynamics import Dynamics
+from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
 from crane.formats.machine_file.machine_writer import friction_data
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
+from crane.formats.machine_loading import load
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
 from crane.identification.mechanics.force_terms import FrictionTerm
@@ -34,7 +35,7 @@ from crane.identification.mechanics.identified_description import (
     replace_inertials,
 )
 from crane.identification.mechanics.model_term import BODY_PARAMETERS
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
 _FRICTION_PARAMETERS = tuple(item.name for item in dataclasses.fields(Friction))
@@ -44,7 +45,7 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
     """Write an identified machine as a machine file with a URDF file per sub-chain.
 
     `crane.load` reads it, with unlocked joints unless they are locked again:
-    `crane.load(crane.write_identified(identification, "identified"),
+    `crane.load(crane.identification.write_identified(identification, "identified"),
     lock=identification.described_machine.locked_joints)`.
 
     The parameters of a body are written to the link that its joint moves; inertials of links fixed

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_patch import (
     GridNode,
     WorkspacePatch,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_patch import last_closed_configuration
 from crane.motion.workspaces.workspace_result import SingularCurve, WorkspaceExtreme
 from crane.motion.workspaces.workspace_section import WorkspaceKinematics

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_count, as_seed
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces.covered_triangles import covered_triangles
 from crane.motion.workspaces.singular_curves import branch_edges, patch_curves, singular_curves

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from crane.common.errors import ClosureError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 GridNode = tuple[int, int]
 _GRID_DIRECTIONS: tuple[GridNode, ...] = ((1, 0), (-1, 0), (0, 1), (0, -1))

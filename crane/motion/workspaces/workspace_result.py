@@ -10,7 +10,7 @@ from scipy.ndimage import binary_closing
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.result import Result
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_patch import WorkspacePatch
 from crane.motion.workspaces.workspace_section import WorkspaceSection
 from crane.recordings.timeseries import Table, write_table

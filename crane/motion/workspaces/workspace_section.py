@@ -8,7 +8,7 @@ import pinocchio as pin
 from crane.closure.active_joint_selection import condition_number
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 
 _FLATNESS_TOLERANCE = 1e-7  # relative to the extent

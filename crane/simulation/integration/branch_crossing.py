@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 NODES_BEFORE = 7  # nodes before the crossing
 STEPS_BEFORE, STEPS_BEHIND = 2, 4  # steps from the last node to the crossing, and from there

@@ -9,7 +9,8 @@ import numpy as np
 from crane.codegen import Scalar, Tape
 from crane.common.samples import Array
 from crane.common.threads import single_threaded_blas
-from crane.control import Controller, ControllerInputs, TracedController, ValveDrive
+from crane.control.control_law import Controller, ControllerInputs, TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.branch_crossing import (
     MAX_MOTION_PER_STEP,
     MAX_RELATIVE_RANK,

@@ -23,9 +23,10 @@ from crane.codegen import Layout
 from crane.codegen.symbolic import Scalar, SymbolicExpression, dot
 from crane.common.errors import ClosureError, InputError, MechanismError
 from crane.common.samples import Array
-from crane.control import Controller, ValveDrive
+from crane.control.control_law import Controller
+from crane.control.valve_drive import ValveDrive
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import (
     ExternalForces,
     ExternalForceValues,
@@ -33,7 +34,7 @@ from crane.dynamics.external_forces import (
     state_count,
 )
 from crane.dynamics.joint_forces import find_stick_slip_columns
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
 MAX_GAMMA_ENTRY = 5.0  # entry of gamma in coordinate units from which another chart is sought

@@ -24,9 +24,10 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control import TracedController, ValveDrive
+from crane.control.control_law import TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
 from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations

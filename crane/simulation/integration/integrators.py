@@ -9,7 +9,8 @@ import numpy as np
 from crane.codegen import FormulaTooLongError
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.control import Controller, TracedController, ValveDrive
+from crane.control.control_law import Controller, TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     MAX_REFERENCE_SPACING,

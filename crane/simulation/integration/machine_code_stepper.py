@@ -12,7 +12,7 @@ from crane.codegen import (
 )
 from crane.codegen.intermediate_representation import ArrayPointer, Routine
 from crane.common.samples import Array
-from crane.control import ControllerInputs, TracedController
+from crane.control.control_law import ControllerInputs, TracedController
 from crane.dynamics import external_forces
 from crane.simulation.integration.charts import Chart, output_layout, state_layout
 from crane.simulation.integration.machine_formulas import (

@@ -20,10 +20,11 @@ from crane.codegen.differentiation import differentiate
 from crane.codegen.symbolic import add_vectors, dot, subtract_vectors
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control import ControllerInputs, TracedController, ValveDrive
+from crane.control.control_law import ControllerInputs, TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.dynamics import external_forces
 from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart
 
 AT_REST_SUFFIX = "_rest"  # of formulas for machines with joints at rest

@@ -7,8 +7,9 @@ import numpy as np
 from crane.codegen import LayoutView
 from crane.common.errors import ClosureError, InputError, SimulationError
 from crane.common.samples import Array
-from crane.control import Controller, ValveDrive
-from crane.machine import Machine
+from crane.control.control_law import Controller
+from crane.control.valve_drive import ValveDrive
+from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_tolerances
 from crane.motion.trajectory import Trajectory
 from crane.simulation.integration.charts import Chart, state_layout

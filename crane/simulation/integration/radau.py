@@ -18,7 +18,7 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control import TracedController
+from crane.control.control_law import TracedController
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     ErrorControlledStepper,

@@ -18,7 +18,8 @@ from crane.codegen.symbolic import (
     scale_vector,
     subtract_vectors,
 )
-from crane.control import TracedController, ValveDrive
+from crane.control.control_law import TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (

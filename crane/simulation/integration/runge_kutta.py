@@ -7,7 +7,7 @@ from crane.codegen import Program, Scalar, Tape, max_abs, maximum
 from crane.codegen.intermediate_representation import Routine
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
-from crane.control import TracedController
+from crane.control.control_law import TracedController
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_code_stepper import (
     MachineCodeStepper,

@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control import Controller
+from crane.control.control_law import Controller
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress

@@ -19,12 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.closure import Closure
+from crane.closure.closure import Closure
 from crane.closure.constraint_structure import Indices
 from crane.common.samples import Array
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_forces import REST_VELOCITY
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 # accuracy of located events; see `StickSlipAccelerations.transition_margin`
 EVENT_TOLERANCE = 1e-10

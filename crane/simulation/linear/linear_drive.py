@@ -9,11 +9,14 @@ from crane.codegen import Program, Scalar, SymbolicExpression, Tape
 from crane.codegen.differentiation import differentiate
 from crane.codegen.symbolic import subtract_vectors
 from crane.common.samples import Array
-from crane.control import ControllerInputs, ValveDrive, ValveSignals
-from crane.dynamics import Dynamics, JointForces
+from crane.control.control_law import ControllerInputs
+from crane.control.valve_commands import ValveSignals
+from crane.control.valve_drive import ValveDrive
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_force_formulas import friction_sign
+from crane.dynamics.joint_forces import JointForces
 from crane.hydraulics.circuit_states import BALANCE_UNITS
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.integration.machine_formulas import controller_settings
 

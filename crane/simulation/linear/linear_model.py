@@ -15,7 +15,7 @@ from crane.common.one_line_repr import format_count, shorten_to_line
 from crane.common.optional_libraries import import_optional_library
 from crane.common.result import Result
 from crane.common.samples import Array, as_sample
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 _FRAMES_PER_SECOND = 50  # of mode animations

@@ -12,11 +12,10 @@ from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_samples
 from crane.description.machine_parameters import unknown_parameter_text
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import ExternalForces
-from crane.formats import load
-from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
+from crane.formats.machine_loading import MachineVariants, load
+from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.simulation.linear.linear_drive import LinearizedDrive
 from crane.simulation.linear.linear_model import LinearModel

@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.errors import CraneWarning, SimulationError
 from crane.common.samples import Array
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.linear.linear_drive import LinearizedDrive
 

@@ -13,9 +13,10 @@ from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
-from crane.control import Controller, ValveCommand
+from crane.control.control_law import Controller
+from crane.control.valve_commands import ValveCommand
 from crane.description.sensors import VELOCITY_SUFFIX
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.simulation.recorded_run import read_simulation
 from crane.simulation.sensitivity.adjoint_integration import AdjointIntegrator

@@ -15,7 +15,9 @@ from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.control import Controller, TracedController, ValveCommand, ValveDrive
+from crane.control.control_law import Controller, TracedController
+from crane.control.valve_commands import ValveCommand
+from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import (
     FORCE_SUFFIX,
     FORCE_UNITS,
@@ -23,9 +25,9 @@ from crane.description.sensors import (
     VELOCITY_SUFFIX,
     VELOCITY_UNITS,
 )
-from crane.dynamics import Dynamics
-from crane.formats import load
-from crane.machine import Machine
+from crane.dynamics.dynamics import Dynamics
+from crane.formats.machine_loading import load
+from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table

@@ -20,10 +20,11 @@ from crane.codegen.symbolic import (
 )
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control import TracedController, ValveDrive
+from crane.control.control_law import TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.external_forces import reference_counts
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart, state_layout
 from crane.simulation.integration.machine_formulas import (
     AT_REST_SUFFIX,

@@ -8,8 +8,9 @@ import numpy as np
 from crane.closure.constraint_structure import Indices
 from crane.common.errors import InputError, SimulationError
 from crane.common.samples import Array
-from crane.control import TracedController, ValveDrive
-from crane.dynamics import Dynamics
+from crane.control.control_law import TracedController
+from crane.control.valve_drive import ValveDrive
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
 from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.stick_slip_modes import StickSlipTransition

@@ -9,11 +9,12 @@ import numpy as np
 from crane.closure.kinematics_formulas import tree_geometry
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.control import TracedController, ValveDrive
+from crane.control.control_law import TracedController
+from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import VELOCITY_SUFFIX
-from crane.dynamics import Dynamics
 from crane.dynamics.constant_derivatives import UNIT_OF_ZERO_PARAMETER, ConstantDerivatives
-from crane.machine import Machine
+from crane.dynamics.dynamics import Dynamics
+from crane.machine.machine import Machine
 from crane.simulation.integration.machine_formulas import reference_samples
 
 FRAME_SIZE = 6  # numbers of a frame

@@ -11,8 +11,9 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_seed
 from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.ratings.rating_rules import Rule, find_rule
+from crane.studies.measures import stroke_measures, task_measures
 from crane.studies.optimization.design_problem import DesignJob, DesignProblem, solve_design_job
 from crane.studies.optimization.design_result import Design, DesignSolution
 from crane.studies.optimization.measure_expressions import (
@@ -28,7 +29,6 @@ from crane.studies.optimization.variant_measures import (
     check_unique_names,
     load_positions,
 )
-from crane.studies.measures import stroke_measures, task_measures
 from crane.studies.parallel_jobs import check_process_count, compute_jobs, machine_from_files
 
 

@@ -10,8 +10,7 @@ from scipy.optimize import minimize
 
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array
-from crane.formats import load
-from crane.formats.machine_loading import MachineVariants
+from crane.formats.machine_loading import MachineVariants, load
 from crane.ratings.rating_rules import Rule
 from crane.studies.optimization.design_result import DesignSolution
 from crane.studies.optimization.measure_expressions import (

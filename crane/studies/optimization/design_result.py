@@ -9,8 +9,8 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
-from crane.ratings import Capacity, capacity
+from crane.machine.machine import Machine
+from crane.ratings.lifting_capacity import Capacity, capacity
 from crane.recordings.timeseries import Table, write_table
 from crane.studies.optimization.variant_measures import MeasureOptions
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 
 @dataclass(frozen=True, eq=False)

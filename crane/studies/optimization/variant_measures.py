@@ -10,14 +10,21 @@ from scipy.optimize import minimize
 
 from crane.common.errors import CraneError, InputError, suggest_names
 from crane.common.samples import Array
-from crane.dynamics import Dynamics
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.statics import StaticsEvaluator
 from crane.formats.machine_loading import MachineVariants
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import up_direction
-from crane.ratings import capacity, torques
 from crane.ratings.configuration_search import ConfigurationSearch
+from crane.ratings.lifting_capacity import capacity, torques
 from crane.ratings.rating_rules import Rule
+from crane.studies.measures import (
+    combine_task_measures,
+    measure_strokes,
+    measure_task,
+    stroke_measures,
+    task_measures,
+)
 from crane.studies.optimization.measure_expressions import (
     DUAL_FUNCTIONS,
     DualNumber,
@@ -25,13 +32,6 @@ from crane.studies.optimization.measure_expressions import (
     MeasureFunction,
     constant,
     evaluate_user_measure,
-)
-from crane.studies.measures import (
-    combine_task_measures,
-    measure_strokes,
-    measure_task,
-    stroke_measures,
-    task_measures,
 )
 
 _DIFFERENCE_STEP = 1e-4  # share of a parameter's range

@@ -11,7 +11,7 @@ import numpy as np
 from crane.common.errors import CraneError
 from crane.common.samples import Array
 from crane.common.units import format_quantity
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS
 from crane.view.live.live_scene import LiveScene

@@ -14,8 +14,9 @@ from crane.common.errors import (
     suggest_names,
 )
 from crane.common.samples import Array, as_number
-from crane.dynamics import Dynamics
-from crane.machine import Machine, Payload
+from crane.dynamics.dynamics import Dynamics
+from crane.machine.machine import Machine
+from crane.machine.payload import Payload
 from crane.motion.kinematics import Kinematics
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS

@@ -11,9 +11,9 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.ratings import Capacity
 from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
+from crane.ratings.lifting_capacity import Capacity
 from crane.view.page.html_document import check_page_suffix, write_page
 from crane.view.plots.capacity_figure import (
     capacity_heading,

@@ -7,7 +7,7 @@ import numpy as np
 from crane.common.samples import Array
 from crane.description.specification import ForceElement, GasSpring
 from crane.dynamics.frame_jacobians import FrameDistances
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.view.page.machine_visuals import largest_body_extent
 from crane.view.page.page_motion import frame_data, pack_base64

@@ -17,7 +17,7 @@ from crane.formats.visuals.urdf_shapes import (
     Visual,
     read_shapes,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _MAX_ROD_STROKE_RATIO = (
     3.0  # largest distances on one body, the longest stroke that is drawn as a rod

@@ -14,7 +14,7 @@ import numpy as np
 from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks, release_pages
 from crane.common.units import display_unit
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import (
     FORCE_UNITS,
     REFERENCE_PREFIX,

@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 
 _LEVELS = 2**32 - 1

@@ -10,7 +10,7 @@ from string import Template
 from typing import Any
 
 from crane.common.errors import RecordingError
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import (
     clock_shift,

@@ -7,7 +7,7 @@ import numpy as np
 from crane.common.samples import Array
 from crane.common.scratch_arrays import compute_in_blocks
 from crane.common.units import format_number, format_quantity
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS, Recording
 from crane.recordings.recording_summary import DISPLAY_UNITS, summarize
 

@@ -16,7 +16,7 @@ from crane.formats.visuals.urdf_shapes import (
     SphereShape,
     Visual,
 )
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.view.page.machine_visuals import read_visuals
 from crane.view.page.page_motion import frame_rows, recorded_configurations

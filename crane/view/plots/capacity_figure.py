@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.ratings import Capacity
 from crane.ratings.capacity_report import slew_labels
+from crane.ratings.lifting_capacity import Capacity
 from crane.recordings.recording_summary import result_title
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from crane.ratings import Capacity
 from crane.ratings.capacity_report import (
     LoadTable,
     capacity_facts,
@@ -16,6 +15,7 @@ from crane.ratings.capacity_report import (
     slew_labels,
     table_note,
 )
+from crane.ratings.lifting_capacity import Capacity
 from crane.view.plots.capacity_figure import (
     capacity_heading,
     draw_capacity_panel,

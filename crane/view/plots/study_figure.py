@@ -12,7 +12,7 @@ from scipy.stats import rankdata
 
 from crane.common.samples import Array
 from crane.recordings.recording_summary import result_title
-from crane.studies import Study
+from crane.studies.study_table import Study
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import (
     DASHED_STYLE,

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import WorkspaceSection, up_direction
 from crane.view.sketches.sketch_canvas import convex_hull
 from crane.view.sketches.sketch_elements import (

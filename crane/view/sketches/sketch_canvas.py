@@ -14,7 +14,7 @@ from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.recordings.recording_summary import DISPLAY_UNITS
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import INK_COLOUR

@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.machine import Machine
+from crane.machine.machine import Machine
 
 _PARALLEL_TOLERANCE = 1e-6  # deviation of unit vectors that count as parallel
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from crane.common.errors import InputError
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.hydraulic_circuit import Hydraulics
-from crane.machine import Machine
+from crane.machine.machine import Machine
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
 from crane.view.sketches.circuit import circuit_section

@@ -1,0 +1,11 @@
+from .additions.cylinder_addition import add_cylinder as add_cylinder
+from .additions.loop_addition import add_loops as add_loops
+from .checks.check_report import check as check
+from .home_writer import write_home as write_home
+from .machine_file.machine_reader import read_machine_spec as read_machine_spec
+from .machine_file.machine_writer import write_machine as write_machine
+from .machine_loading import load as load
+from .machine_loading import load_from_expression as load_from_expression
+from .mjcf.mjcf_writer import write_mjcf as write_mjcf
+from .urdf.urdf_writer import robot_description as robot_description
+from .urdf.urdf_writer import write_urdf_plus as write_urdf_plus

@@ -1,0 +1,13 @@
+from .circuit_elements import Accumulator as Accumulator
+from .circuit_elements import CircuitElement as CircuitElement
+from .circuit_elements import CircuitLine as CircuitLine
+from .circuit_elements import Engine as Engine
+from .circuit_elements import Supply as Supply
+from .components import CounterbalanceValve as CounterbalanceValve
+from .components import Cylinder as Cylinder
+from .components import OpeningCurve as OpeningCurve
+from .components import Spool as Spool
+from .components import Valve as Valve
+from .hydraulic_circuit import Hydraulics as Hydraulics
+from .hydraulic_circuit import Oil as Oil
+from .hydraulic_circuit import PDGains as PDGains

@@ -1,0 +1,16 @@
+from .calibration.calibrate import calibrate as calibrate
+from .calibration.calibration_result import Calibration as Calibration
+from .excitation.periodic_excitation import Excitation as Excitation
+from .excitation.periodic_excitation import excite as excite
+from .excitation.signal_excitation import SignalExcitation as SignalExcitation
+from .excitation.signal_excitation import excite_valves as excite_valves
+from .hydraulics.cylinder_friction import identify_cylinder_friction as identify_cylinder_friction
+from .hydraulics.orifice_coefficients import identify_orifices as identify_orifices
+from .hydraulics.valve_curve import identify_valve as identify_valve
+from .mechanics.cross_validation import cross_validate as cross_validate
+from .mechanics.identification_model import IdentificationModel as IdentificationModel
+from .mechanics.identification_result import Identification as Identification
+from .mechanics.identify import identify as identify
+from .mechanics.identify_payload import identify_payload as identify_payload
+from .mechanics.model_term import ModelTerm as ModelTerm
+from .mechanics.write_identified import write_identified as write_identified

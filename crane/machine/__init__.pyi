@@ -1,0 +1,2 @@
+from .machine import Machine as Machine
+from .payload import Payload as Payload

@@ -1,0 +1,12 @@
+from .breakout_forces import Breakout as Breakout
+from .breakout_forces import breakout as breakout
+from .lifting_capacity import Capacity as Capacity
+from .lifting_capacity import Torques as Torques
+from .lifting_capacity import capacity as capacity
+from .lifting_capacity import torques as torques
+from .rating_rules import RULES as RULES
+from .rating_rules import Rule as Rule
+from .tool_forces import ToolForce as ToolForce
+from .tool_forces import tool_force as tool_force
+from .working_ranges import WorkingRange as WorkingRange
+from .working_ranges import working_range as working_range

@@ -1,0 +1,3 @@
+from .limit_cycle_detection import limit_cycles as limit_cycles
+from .measured_recordings import read_measured as read_measured
+from .recording import Recording as Recording

@@ -1,0 +1,14 @@
+from .batch import Batch as Batch
+from .batch import simulate_batch as simulate_batch
+from .casadi_functions import casadi_function as casadi_function
+from .linear.linear_model import LinearModel as LinearModel
+from .linear.linearization import linear_models as linear_models
+from .linear.linearization import linearize as linearize
+from .recorded_run import InterruptedRun as InterruptedRun
+from .recording_replay import Comparison as Comparison
+from .recording_replay import replay as replay
+from .sensitivity.motion_gradient import Gradient as Gradient
+from .sensitivity.motion_gradient import gradient as gradient
+from .sensitivity.motion_sensitivities import Sensitivities as Sensitivities
+from .sensitivity.motion_sensitivities import sensitivities as sensitivities
+from .simulation_run import simulate as simulate

@@ -1,0 +1,10 @@
+from .hydraulic_power_balance import power_balance as power_balance
+from .optimization.design_optimization import design as design
+from .optimization.design_result import Design as Design
+from .power_balance_result import PowerBalance as PowerBalance
+from .power_balance_result import PowerComparison as PowerComparison
+from .residual_sway_study import SwayStudy as SwayStudy
+from .residual_sway_study import sway_study as sway_study
+from .study_table import Study as Study
+from .task_tipping_load import tipping_load as tipping_load
+from .variant_study import study as study
