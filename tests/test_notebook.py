@@ -287,6 +287,7 @@ def instances(mini, run):
         crane.motion.Sway(grapple),
         crane.control.TipVelocity(patu, lambda t: np.zeros(3)),
         crane.motion.Transmission(mini),
+        crane.control.ZeroForce(mini),
         crane.ratings.Torques("X", "q", 1e4, 0.1, 5.0, 300.0, 1.0, 1.5e4, 1e4),
         crane.control.ValveDrive(patu, pd),
         crane.control.ValveFeedforward(patu, swing),

@@ -2,6 +2,11 @@ from .external_forces import ExternalForce as ExternalForce
 from .external_forces import PhasedWrench as PhasedWrench
 from .external_forces import Wrench as Wrench
 from .external_forces import WrenchFunction as WrenchFunction
+from .force_elements import EndStop as EndStop
+from .force_elements import ForceElement as ForceElement
+from .force_elements import Friction as Friction
+from .force_elements import GasSpring as GasSpring
+from .force_elements import Rope as Rope
 from .ground_contact import Contact as Contact
 from .ground_contact import Ground as Ground
 from .machine_lookup import bundled_machines as bundled_machines
@@ -11,12 +16,7 @@ from .sensors import Sensor as Sensor
 from .soil_cutting import SOILS as SOILS
 from .soil_cutting import Soil as Soil
 from .soil_cutting import SoilCutting as SoilCutting
-from .specification import EndStop as EndStop
-from .specification import ForceElement as ForceElement
-from .specification import Friction as Friction
-from .specification import GasSpring as GasSpring
 from .specification import MachineSpec as MachineSpec
 from .specification import PIGains as PIGains
-from .specification import Rope as Rope
 from .specification import Task as Task
 from .task_phases import Phase as Phase

@@ -6,19 +6,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
+from crane.description.force_elements import AnyForceElement, EndStop, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.machine_lookup import bundled_machines, command_line_arguments
 from crane.description.sensors import (
     sensor_parameters,
 )
-from crane.description.specification import (
-    AnyForceElement,
-    Chain,
-    EndStop,
-    Friction,
-    MachineSpec,
-    PIGains,
-)
+from crane.description.specification import Chain, MachineSpec, PIGains
 from crane.hydraulics.circuit_elements import parameter_names
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 

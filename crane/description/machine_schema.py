@@ -3,6 +3,7 @@
 from crane.description.circuit_schema import HYDRAULICS
 from crane.description.external_force_schema import CONTACT, CUTTER, GROUND, LOAD, SOIL, TASK_LOAD
 from crane.description.floating_bases import FLOATING_FREEDOMS
+from crane.description.force_elements import EndStop, ForceElement, Friction, GasSpring, Rope
 from crane.description.key_types import (
     REQUIRED,
     FileKey,
@@ -18,17 +19,7 @@ from crane.description.key_types import (
     section_schema,
 )
 from crane.description.sensors import Sensor
-from crane.description.specification import (
-    DEFAULT_RAMP_TIME,
-    LOOP_TYPES,
-    TIP_COORDINATES,
-    EndStop,
-    ForceElement,
-    Friction,
-    GasSpring,
-    PIGains,
-    Rope,
-)
+from crane.description.specification import DEFAULT_RAMP_TIME, LOOP_TYPES, TIP_COORDINATES, PIGains
 
 ALL_ITEM = "all"  # an item whose keys hold for all items beside it
 EXTENDS_KEY = "extends"  # the key that names the file a machine file is a variant of

@@ -13,6 +13,7 @@ from crane.common.plausible_ranges import implausible_value_text
 from crane.common.samples import MAX_COORDINATE, as_number
 from crane.description.external_forces import ExternalForce
 from crane.description.floating_bases import convert_locked_rotations
+from crane.description.force_elements import AnyForceElement, Friction
 from crane.description.kinematic_tree import Joint, Limits, Link, parse_limit
 from crane.description.machine_parameters import (
     PAYLOAD_MASS,
@@ -30,14 +31,7 @@ from crane.description.sensors import (
     quantity_unit,
     with_sensor_parameters,
 )
-from crane.description.specification import (
-    AnyForceElement,
-    Coupling,
-    Drive,
-    Friction,
-    MachineSpec,
-    Task,
-)
+from crane.description.specification import Coupling, Drive, MachineSpec, Task
 
 _LIMIT_TOLERANCE = 1e-9  # relative to a limit, for rounding
 

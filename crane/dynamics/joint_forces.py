@@ -9,7 +9,7 @@ from collections import Counter
 import numpy as np
 
 from crane.common.samples import Array
-from crane.description.specification import ForceElement, Friction, GasSpring, Rope
+from crane.description.force_elements import ForceElement, Friction, GasSpring, Rope
 from crane.dynamics.frame_jacobians import FrameDistances, FramePair
 from crane.machine.machine import Machine
 

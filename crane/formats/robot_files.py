@@ -21,7 +21,7 @@ from crane.common.errors import (
 )
 from crane.common.optional_libraries import installation_hint
 from crane.common.package_search import OWN_ARGUMENTS, load_options, use_load_options
-from crane.description.specification import ForceElement
+from crane.description.force_elements import ForceElement
 from crane.formats import xacro_process
 from crane.formats.xml_file import SourceLocations, XmlFile
 from crane.machine.machine import Machine

@@ -22,6 +22,14 @@ from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
 from crane.description.estimation_settings import EstimationSettings
 from crane.description.external_forces import ExternalForce, PhasedWrench
+from crane.description.force_elements import (
+    AnyForceElement,
+    EndStop,
+    ForceElement,
+    Friction,
+    GasSpring,
+    Rope,
+)
 from crane.description.kinematic_tree import Tree
 from crane.description.machine_lookup import (
     CHANGES_SEPARATOR,
@@ -31,18 +39,7 @@ from crane.description.machine_lookup import (
 )
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.description.sensors import Sensor
-from crane.description.specification import (
-    AnyForceElement,
-    Chain,
-    Drive,
-    EndStop,
-    ForceElement,
-    Friction,
-    GasSpring,
-    PIGains,
-    Rope,
-    Task,
-)
+from crane.description.specification import Chain, Drive, PIGains, Task
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
 from crane.machine.payload import Payload
@@ -231,10 +228,9 @@ class Machine(OneLineRepr):
     def command_line_arguments(self) -> str:
         """Command line arguments that load this machine again, quoted for a shell."""
         load_options = LoadOptions(self.packages, self.arguments, bool(self.floating_base))
-        active, free = self.chosen_joints.get("active"), self.chosen_joints.get("free")
-        return command_line_arguments(
-            self.load_name, active, free, self.parameter_changes, self.locked_joints, load_options
-        )
+        active, free = map(self.chosen_joints.get, ("active", "free"))
+        changed = self.parameter_changes, self.locked_joints
+        return command_line_arguments(self.load_name, active, free, *changed, load_options)
 
     @property
     def coordinates(self) -> Coordinates:
@@ -389,15 +385,14 @@ class Machine(OneLineRepr):
             arguments = self.model, equations.loops, names, home, equations.couplings
             closure = Closure(*arguments, keep_revolutions=keep_revolutions)
         same = set(names) == set(self.active)
+        tasks = {key: x for key, x in self.tasks.items() if same or x.space == "tip"}
         return dataclasses.replace(
             self,
             closure=closure,
             active=names,
             lower=read_only_copy(self.coordinates.lower[closure.active]),
             upper=read_only_copy(self.coordinates.upper[closure.active]),
-            tasks=MappingProxyType(
-                {key: task for key, task in self.tasks.items() if same or task.space == "tip"}
-            ),
+            tasks=MappingProxyType(tasks),
             control=self.control if same else MappingProxyType({}),
             hydraulics=self.hydraulics and self.hydraulics.select_joints(names),
             free=tuple(name for name in names if name in self.free),

@@ -16,6 +16,7 @@ from crane.closure.loop_equations import frame_id
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.samples import Array
 from crane.description.findings import is_strict, report_error
+from crane.description.force_elements import AnyForceElement, GasSpring, element_name
 from crane.description.inertia_feasibility import (
     InertiaProblem,
     format_inertia,
@@ -23,7 +24,7 @@ from crane.description.inertia_feasibility import (
     nearest_inertia,
 )
 from crane.description.kinematic_tree import Joint, Link
-from crane.description.specification import AnyForceElement, GasSpring, MachineSpec, element_name
+from crane.description.specification import MachineSpec
 from crane.machine.machine_assembly import assemble_tree
 
 _DEFINITE_TOLERANCE = 1e-12  # least eigenvalue of M_A scaled to unit diagonal

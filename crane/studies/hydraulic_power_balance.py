@@ -9,8 +9,8 @@ from crane.common.errors import RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.control.valve_commands import ValveSignals
 from crane.control.valve_drive import ValveDrive
+from crane.description.force_elements import Friction
 from crane.description.sensors import VELOCITY_SUFFIX
-from crane.description.specification import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Engine
 from crane.hydraulics.circuit_equations import CircuitEquations

@@ -3,7 +3,7 @@
 import warnings
 
 from crane.common.errors import CraneWarning
-from crane.description.specification import (
+from crane.description.force_elements import (
     EndStop,
     ForceElement,
     Friction,

@@ -19,6 +19,7 @@ from crane.description.circuit_schema import (
     SPOOL,
     VALVE,
 )
+from crane.description.force_elements import Friction
 from crane.description.key_types import REQUIRED
 from crane.description.machine_schema import (
     COUPLING,
@@ -30,7 +31,7 @@ from crane.description.machine_schema import (
     VIA_POINT,
 )
 from crane.description.sensors import quantity_unit
-from crane.description.specification import Friction, Task
+from crane.description.specification import Task
 from crane.formats.machine_file.estimation_section import estimation_data
 from crane.formats.machine_file.external_force_sections import external_force_data, load_data
 from crane.formats.machine_file.flow_curves import curve_data

@@ -6,14 +6,13 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.floating_bases import FLOATING_FREEDOMS, check_freedoms
+from crane.description.force_elements import ForceElement, Friction
 from crane.description.specification import (
     AXISLESS_TYPES,
     LOOP_TYPES,
     Chain,
     Coupling,
     Drive,
-    ForceElement,
-    Friction,
     LoopSpec,
     unit_vector,
 )

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from crane.description.specification import Drive, ForceElement, Friction, Rope
+from crane.description.force_elements import ForceElement, Friction, Rope
+from crane.description.specification import Drive
 from crane.formats.mjcf.mujoco_file import MujocoFile, nonzero_rows
 
 _TENDON_FIELDS = {  # fields of tendons by the feature that they define

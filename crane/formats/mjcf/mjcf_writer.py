@@ -10,14 +10,8 @@ from lxml import etree
 
 from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
-from crane.description.specification import (
-    Coupling,
-    Drive,
-    ForceElement,
-    LoopSpec,
-    Rope,
-    element_name,
-)
+from crane.description.force_elements import ForceElement, Rope, element_name
+from crane.description.specification import Coupling, Drive, LoopSpec
 from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
 from crane.formats.urdf_elements import finite_limits, format_numbers
 from crane.formats.urdf_output import format_document, origin_text, solve_coupling

@@ -9,13 +9,13 @@ from scipy.interpolate import CubicSpline
 
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
+from crane.description.force_elements import Friction
 from crane.description.sensors import (
     SENSOR_PREFIX,
     VALVE_SIGNAL_PREFIX,
     Sensor,
     with_sensor_parameters,
 )
-from crane.description.specification import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants

@@ -270,12 +270,8 @@ def excite(
     random_motions = _random_motions(model, bounds, 2 * np.pi / period * harmonics)
     information = FisherInformation(model, base, deviation, force, random_motions, prior)
     count = periods * period / step
-    smooth_information = FisherInformation(
-        smooth_model, base, deviation, force, random_motions, prior
-    )
-    search = TrajectoryOptimizer(
-        smooth_information, bounds, period, harmonics, count, CRITERIA[criterion]
-    )
+    smooth = FisherInformation(smooth_model, base, deviation, force, random_motions, prior)
+    search = TrajectoryOptimizer(smooth, bounds, period, harmonics, count, CRITERIA[criterion])
     draws = search.random_references(np.random.default_rng(seed))
     best = _optimize_best(search, draws, starts, progress)
     initial_trajectory, trajectory = (

@@ -17,7 +17,7 @@ from crane.common.errors import InputError, RecordingError, suggest_names
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.description.specification import Friction
+from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation import estimators
 from crane.identification.estimation.regression_problem import Estimate, confidence_intervals

@@ -78,7 +78,7 @@ def feasible_estimate(
     # the triangular factors have the same column norms and products as the rows
     K = selection @ base.grouping
     W, y = (
-        np.vstack(list(equations.triangular_factors[:, :, :-1] @ K)),
+        equations.stacked_factors(K),
         equations.triangular_factors[:, :, -1].ravel(),
     )
     size = np.linalg.norm(y) / np.sqrt(len(equations.y))

@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.description.specification import Friction
+from crane.description.force_elements import Friction
 from crane.dynamics.joint_forces import JointForces
 from crane.identification.mechanics.model_term import (
     ForceDirection,

@@ -13,7 +13,7 @@ from lxml import etree
 from crane.common.atomic_output import portable_file_name
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.description.specification import Friction
+from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.visuals.mesh_files import find_mesh_file
 from crane.identification.mechanics.feasible_estimate import thicken_body

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
@@ -25,6 +24,7 @@ from crane.identification.mechanics.equation_setup import (
 from crane.identification.mechanics.feasible_estimate import feasible_estimate
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
 from crane.identification.mechanics.force_comparison import (
+    ForceComparison,
     check_forces,
     check_shared_samples,
     warn_delays,
@@ -115,9 +115,9 @@ def identify(
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
     model = IdentificationModel(machine, terms)
-    if feasible and not model.bodies:
-        raise InputError("the model has no bodies, so nothing has to be feasible")
     if feasible:
+        if not model.bodies:
+            raise InputError("the model has no bodies, so nothing has to be feasible")
         load_convex_solver()  # fail early
     final_progress, progress = progress, multi_pass_progress(progress)
     check_shared_samples(as_list(recording), as_list(validation), trust)
@@ -127,18 +127,15 @@ def identify(
         _check_forces(model, motions, equations, trust)
     selection = equations.column_selection(identifiable)
     columns = equations.projected_regressor(selection)
-    parameter_sizes = parameter_magnitudes(
-        model, identifiable, columns.triangular_factors(equations.y, equations.groups)
-    )
+    factors = columns.triangular_factors(equations.y, equations.groups)
+    parameter_sizes = parameter_magnitudes(model, identifiable, factors)
     known_prior = _build_prior(model, prior, equations.base, parameter_sizes, feasible)
     estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
     if known_prior is None:
         _check_mass_scale(machine, equations)
     elif not feasible:
         T = equations.base.grouping
-        check_identifiable(
-            model.names, np.vstack(list(equations.triangular_factors[:, :, :-1] @ T)), known_prior
-        )
+        check_identifiable(model.names, equations.stacked_factors(T), known_prior)
     start = equations.base.values(model.nominal)
     equations, estimate = equations.estimate(T, METHODS[method], estimator_prior, start)
     values, covariance, parameters = estimate.values, estimate.covariance, None
@@ -147,9 +144,7 @@ def identify(
             model, identifiable, equations, selection, estimate, known_prior
         )
     if feasible or known_prior is not None:
-        plain, scaled = condition_numbers(
-            np.vstack(list(equations.triangular_factors[:, :, :-1] @ selection))
-        )
+        plain, scaled = condition_numbers(equations.stacked_factors(selection))
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
         values = identifiable.values(parameters)
@@ -159,27 +154,15 @@ def identify(
         selection @ values if parameters is None else equations.base.values(parameters)
     )
     training, validation_comparison = equations.compare(predicting_values), None
-    base, bandwidth, slow_speeds, advice = (
-        equations.base,
-        equations.bandwidth,
-        equations.slow,
-        motion_advice(machine, motions),
-    )
+    base, bandwidth, slow_speeds = equations.base, equations.bandwidth, equations.slow
+    advice = motion_advice(machine, motions)
     speeds = speed_ranges(model, motions, slow_speeds)
     del equations, motions
     if validation is not None:
         validation_motions = prepare_motions(machine, validation, trust, progress, "validation")
-        long_motions = [
-            motion for motion in validation_motions if is_long_enough(motion, bandwidth)
-        ]
-        if long_motions:
-            held_out = RegressionEquations(
-                model, base, long_motions, bandwidth, slow_speeds, progress
-            )
-            if held_out.is_moving.any():
-                validation_comparison = held_out.compare(predicting_values)
-        if validation_comparison is None or len(long_motions) < len(validation_motions):
-            _warn_short_validations(validation_motions, long_motions, bandwidth)
+        validation_comparison = _compare_held_out(
+            model, base, validation_motions, bandwidth, slow_speeds, progress, predicting_values
+        )
         if validation_comparison is not None:
             warn_validation(training, validation_comparison)
     if final_progress is not None:
@@ -211,6 +194,27 @@ def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
         )
 
 
+def _compare_held_out(
+    model: IdentificationModel,
+    base: BaseParameters,
+    motions: Sequence[Motion],
+    bandwidth: float,
+    slow_speeds: Array,
+    progress: Progress | None,
+    values: Array,
+) -> ForceComparison | None:
+    """Compare held-out motions with the forces of base parameters; None if none is usable."""
+    long_motions = [motion for motion in motions if is_long_enough(motion, bandwidth)]
+    comparison = None
+    if long_motions:
+        held_out = RegressionEquations(model, base, long_motions, bandwidth, slow_speeds, progress)
+        if held_out.is_moving.any():
+            comparison = held_out.compare(values)
+    if comparison is None or len(long_motions) < len(motions):
+        _warn_short_validations(motions, long_motions, bandwidth)
+    return comparison
+
+
 def _warn_short_validations(
     motions: Sequence[Motion], long_motions: Sequence[Motion], bandwidth: float
 ) -> None:
@@ -222,7 +226,7 @@ def _warn_short_validations(
         if short_count
         else "no held-out recording moves faster than standstill, none is used"
     )
-    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
+    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=5)
 
 
 def _build_prior(

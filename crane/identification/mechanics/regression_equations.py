@@ -264,6 +264,10 @@ class RegressionEquations:
         _ = self.triangular_factors
         return (self.forces - self.offset)[self.is_moving]
 
+    def stacked_factors(self, T: Array) -> Array:
+        """Triangular factors (n p, k) of the regressor W T, stacked by joint."""
+        return np.vstack(list(self.triangular_factors[:, :, :-1] @ T))
+
     @cached_property
     def triangular_factors(self) -> Array:
         """Triangular factors (g, r + 1, r + 1) of [W y] of the used rows of each joint."""

@@ -14,9 +14,10 @@ from lxml import etree
 from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.samples import Array
+from crane.description.force_elements import Friction
 from crane.description.inertia_feasibility import inertia_problem
 from crane.description.parameter_changes import lock_joints
-from crane.description.specification import Chain, Friction, MachineSpec
+from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_file.machine_reader import read_machine_spec, read_plain_data
 from crane.formats.machine_file.machine_writer import friction_data

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from crane.common.samples import Array
-from crane.description.specification import ForceElement, GasSpring
+from crane.description.force_elements import ForceElement, GasSpring
 from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
