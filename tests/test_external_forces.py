@@ -215,7 +215,7 @@ def test_recorded_loads_are_known_to_identification(tmp_path):
         # q1 rests
         errors.append(found.validation.rmse[1:] / np.abs(without.tau).max(axis=0)[1:])
     assert errors[0].max() < 1e-4 and errors[1].max() > 0.2, errors
-    with pytest.raises(CraneError, match="has the load 'push', and no column tells"):
+    with pytest.raises(CraneError, match="has the load 'push', and no column contains it"):
         crane.identify(
             machine.with_external_forces(crane.Wrench(machine.tip, name="push")),
             without,
