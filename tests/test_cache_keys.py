@@ -342,21 +342,21 @@ EVERYTHING = """
 import json, sys, warnings
 import numpy as np
 import crane
-from crane.codegen.program_cache import Note
-from crane.common import cache
+from crane.codegen.program_cache import ProgramRecord
+from crane.common import file_cache
 warnings.simplefilter("ignore")
 crane.LOADED += 3600.0
 import test_cache_keys
-notes, write = {}, Note.write
+notes = {}
 for name in sys.argv[1:]:
-    machine = test_kept_keys.load(name)
+    machine = test_cache_keys.load(name)
     for formulation in ("exact", "decoupled"):
         dynamics = crane.Dynamics(machine, formulation)
         for quantity in ("inverse with friction", "forward", "observation", "regressor"):
             dynamics.backend_of(quantity)
     if machine.tip:
         tip = crane.Kinematics(machine)
-        tip._fast, tip._points
+        tip._compiled_frame, tip._compiled_point
     crane.simulate(machine, duration=0.002)
     for name, task in machine.tasks.items():
         if task.space == "joystick":
@@ -364,13 +364,13 @@ for name in sys.argv[1:]:
         else:
             reference = crane.task_trajectory(machine, name)
             controllers = [crane.ComputedTorque(machine, reference)]
-            usual = crane.control.usual(machine)
-            controllers.append(crane.control.controller(usual, machine, reference))
+            usual = crane.control.default_controller_name(machine)
+            controllers.append(crane.control.make_controller(usual, machine, reference))
         for controller in controllers:
             crane.simulate(machine, controller, duration=0.002)
-for file in sorted(cache.folder().glob("*.note")):
-    note = Note.read(file.name)
-    notes[file.name] = [note.code, note.longest, repr(note.functions)]
+for file in sorted(file_cache.cache_folder().glob("*.note")):
+    note = ProgramRecord.from_cache(file.name)
+    notes[file.name] = [note.code_name, note.max_formula_length, repr(note.signatures)]
 print(json.dumps(notes))
 """
 

@@ -242,7 +242,9 @@ class Shaped(crane.motion.Trajectory):
         return sum(x * self._base.position(np.asarray(time) - at) for at, x in self._impulses)
 
     def _derivative(self, order, time):
-        return sum(x * self._base._rate(order, np.asarray(time) - at) for at, x in self._impulses)
+        return sum(
+            x * self._base._derivative(order, np.asarray(time) - at) for at, x in self._impulses
+        )
 
     def breaks(self):
         return np.array([0.0, self.duration])

@@ -58,8 +58,9 @@ def casadi_function(
     | "simulation" | q, v_a, circuit, signals | rates of a machine with valves |
 
     "simulation" gives the rates q_rate (nq,), a_a (n,), circuit_rate of the states of
-    `crane.hydraulics.CircuitEquations` (`ValveDrive(machine, command).circuit.state_units` names
-    them, `start` of the drive returns those at rest) and balance_rate (6,) of the integrals
+    `crane.hydraulics.circuit_equations.CircuitEquations` (`state_units` of
+    `ValveDrive(machine, command).circuit` names them, `start` of the drive returns those at rest)
+    and balance_rate (6,) of the integrals
     `crane.hydraulics.circuit_states.BALANCE_UNITS`. `signals` are those of the valves [V].
 
     Args:
