@@ -514,7 +514,7 @@ def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     (second,) = quiet(
         crane.calibrate, again, log, fit, train=(0.5, 3.0), span=(0.5, 4.0)
     ).parameters
-    assert second.start == zero.value and abs(second.value - zero.value) < 0.1 * zero.interval
+    assert second.start == zero.value and abs(second.value - zero.value) < 0.1 * zero.interval_half_width
 
 
 def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
