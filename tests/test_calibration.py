@@ -411,7 +411,7 @@ def test_the_page_says_what_was_found(fitted, tmp_path):
     for one in found.parameters:
         assert cells[one.name][:3] == [one.unit, f"{one.start:.5g}", f"{one.value:.5g}"]
         assert f"--set {one.name}={one.value:.8g}" in page
-    assert "file value off by" in page and "0 to 4 s, the rest is held out" in page
+    assert "file value off by" in page and "0 to 4 s, the rest held out" in page
     for channel in found.channels:
         assert f"{channel.name}</code></td><td>" in page
         noise = 2e-4 if channel.name == "x" else 2e4
@@ -514,7 +514,10 @@ def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     (second,) = quiet(
         crane.calibrate, again, log, fit, train=(0.5, 3.0), span=(0.5, 4.0)
     ).parameters
-    assert second.start == zero.value and abs(second.value - zero.value) < 0.1 * zero.interval_half_width
+    assert (
+        second.start == zero.value
+        and abs(second.value - zero.value) < 0.1 * zero.interval_half_width
+    )
 
 
 def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):

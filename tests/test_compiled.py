@@ -291,7 +291,7 @@ def test_a_folded_region_is_told_apart_from_the_branch(five_bar):
     closed = 0
     for target in home + np.random.default_rng(2).uniform(-2.5, 2.5, (80, 2)):
         try:
-            wanted = branch.reach(target, branch.home).q
+            wanted = branch.continue_to(target, branch.home).q
         except CraneError as error:
             with pytest.raises(type(error)) as caught:
                 closure.solve(target)

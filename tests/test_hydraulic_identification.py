@@ -230,7 +230,7 @@ def test_rows_of_a_recording_are_made_once(machine, quick, method, monkeypatch):
     assert len(made) == 1
     (both,), alone = found.training_sides, found.predict(run)
     assert len(made) == 2
-    for name in ("time", "left", "right"):
+    for name in ("time", "predicted", "measured"):
         one, other = getattr(both, name), getattr(alone, name)
         assert np.abs(one - other).max() < 1e-12 * np.abs(other).max()
 
@@ -372,8 +372,8 @@ def one_way(quick, sense):
 
 @pytest.mark.parametrize(
     ("sense", "line"),
-    [(1, "c3 and c4 of 'boom' cannot be told: .*record retracting motion"),
-     (-1, "c1 and c2 of 'boom' cannot be told: .*record extending motion")],
+    [(1, "c3 and c4 of 'boom' cannot be determined: .*record retracting motion"),
+     (-1, "c1 and c2 of 'boom' cannot be determined: .*record extending motion")],
 )  # fmt: skip
 def test_one_direction_is_refused(machine, quick, sense, line):
     with pytest.raises(InputError, match=line):
@@ -389,7 +389,7 @@ def test_constant_pressures_do_not_tell_beta(machine, noise, method):
     p_a, p_b = np.full_like(time, 100e5), np.full_like(time, 60e5)
     v = 0.02 * np.sign(y)
     data = time, 0.1 + np.cumsum(v) * 2e-3, v, p_a, p_b, y
-    with pytest.raises(InputError, match="1/beta of 'boom' cannot be told: .*record faster"):
+    with pytest.raises(InputError, match="1/beta of 'boom' cannot be determined: .*record faster"):
         identify_orifices(machine, recorded(data, noise, np.random.default_rng(1)), "boom", method)
 
 
