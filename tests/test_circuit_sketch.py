@@ -168,7 +168,9 @@ def test_wires_of_two_nets_touch_nowhere_but_where_they_cross(drawings):
 
 def tapped(ink, point):
     """Whether the end of an open centre is there, and the signal before its throttle."""
-    return any(p.at == point and p.part.split()[0] in ("bypass", "throttle") for p in ink.ports)
+    return any(
+        p.position == point and p.component.split()[0] in ("bypass", "throttle") for p in ink.ports
+    )
 
 
 def pieces(ink, net):
@@ -179,11 +181,11 @@ def pieces(ink, net):
     def joined(one, other):
         for wires, ports in ((one, other), (other, one)):
             for wire in wires[0]:
-                ends = [p.at for p in ports[1]]
+                ends = [p.position for p in ports[1]]
                 ends += [at for w in ports[0] for at in (w.start, w.end)]
                 if any(wire.contains(at) for at in ends):
                     return True
-        return any(p.at == q.at for p in one[1] for q in other[1])
+        return any(p.position == q.position for p in one[1] for q in other[1])
 
     done = []
     for group in groups:
@@ -201,11 +203,14 @@ def test_every_net_hangs_together_and_joins_its_ports(drawings):
             groups = pieces(ink, net)
             if net == TANK_NODE:
                 for wires, ports in groups:
-                    assert wires and any(p.part.startswith("tank") for p in ports), (name, ports)
+                    assert wires and any(p.component.startswith("tank") for p in ports), (
+                        name,
+                        ports,
+                    )
             else:
                 assert len(groups) == 1, (name, net)
         for joint, valve in machine.hydraulics.valves.items():
-            ways = {(p.part, p.net) for p in ink.ports}
+            ways = {(p.component, p.net) for p in ink.ports}
             part = "compensator" if valve.margin else "metering" if valve.sharing else "valve"
             assert (f"{part} {joint}", valve.supply) in ways
             assert (f"valve {joint}", valve.return_a) in ways
@@ -217,7 +222,7 @@ def test_every_net_hangs_together_and_joins_its_ports(drawings):
 def test_wires_end_at_ports(drawings):
     """An end of a wire is at a port, on another piece, or it is the way to the right of a rail."""
     for name, (_, _, ink) in drawings.items():
-        ports = {(p.net, p.at) for p in ink.ports}
+        ports = {(p.net, p.position) for p in ink.ports}
         for wire in ink.wires:
             for at in (wire.start, wire.end):
                 on = any(w is not wire and w.net == wire.net and w.contains(at) for w in ink.wires)

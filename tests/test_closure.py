@@ -271,7 +271,7 @@ def test_far_samples_stay_on_the_branch_around_holes(five_bar):
     assert len(found) > 100 and missed < 0.03 * len(found)
     random = np.random.default_rng(15)
     for q, guess in random.choice(found, (150, 2)):
-        again = five_bar.closure.solve(q[five_bar.closure.active], guess=guess)
+        again = five_bar.closure.solve(q[five_bar.closure.active], initial_guess=guess)
         assert from_closed_form(five_bar, again) < 1e-7
     stack = five_bar.closure.solve(np.array(found)[:, five_bar.closure.active])
     assert max(from_closed_form(five_bar, q) for q in stack) < 1e-7

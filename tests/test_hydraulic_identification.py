@@ -780,7 +780,9 @@ def test_fast_speeds_tell_no_stiction(machine):
     assert found.names == ("coulomb", "coulomb_offset", "viscous")
     assert "Coulomb and viscous friction only" in found.note and found.note in found.to_text()
     np.testing.assert_allclose(found.values, [210, 25, 3300], rtol=0.02)
-    with pytest.raises(RecordingError, match="stiction of 'boom' cannot be told: speeds from"):
+    with pytest.raises(
+        RecordingError, match="stiction of 'boom' cannot be determined: speeds from"
+    ):
         identify_cylinder_friction(
             machine, strokes([0.02, 0.03, 0.045, 0.06], 0, None), "boom", stribeck=True
         )

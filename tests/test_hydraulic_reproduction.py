@@ -173,8 +173,8 @@ def test_torques_are_predicted(plant, motions, model):
     The seven miss 10 % of tau_2 and take most of it up.
     """
     found = mechanics.learned(plant.joints, motions["learn"], model)
-    left = mechanics.true_forces(plant.joints, motions["set 1"]).relative
-    judged = mechanics.judge(found, motions["set 1"]).relative
+    left = mechanics.true_forces(plant.joints, motions["set 1"]).relative_error
+    judged = mechanics.judge(found, motions["set 1"]).relative_error
     assert (left < [0.002, 0.004, 0.03]).all()
     assert (judged < 2.5 * left).all()
 
@@ -267,7 +267,11 @@ def test_friction_of_the_machine_as_published(tmp_path):
 
 def sets(machine):
     """The machine's changes as options."""
-    return [word for x, value in machine.changes.items() for word in ("--set", f"{x}={value!r}")]
+    return [
+        word
+        for x, value in machine.parameter_changes.items()
+        for word in ("--set", f"{x}={value!r}")
+    ]
 
 
 @pytest.fixture(scope="module")

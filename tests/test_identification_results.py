@@ -63,7 +63,7 @@ def same_forces(result, machine, q, v, a):
 
     def forces(q, v, a):
         at = result.model.samples(q, v, a)
-        return inertial.columns(at) @ bodies + result.model.known(at)
+        return inertial.columns(at) @ bodies + result.model.known_forces(at)
 
     bias = forces(q, v, 0 * a)
     M = np.stack([forces(q, v, np.eye(3)[i] + 0 * a) - bias for i in range(3)], axis=2)
@@ -276,7 +276,7 @@ def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
     assert counts[:3] == [3, found.base.rank, len(found.model.bodies)]
     shown = {code.text for code in tables[1].iter("code")}
     assert shown == set(found.names)
-    assert f"{100 * found.training.relative[1]:.3g} %" in bare
+    assert f"{100 * found.training.relative_error[1]:.3g} %" in bare
     assert "essential" in bare and "zero in interval" in bare
     section = tree.xpath("//h2[.='Unobservable parameters']/following-sibling::p")[0]
     unobservable = " ".join(section.itertext())
@@ -352,7 +352,11 @@ def test_no_load_can_be_told(mini):
             RecordingError,
             "'q1_force' is 986",
         ),
-        (lambda: identify_payload(mini, slewing), RecordingError, "this motion does not tell"),
+        (
+            lambda: identify_payload(mini, slewing),
+            RecordingError,
+            "this motion does not determine",
+        ),
     ):
         with pytest.raises(kind) as caught:
             call()

@@ -79,7 +79,7 @@ def torques(judged: Judged, measured: Array, title: str) -> Figure:
             axes.plot(judged.time, measured[:, i] / 1e3, **LIGHT)
             axes.plot(judged.time, judged.measured[:, i] / 1e3, color=RECORDED_COLOUR)
             axes.plot(judged.time, judged.modelled[:, i] / 1e3, **DASHED_STYLE)
-            share = f"relative error {100 * judged.relative[i]:.2g} %"
+            share = f"relative error {100 * judged.relative_error[i]:.2g} %"
             error = f"RMS error {judged.rmse[i]:.2g} {'N' if i == 2 else 'N m'}"
             axes.set_title(f"{error}, {share}", loc="left", fontsize=9)
             low, high = (f(judged.measured[:, i] / 1e3) for f in (np.min, np.max))

@@ -44,7 +44,7 @@ def requirements(found: Results) -> list[tuple[str, str, str, bool]]:
         ("(29) on the recording left out, the machine", "5 %", percent(worst), worst < 0.05)
     )
     for i, (signal, most) in enumerate(zip(SIGNALS, (0.01, 0.01, 0.05), strict=True)):
-        worst = max(one.relative[i] for one in found.judged["closed"].values())
+        worst = max(one.relative_error[i] for one in found.judged["closed"].values())
         what = f"{signal} of sets 1 and 2 by the identified crane"
         out.append((what, percent(most), percent(worst), worst <= most))
     curve = found.valves["X_ext"].parameter_intervals()

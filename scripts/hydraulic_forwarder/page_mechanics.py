@@ -24,7 +24,7 @@ def torques(found: Results) -> str:
         cells = [
             f"{e:.1f} ({percent(r)})"
             for x in (one, two)
-            for e, r in zip(x.rmse, x.relative, strict=True)
+            for e, r in zip(x.rmse, x.relative_error, strict=True)
         ]
         rows.append([text, *cells])
     head = [""] + [
