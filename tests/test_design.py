@@ -213,7 +213,7 @@ def test_dual_numbers_are_exact():
         }
         for i, (dx, dy) in enumerate(((step, 0), (0, step))):
             value = eval(text, numpy, {"x": x + 1j * dx, "y": y + 1j * dy})
-            assert found.slopes[i] == pytest.approx(value.imag / step, rel=1e-12)
+            assert found.derivatives[i] == pytest.approx(value.imag / step, rel=1e-12)
         assert found.value == pytest.approx(value.real, rel=1e-14)
 
 
