@@ -112,8 +112,7 @@ def follow_motion(
         ):
             raise ClosureError(
                 f"sample {k}: the motion does not go on to it, it is {deviation:.2g} of a way "
-                f"off: "
-                "record more samples, or see that zeros and signs are the machine's"
+                "off: record more samples, or see that zeros and signs are the machine's"
             )
         out[k] = q
     return out

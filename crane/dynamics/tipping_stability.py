@@ -95,8 +95,7 @@ class TippingStability:
         except (QhullError, ValueError):
             raise InputError(
                 f"'{machine.name}' has {len(support_list)} supports and no area between them, "
-                f"name three "
-                "that are not in one line"
+                "name three that are not in one line"
             ) from None
         around = [int(i) for i in hull.vertices]
         self.line_indices = list(zip(around, around[1:] + around[:1], strict=True))

@@ -282,9 +282,8 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     )
     return (
         f"friction of {', '.join(joints[:_MAX_NAMED_JOINTS])}{more} chatters in {count} of "
-        f"{len(time)} "
-        f"samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not follow its "
-        "smoothing, leave that out, so that it sticks, or shorten the step"
+        f"{len(time)} samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not "
+        "follow its smoothing, leave that out, so that it sticks, or shorten the step"
     )
 
 

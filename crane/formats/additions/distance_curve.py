@@ -287,8 +287,8 @@ def fit_to_joint_range(
     if distances.length.min() > LONGEST:
         raise InputError(
             f"'{points[0]}' and '{points[1]}' are {distances.length.min():.4g} m apart and "
-            f"more, farther "
-            f"than a machine is large: look at its units with crane check, lengths are metres"
+            "more, farther than a machine is large: look at its units with crane check, "
+            "lengths are metres"
         )
     length_text = f"{distances.length.min():.4g} to {distances.length.max():.4g} m"
     unit = machine.unit(distances.joint)
@@ -299,10 +299,8 @@ def fit_to_joint_range(
         lever_arm_hint = "with a lever arm " if fits.any() else ""
         raise InputError(
             f"a cylinder of {length_limits[0]:.4g} to {length_limits[1]:.4g} m does not fit "
-            f"{lever_arm_hint}between "
-            f"'{points[0]}' and '{points[1]}', {length_text} apart with {distances.joint} at "
-            f"{range_text}: choose "
-            "another stroke, dead length or eyes"
+            f"{lever_arm_hint}between '{points[0]}' and '{points[1]}', {length_text} apart with "
+            f"{distances.joint} at {range_text}: choose another stroke, dead length or eyes"
         )
     start_index, reached_distances = fit
     if any(reached_distances.values[k] != distances.values[k] for k in (0, -1)):
@@ -322,10 +320,9 @@ def fit_to_joint_range(
         if dead_centres or not is_unlimited:  # the stroke limits a joint without limits
             warnings.warn(
                 f"'{distances.joint}' moves from {range_text}, and a cylinder of "
-                f"{length_limits[0]:.4g} to "
-                f"{length_limits[1]:.4g} m drives it from {a:.4g} to {b:.4g}{dead_centre_text}: "
-                f"its eyes are {length_text} "
-                "apart over all of it, choose stroke, dead length or eyes by that",
+                f"{length_limits[0]:.4g} to {length_limits[1]:.4g} m drives it from {a:.4g} to "
+                f"{b:.4g}{dead_centre_text}: its eyes are {length_text} apart over all of it, "
+                "choose stroke, dead length or eyes by that",
                 CraneWarning,
                 stacklevel=4,
             )
@@ -348,9 +345,8 @@ def warn_about_masses(machine: Machine, cylinder: SteelCylinder, joint: str) -> 
     if mass < cylinder_mass:
         warnings.warn(
             f"the cylinder weighs {cylinder_mass:.4g} kg, and all that '{joint}' moves "
-            f"{mass:.3g} kg: "
-            "forces are little more than its own weight, give the bodies the masses of the real "
-            "machine",
+            f"{mass:.3g} kg: forces are little more than its own weight, give the bodies the "
+            "masses of the real machine",
             CraneWarning,
             stacklevel=4,
         )
@@ -370,8 +366,7 @@ def warn_about_strokes(machine: Machine, name: str) -> None:
     if unreachable:
         warnings.warn(
             f"the linkage does not close at {' and '.join(unreachable)} of the stroke of "
-            f"'{name}', "
-            "beyond its dead centre: choose another stroke, dead length or eyes",
+            f"'{name}', beyond its dead centre: choose another stroke, dead length or eyes",
             CraneWarning,
             stacklevel=4,
         )

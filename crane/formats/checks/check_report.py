@@ -288,6 +288,5 @@ def _machine_summary(spec: MachineSpec, closure: Closure) -> str:
     )
     return (
         f"{_replace_unprintable(spec.name)}: {joints} joints, {len(spec.loops)} loops, "
-        f"{mobility} degrees of "
-        f"freedom, {elements_text}loops closed to {residual:.1e} m at home"
+        f"{mobility} degrees of freedom, {elements_text}loops closed to {residual:.1e} m at home"
     )

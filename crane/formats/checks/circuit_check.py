@@ -132,8 +132,7 @@ def _pump_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
                 key,
                 f"'{name}' follows its loads so closely that it drives those that swing at "
                 f"{unstable_band[0]:.3g} to {unstable_band[1]:.3g} Hz: pressures may ring on, "
-                f"give 'sensing' "
-                f"{min_damping:g} or more (damping of the load-sensing line)",
+                f"give 'sensing' {min_damping:g} or more (damping of the load-sensing line)",
             )
         # volume that it delivers into a closed line until its displacement is reduced
         pressure_rise = supply.flow * supply.response * hydraulics.oil.bulk_modulus / supply.volume
@@ -142,10 +141,9 @@ def _pump_problems(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
         ):
             yield (
                 key,
-                f"nothing relieves '{name}', which swings back within {supply.response:g} s: once "
-                f"its valves close or what they feed stalls, its line rises by up to "
-                f"{pressure_rise:.3g} "
-                f"Pa over its {supply.pressure:.3g} Pa, give 'relief' [Pa]",
+                f"nothing relieves '{name}', which swings back within {supply.response:g} s: "
+                "once its valves close or what they feed stalls, its line rises by up to "
+                f"{pressure_rise:.3g} Pa over its {supply.pressure:.3g} Pa, give 'relief' [Pa]",
             )
 
 

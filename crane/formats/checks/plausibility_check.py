@@ -142,8 +142,7 @@ def _warn_about_home(spec: MachineSpec) -> None:
             location = spec.source_locations.get(f"home {name}", spec.path.name)
             _warn(
                 f"{location}: home of '{name}' is {value:g} rad, many turns, write radians if "
-                f"these "
-                "are degrees"
+                "these are degrees"
             )
 
 
@@ -215,8 +214,7 @@ def _size_problems(
             yield (
                 "inertia",
                 f"has a radius of gyration of {gyration_radius:.3g} m, and its joints and its "
-                f"centre of "
-                f"mass are at most {joint_distance:.3g} m away, {hint}",
+                f"centre of mass are at most {joint_distance:.3g} m away, {hint}",
             )
         return
     size = float(np.linalg.norm(bounds[1] - bounds[0]))

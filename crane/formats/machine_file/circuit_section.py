@@ -214,9 +214,8 @@ def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinde
     ):
         message = (
             f"{section.source_location('relief')}: 'relief' of {section.title} is "
-            f"{cylinder.relief:g} Pa, "
-            f"not above the supply's {supply.pressure:g} Pa: what the pump gives flows off there "
-            "before it can press, give a higher one"
+            f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
+            "pump gives flows off there before it can press, give a higher one"
         )
         warnings.warn(message, CraneWarning, stacklevel=2)
 

@@ -52,10 +52,9 @@ def warn_about_open_loops(spec: MachineSpec) -> None:
     remainder_text = [f"{len(pairs) - _MAX_SHOWN} more"] if len(pairs) > _MAX_SHOWN else []
     location = spec.tree.links[pairs[0][1]].source_location
     warnings.warn(
-        f"{location}: nothing closes what looks like {len(pairs)} "
-        f"loop{'s' * (len(pairs) > 1)}, {', '.join(pair_texts + remainder_text)}: close them by "
-        f"crane add loops, "
-        "paste what crane check proposes into a machine file, or rename the frames",
+        f"{location}: nothing closes what looks like {len(pairs)} loop{'s' * (len(pairs) > 1)}, "
+        f"{', '.join(pair_texts + remainder_text)}: close them by crane add loops, paste what "
+        "crane check proposes into a machine file, or rename the frames",
         CraneWarning,
         stacklevel=2,
     )

@@ -95,8 +95,7 @@ class TreeBuilder:
         if chain.parent not in self.links:
             raise self.unknown_name_error(
                 f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', no "
-                f"frame "
-                f"of an earlier chain, {suggest_names(self.links, chain.parent)}",
+                f"frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
                 chain.parent,
             )
         joint = chain.attachment_joint(urdf.root_link)

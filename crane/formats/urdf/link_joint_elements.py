@@ -303,8 +303,7 @@ def _find_root(
             xml.error_at(
                 joints[closing_joint],
                 f"link '{repeated_link}' is its own ancestor: cut the ring of joints {ring} at "
-                f"'{closing_joint}' and "
-                "close it as a loop",
+                f"'{closing_joint}' and close it as a loop",
             )
         )
         cut_joints.add(closing_joint)

@@ -175,8 +175,7 @@ class Calibration(Result):
         parameters, channels = format_count(len(self.parameters), "parameter"), len(self.channels)
         return (
             f"Calibration of '{self.machine.name}': {len(identifiable)} of {parameters} "
-            "determined by "
-            f"{format_count(channels, 'channel')}{': ' * bool(identifiable)}{values}"
+            f"determined by {format_count(channels, 'channel')}{': ' * bool(identifiable)}{values}"
         )
 
     @property

@@ -328,8 +328,7 @@ class ChartSwitchingIntegrator:
                 raise self._integrator.python_stepper.halt_error(behind_time, state)
         self.notes.append(
             f"at t = {behind_time:.4g} s the linkage passes a posture from which it could go on "
-            f"in "
-            "several ways: it goes on as it moves"
+            "in several ways: it goes on as it moves"
         )
         return i
 
@@ -390,8 +389,8 @@ class ChartSwitchingIntegrator:
             verb = "pass" if len(left_columns) > 1 else "passes"
             self.notes.append(
                 f"{names} {verb} a dead centre at t = {times[behind_indices[0]]:.4g} s: from "
-                f"there on "
-                "active coordinates alone do not tell the posture, take passive joints with them"
+                "there on active coordinates alone do not tell the posture, take passive "
+                "joints with them"
             )
         at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
         transposed_maps = np.swapaxes(velocity_maps, 1, 2)

@@ -97,9 +97,8 @@ class StickSlipModes:
         )
         return [
             f"friction of {', '.join(names[:_MAX_NAMED_JOINTS])}{more} holds the machine at "
-            f"rest in more "
-            "ways than one: the motion is determined, how they share the load is not, and their "
-            "'rest_' channels are one way"
+            "rest in more ways than one: the motion is determined, how they share the load is "
+            "not, and their 'rest_' channels are one way"
         ]
 
     def record_transition(self, time: float, state: Array) -> None:

@@ -197,8 +197,7 @@ class Session:
             readout = replace(
                 readout,
                 refusal=f"{joint} stops at {scale * readout.q_a[index]:.4g} {shown_unit}: beyond "
-                "it "
-                f"loop '{readout.weakest_loop}' leaves its assembly branch or cannot be closed",
+                f"it loop '{readout.weakest_loop}' leaves its assembly branch or cannot be closed",
             )
         self.posture = readout
         return readout

@@ -44,8 +44,7 @@ def read_visuals(machine: Machine) -> list[Visual]:
     if missing_meshes:
         _warn(
             f"{machine.name}: {len(missing_meshes)} mesh files are not there and are drawn as "
-            f"boxes "
-            f"({missing_meshes[0]}), install the package that has them"
+            f"boxes ({missing_meshes[0]}), install the package that has them"
         )
     if problems:
         more_text = f" ({len(problems)} such, crane check lists them)" if len(problems) > 1 else ""

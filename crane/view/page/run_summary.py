@@ -116,8 +116,8 @@ def reached_limit_sentences(machine: Machine, recording: Recording) -> list[str]
             first_time = recording.time[int(np.argmax(is_reached))]
             sentences.append(
                 f"{joint} reaches its {limit_name} limit of {_format_number(scale * limit)} "
-                f"{unit} "
-                f"at {first_time:.4g} s ({_format_percent(is_reached.mean())} of the samples)"
+                f"{unit} at {first_time:.4g} s ({_format_percent(is_reached.mean())} of the "
+                "samples)"
             )
     if len(sentences) > _MAX_LIMIT_SENTENCES:
         sentences[_MAX_LIMIT_SENTENCES:] = [
