@@ -8,6 +8,8 @@ this file, and imported when they are first used.
 
 import sys
 import time
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import lazy_loader
@@ -18,7 +20,16 @@ LOADED = time.time()  # before any other file of the package was read
 from crane.common import one_line_repr as _one_line_repr  # noqa: E402
 from crane.common import result as _result  # noqa: E402
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_lazy_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__ or name.startswith("_"):
+        return _lazy_attribute(name)
+    rooms = [f"crane.{x}" for x in __all__ if find_spec(f"crane.{x}")]
+    homes = [room for room in rooms if name in import_module(room).__all__]
+    hint = f"use {homes[0]}.{name}" if homes else "docs/names_0_3.md lists names of 0.2 and of 0.3"
+    raise AttributeError(f"module 'crane' has no attribute '{name}', {hint}")
 
 
 def _to_html(what: Any) -> str | None:

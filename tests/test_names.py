@@ -6,6 +6,8 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 import crane
 
 PACKAGE = Path(crane.__file__).parent
@@ -192,6 +194,13 @@ def test_the_root_keeps_what_short_programs_need():
     names = {name for name in crane.__all__ if not inspect.ismodule(getattr(crane, name))}
     assert len(names) <= 36
     assert {"load", "simulate", "replay", "identify", "report", "Dynamics", "Recording"} <= names
+
+
+def test_a_name_of_a_submodule_is_found_by_the_message():
+    with pytest.raises(AttributeError, match="use crane.recordings.limit_cycles"):
+        _ = crane.limit_cycles
+    with pytest.raises(AttributeError, match="names_0_3"):
+        _ = crane.retimed
 
 
 def test_submodules_list_what_they_define():
