@@ -24,7 +24,7 @@ _lazy_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__ or name.startswith("_"):
+    if name in __all__ or name.startswith("_") or find_spec(f"crane.{name}"):
         return _lazy_attribute(name)
     rooms = [f"crane.{x}" for x in __all__ if find_spec(f"crane.{x}")]
     homes = [room for room in rooms if name in import_module(room).__all__]

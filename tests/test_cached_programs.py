@@ -16,6 +16,9 @@ import numpy as np
 import pytest
 
 import crane
+import crane.closure.compiled_closure
+import crane.dynamics.compiled_dynamics
+import crane.dynamics.joint_force_formulas
 from crane.closure.kinematics_formulas import PositionKinematics
 from crane.codegen import FormulaTooLongError, program, program_cache
 from crane.codegen.llvm import machine_code
