@@ -14,7 +14,7 @@ from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.signals.signal_processing import Motion
 from crane.view.plots.identification_figures import draw_friction, draw_valve_curve
 from crane.view.plots.recording_figure import DASHED_STYLE, FIGURE_STYLE, RECORDED_COLOUR
-from hydraulic_forwarder.mechanics import Judged
+from hydraulic_forwarder.mechanics import HeldOutForces
 
 LIGHT = {"color": "#c9c9c9", "linewidth": 0.6}
 REFERENCE = {"color": "#333333", "linestyle": (0, (4, 2)), "linewidth": 0.9}
@@ -63,7 +63,7 @@ def data(motion: Motion, reference: tuple[Array, Array, Array], title: str) -> F
     return figure
 
 
-def torques(judged: Judged, measured: Array, title: str) -> Figure:
+def torques(judged: HeldOutForces, measured: Array, title: str) -> Figure:
     """Figures 6 and 7: measured and modelled tau_2, tau_3, F_4.
 
     Args:

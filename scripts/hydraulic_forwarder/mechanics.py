@@ -112,14 +112,14 @@ def forces_of(joints: crane.Machine, motion: Motion, bodies: tuple[str, ...]) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """Measured against modelled forces (N, 3) of a held-out set, both through one filter.
+class HeldOutForces:
+    """Measured and modelled forces (N, 3) of a held-out set, both filtered alike.
 
     Attributes:
         time: (N,) [s].
         measured: tau_2, tau_3, F_4.
         modelled: Likewise.
-        moving: (N, 3) where the joint moves and its friction is told.
+        moving: (N, 3) where the joint moves, so that its friction is known.
     """
 
     time: Array
@@ -134,36 +134,36 @@ class Judged:
         return np.sqrt((gaps**2).sum(axis=0) / self.moving.sum(axis=0))
 
     @property
-    def relative(self) -> Array:
-        """(3,) the same over the root mean square of what was measured there."""
+    def relative_error(self) -> Array:
+        """(3,) `rmse` over the root mean square of the measured forces at the same samples."""
         squares = (np.where(self.moving, self.measured, 0.0) ** 2).sum(axis=0)
         return self.rmse / np.sqrt(squares / self.moving.sum(axis=0))
 
     @property
     def whole(self) -> Array:
-        """(3,) relative error of all samples, standstill too."""
+        """(3,) relative error of all samples, those at standstill included."""
         gaps = np.linalg.norm(self.measured - self.modelled, axis=0)
         return gaps / np.linalg.norm(self.measured, axis=0)
 
 
-def judge(found: Identification, motion: Motion, added: Array | None = None) -> Judged:
-    """A held-out set by identified parameters, and forces known beside them."""
+def judge(found: Identification, motion: Motion, added: Array | None = None) -> HeldOutForces:
+    """Forces of a held-out set by identified parameters, with known forces added."""
     modelled = found.predict(motion.q, motion.v, motion.a)
     return _judged(motion, modelled if added is None else modelled + added)
 
 
-def true_forces(joints: crane.Machine, motion: Motion) -> Judged:
-    """The same by the true parameters: what is left is noise and what was filtered away."""
+def true_forces(joints: crane.Machine, motion: Motion) -> HeldOutForces:
+    """Forces by the true parameters: the residual is noise, and what the filter removes."""
     modelled = crane.Dynamics(joints).inverse(motion.q, motion.v, motion.a, friction=True)
     return _judged(motion, modelled)
 
 
-def _judged(motion: Motion, modelled: Array) -> Judged:
+def _judged(motion: Motion, modelled: Array) -> HeldOutForces:
     both = np.tile(np.hstack([motion.tau, modelled]), (3, 1))
     count = len(motion.time)
     passed = low_pass(STEP * np.arange(3 * count), both, BANDWIDTH)[count : 2 * count]
     moving = np.abs(motion.v) > 0.02 * np.abs(motion.v).max(axis=0)
-    return Judged(motion.time, passed[:, :3], passed[:, 3:], moving)
+    return HeldOutForces(motion.time, passed[:, :3], passed[:, 3:], moving)
 
 
 def learned(

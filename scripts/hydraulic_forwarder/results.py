@@ -57,7 +57,7 @@ class Results:
     motions: dict[str, Motion]
     references: dict[str, tuple[Array, Array, Array]]
     found: dict[str, Identification]
-    judged: dict[str, dict[str, mechanics.Judged]]
+    judged: dict[str, dict[str, mechanics.HeldOutForces]]
     shares: dict[str, tuple[Array, Array]]
     oscillation: float
     clean: dict[str, OrificeCoefficients]
@@ -95,7 +95,7 @@ def compute(folder: Path) -> Results:
     alone = mechanics.without(plant.joints, learn, REST)
     found["seven, rest known"] = mechanics.learned(plant.joints, alone, "seven")
     found["seven, stiction"] = mechanics.learned(plant.joints, alone, "seven", (5e-3,))
-    judged: dict[str, dict[str, mechanics.Judged]] = {}
+    judged: dict[str, dict[str, mechanics.HeldOutForces]] = {}
     for name in ("set 1", "set 2"):
         motion = motions[name]
         for model in MODELS:
