@@ -6,13 +6,7 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from crane.description.kinematic_tree import Inertial, Placement, Tree, Vector
-
-
-def to_vector(values: np.ndarray) -> Vector:
-    """Return three floats, without negative zeros."""
-    x, y, z = (float(value) + 0.0 for value in values)
-    return x, y, z
+from crane.description.kinematic_tree import Inertial, Placement, Tree, Vector, to_vector
 
 
 def rotation_from_rpy(rpy: Vector) -> np.ndarray:

@@ -20,6 +20,7 @@ from crane.codegen.symbolic import (
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.external_forces import ExternalForce, FrameMotion
+from crane.description.force_elements import as_nonnegative_number
 from crane.description.ground_contact import DEFAULT_SMOOTHING, Ground
 
 MAX_FRICTION_ANGLE = 1.05  # [rad] of a soil
@@ -54,10 +55,7 @@ class Soil:
         units = ("N/m3", "Pa", "rad", "rad", "Pa", "Pa")
         for field, unit in zip(fields(self), units, strict=True):
             value = getattr(self, field.name)
-            if as_number(value, f"the {field.name} of the soil", unit) < 0:
-                raise InputError(
-                    f"the {field.name} of the soil is {value:g}, it must not be negative"
-                )
+            as_nonnegative_number(value, f"the {field.name} of the soil", unit)
         if self.friction > MAX_FRICTION_ANGLE:
             raise InputError(
                 f"the friction of the soil is {self.friction:g} rad, give at most "
@@ -219,9 +217,7 @@ class SoilCutting(ExternalForce):
         self.width = as_number(width, f"the width {label}", "m", greater_than=0)
         self.length = as_number(length, f"the length {label}", "m", greater_than=0)
         self.smoothing = as_number(smoothing, f"the smoothing {label}", "m/s", greater_than=0)
-        self.thickness = as_number(thickness, f"the thickness {label}", "m")
-        if self.thickness < 0:
-            raise InputError(f"the thickness {label} is {thickness:g}, it must not be negative")
+        self.thickness = as_nonnegative_number(thickness, f"the thickness {label}", "m")
         blade_direction = _unit_direction(blade, f"the blade {label}")
         face_normal = _unit_direction(cutting, f"the cutting {label}")
         face_normal = face_normal - (face_normal @ blade_direction) * blade_direction

@@ -13,9 +13,8 @@ from crane.description.key_types import (
     NumberKey,
     SectionSchema,
 )
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
-from crane.formats.joint_series import joint_series
 from crane.formats.machine_file.structure_sections import read_home
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value

@@ -8,8 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
-from crane.description.kinematic_tree import Joint, Vector
-from crane.description.pinocchio_conversion import to_vector
+from crane.description.kinematic_tree import Joint, Vector, to_vector
 from crane.machine.machine import Machine
 
 _DIFFERENCE_STEP = 1e-5  # of the fastest coordinate, for central differences

@@ -15,8 +15,7 @@ import pinocchio as pin
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import frame_id
 from crane.common.samples import Array
-from crane.description.kinematic_tree import Joint, Vector
-from crane.description.pinocchio_conversion import to_vector
+from crane.description.kinematic_tree import Joint, Vector, to_vector
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.formats.machine_file.open_loop_warning import loop_end_pairs
 

@@ -12,12 +12,8 @@ from lxml import etree
 from crane.common.errors import CraneWarning, InputError
 from crane.common.plausible_ranges import LONGEST, implausible_value_text, suggested_units_text
 from crane.common.samples import Array, as_number
-from crane.description.kinematic_tree import Inertial, Joint, Limits, Link
-from crane.description.pinocchio_conversion import (
-    inertial_from_inertia,
-    to_vector,
-    xyz_rpy_from_se3,
-)
+from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, to_vector
+from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.formats.additions.attachment_points import (
     AttachmentPoint,
     joints_between,

@@ -5,8 +5,13 @@ from collections.abc import Sequence
 
 from crane.description.findings import UnknownNames, error_recovery
 from crane.description.machine_schema import MOTIONS
-from crane.description.specification import ATTITUDE_COORDINATES, TIP_COORDINATES, Task, ViaPoint
-from crane.description.task_phases import Phase
+from crane.description.specification import (
+    ATTITUDE_COORDINATES,
+    TIP_COORDINATES,
+    Phase,
+    Task,
+    ViaPoint,
+)
 from crane.formats.machine_file.external_force_sections import read_loads
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
