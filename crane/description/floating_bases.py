@@ -22,6 +22,7 @@ from crane.description.kinematic_tree import (
     Joint,
     Link,
     Tree,
+    body_of,
     joint_freedoms,
     joint_series,
 )
@@ -54,12 +55,9 @@ def floating_series(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
 
 def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
     """Whether a series connects a body to the ground and nothing else acts on it."""
-    parent_joints = {joint.child: joint for joint in spec.tree.joints.values()}
-    link = series[0].parent
-    while link in parent_joints:
-        if parent_joints[link].is_movable:
-            return False  # another body carries it
-        link = parent_joints[link].parent
+    parent_joints = spec.tree.parent_joints
+    if body_of(parent_joints, series[0].parent) in parent_joints:
+        return False  # another body carries it
     names = {joint.name for joint in series}
     force_element_joints = {part.joint for part in spec.force_elements if part.between is None}
     force_element_joints |= {part.joint for part in spec.end_stops}
@@ -77,9 +75,7 @@ def _is_unconstrained(spec: MachineSpec, series: list[Joint]) -> bool:
 
 def _carries_link(parent_joints: Mapping[str, Joint], link: str, body: str) -> bool:
     """Whether a link is a body or is carried by it."""
-    seen = set()
-    while link != body and link in parent_joints and link not in seen:
-        seen.add(link)
+    while link != body and link in parent_joints:
         link = parent_joints[link].parent
     return link == body
 

@@ -171,13 +171,18 @@ class Tree:
     @property
     def root_link(self) -> str:
         """The link without parent."""
-        children = {joint.child for joint in self.joints.values()}
-        return next(link for link in self.links if link not in children)
+        parent_joints = self.parent_joints
+        return next(link for link in self.links if link not in parent_joints)
 
     @property
     def total_mass(self) -> float:
         """Mass of all links [kg]."""
         return sum(link.inertial.mass for link in self.links.values() if link.inertial)
+
+    @property
+    def parent_joints(self) -> dict[str, Joint]:
+        """By link the joint that carries it."""
+        return {joint.child: joint for joint in self.joints.values()}
 
     def joints_by_parent(self) -> dict[str, list[Joint]]:
         """Return the joints on each link that has child joints."""
@@ -189,14 +194,8 @@ class Tree:
 
     def bodies_by_link(self) -> dict[str, str]:
         """Return by link the first link of its body, to which it is fixed."""
-        parent_joints = {joint.child: joint for joint in self.joints.values()}
-        found: dict[str, str] = {}
-        for link in self.links:
-            body = link
-            while body in parent_joints and not parent_joints[body].is_movable:
-                body = parent_joints[body].parent
-            found[link] = body
-        return found
+        parent_joints = self.parent_joints
+        return {link: body_of(parent_joints, link) for link in self.links}
 
     def with_parts(self, *parts: Link | Joint) -> "Tree":
         """Return the tree with links and joints added, or replaced if the names exist."""
@@ -207,6 +206,13 @@ class Tree:
             else:
                 joints[part.name] = part
         return Tree(links, joints)
+
+
+def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
+    """Return the first link of the body that a link belongs to, see `Tree.parent_joints`."""
+    while link in parent_joints and not parent_joints[link].is_movable:
+        link = parent_joints[link].parent
+    return link
 
 
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:

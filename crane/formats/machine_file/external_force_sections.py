@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError
 from crane.description.external_force_schema import CONTACT, CONTACT_LAW_KEYS, CUTTER, GROUND, LOAD
 from crane.description.external_forces import ExternalForce, PhasedWrench, Wrench
 from crane.description.findings import FollowUpError, error_recovery
@@ -103,8 +103,6 @@ def _read_soil(section: YamlSection) -> Soil:
         for key in ("unit_weight", "cohesion", "friction"):
             values[key] = section.number(key)
         return section.create(Soil, **values)
-    if kind not in SOILS:
-        raise section.error_at("kind", f"unknown soil '{kind}', {suggest_names(SOILS, kind)}")
     return section.create(dataclasses.replace, SOILS[kind], **values)
 
 

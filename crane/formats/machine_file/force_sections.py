@@ -19,29 +19,22 @@ def read_friction(top: YamlSection, tree: TreeBuilder) -> dict[str, Friction]:
     """Friction by joint."""
 
     def read_law(joint: str, item: YamlSection) -> Friction:
-        tree.check_joint(joint, item.source_location())
         values = item.values()
         is_drive_intended = values.pop("is_driving", False)
         law = Friction(**values)
-        if not is_drive_intended:
-            _warn_about_drive(joint, law, item.source_location())
+        for kind in () if is_drive_intended else ("coulomb", "viscous"):
+            mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
+            if abs(offset) > mean:
+                warnings.warn(
+                    f"{item.source_location()}: friction of '{joint}' drives the joint in one "
+                    f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant "
+                    "force may hide in it; write drives: true if it is meant",
+                    CraneWarning,
+                    stacklevel=3,
+                )
         return law
 
-    return top.read_map("friction", read_law)
-
-
-def _warn_about_drive(joint: str, law: Friction, source_location: str) -> None:
-    """Warn about friction that drives its joint in one direction."""
-    for kind in ("coulomb", "viscous"):
-        mean, offset = getattr(law, kind), getattr(law, f"{kind}_offset")
-        if abs(offset) > mean:
-            warnings.warn(
-                f"{source_location}: friction of '{joint}' drives the joint in one direction "
-                f"(|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant force may hide "
-                "in it; write drives: true if it is meant",
-                CraneWarning,
-                stacklevel=3,
-            )
+    return top.read_map("friction", read_law, tree.check_joint)
 
 
 def read_forces(top: YamlSection, tree: TreeBuilder) -> tuple[ForceElement, ...]:
@@ -50,7 +43,7 @@ def read_forces(top: YamlSection, tree: TreeBuilder) -> tuple[ForceElement, ...]
     def read_element(item: YamlSection) -> ForceElement:
         between = tree.read_frame_pair(item) if "between" in item else None
         if between is None:
-            tree.read_joint_name(item)
+            tree.check_joint(item.text("joint"), item.source_location("joint"))
         element = ForceElement(**item.values("between"), between=between)
         if not (element.stiffness or element.damping or element.force):
             problem = f"the {element_name(element)} does nothing, give stiffness, damping or force"
@@ -74,22 +67,19 @@ def read_gas_springs(top: YamlSection, tree: TreeBuilder) -> tuple[GasSpring, ..
 
 def read_ropes(top: YamlSection, tree: TreeBuilder) -> tuple[Rope, ...]:
     """Ropes between frames."""
-
-    def read_rope(item: YamlSection) -> Rope:
-        return Rope(tree.read_frame_pair(item), **item.values("between"))
-
-    return top.read_items("ropes", read_rope)
+    return top.read_items(
+        "ropes", lambda item: Rope(tree.read_frame_pair(item), **item.values("between"))
+    )
 
 
 def read_end_stops(top: YamlSection, tree: TreeBuilder) -> tuple[EndStop, ...]:
     """Stops at the limits of joints."""
 
     def read_stop(joint: str, item: YamlSection) -> EndStop:
-        tree.check_joint(joint, item.source_location())
         if missing_limit := tree.missing_limit_text(joint):
             hint = "make it revolute" if missing_limit == "is continuous" else "give it both"
             problem = f"joint '{joint}' {missing_limit}, a stop needs limits: {hint}"
             raise item.error_at(None, problem)
         return EndStop(joint, **item.values())
 
-    return tuple(top.read_map("end_stops", read_stop).values())
+    return tuple(top.read_map("end_stops", read_stop, tree.check_joint).values())

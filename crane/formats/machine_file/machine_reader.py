@@ -1,6 +1,7 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
 from collections.abc import Callable, Container, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,7 +48,7 @@ from crane.formats.machine_file.structure_sections import (
 )
 from crane.formats.machine_file.task_section import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
-from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_section import YamlSection, parse_with_base
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.formats.robot_files import is_robot_file
 from crane.formats.urdf.urdf_reader import read_urdf
@@ -115,7 +116,7 @@ def read_plain_data(path: Path) -> dict[str, Any]:
     Raises:
         DescriptionError: As `read_machine_spec`.
     """
-    return YamlSection.read(path, MACHINE).to_plain_data()
+    return parse_with_base(path, MACHINE, ())
 
 
 def _read_machine(path: Path) -> MachineSpec:
@@ -283,14 +284,10 @@ def _read_payload(top: YamlSection, tree: TreeBuilder, tip: str | None) -> Paylo
 
 
 def _read_control(top: YamlSection, active: tuple[str, ...]) -> dict[str, PIGains]:
-    def read_gains(joint: str, item: YamlSection) -> PIGains:
-        named_joints.append(joint)
-        with error_recovery():
-            check_active_joint(joint, item, active)
-        return PIGains(**item.values())
-
-    named_joints: list[str] = []
-    gains = top.read_map("control", read_gains)
+    gains = top.read_map(
+        "control", lambda _, item: PIGains(**item.values()), partial(check_active_joint, active)
+    )
+    named_joints = top.item_names("control")
     missing = [joint for joint in active if named_joints and joint not in named_joints]
     if missing:
         raise top.error_at("control", f"no gains for {', '.join(missing)}, give kp and ki of each")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
-from crane.description.floating_bases import FLOATING_FREEDOMS, check_freedoms
+from crane.description.floating_bases import check_freedoms
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.specification import (
     AXISLESS_TYPES,
@@ -50,7 +50,7 @@ def read_chains(
         report_error(top.error_at("chains", "there are no chains, add one under 'chains:'"))
         tree.is_complete = False
     with error_recovery(harmless=True):
-        tree.add_floating_base(_read_floating(top))
+        tree.add_floating_base(check_freedoms(top.names("floating")))
     if not tree.joints and tree.is_complete:
         report_error(top.error_at("chains", "no joint of these chains moves, add one"))
     return tuple(chains), tree, friction, couplings, springs
@@ -98,9 +98,6 @@ def read_loops(top: YamlSection, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
 def _read_loop(section: YamlSection, tree: TreeBuilder, earlier_names: Container[str]) -> LoopSpec:
     name, kind = section.text("name"), section.text("type")
     label = f"loop '{name}'" if name else "a loop"
-    if kind and kind not in LOOP_TYPES:
-        problem = f"{label} has the unknown type '{kind}', {suggest_names(LOOP_TYPES, kind)}"
-        report_error(section.error_at("type", problem))
     frames = []
     for end in ("predecessor", "successor"):
         frame = section.text(end)
@@ -162,19 +159,6 @@ def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:
         return Drive(name, section.value_map(name, YamlSection.number, title=title))
 
     return tuple(top.value_map("drives", read_drive).values())
-
-
-def _read_floating(top: YamlSection) -> tuple[str, ...]:
-    """Freedoms of the first chain's root."""
-    names = top.names("floating")
-    for name in names:
-        if name not in FLOATING_FREEDOMS:
-            raise top.error_at(
-                "floating",
-                f"freedom '{name}' of the root is unknown, "
-                f"{suggest_names(FLOATING_FREEDOMS, name)}",
-            )
-    return check_freedoms(names)
 
 
 def read_home(top: YamlSection, tree: TreeBuilder) -> tuple[dict[str, float], dict[str, str]]:

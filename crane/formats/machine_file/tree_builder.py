@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from crane.common.errors import CraneError, DescriptionError, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, report_error
 from crane.description.floating_bases import add_base_joints
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import Joint, Link, Tree, body_of
 from crane.description.specification import Chain, LoopSpec
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.urdf.urdf_reader import UrdfModel
@@ -27,7 +27,7 @@ class TreeBuilder:
         self.joints: dict[str, Joint] = {}
         self.is_complete = True
         self._all_joints: dict[str, Joint] = {}
-        self._body_of_link: dict[str, str] = {}  # link -> the link it is rigidly attached to
+        self._parent_joints: dict[str, Joint] = {}
 
     @property
     def tree(self) -> Tree:
@@ -40,7 +40,6 @@ class TreeBuilder:
         Raises:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
-        self._body_of_link[urdf.root_link] = urdf.root_link
         with error_recovery():
             self._attach_to_parent(chain, urdf)
         parts = list(urdf.tree)
@@ -49,22 +48,15 @@ class TreeBuilder:
         self.is_complete &= urdf.is_complete and len(free) == len(parts)
         for part in free:
             self._add_part(part)
-        self._assign_bodies(urdf)
 
     def add_floating_base(self, freedoms: Sequence[str]) -> None:
         """Let the root of the first chain float instead of standing on the world."""
         if not freedoms or not self.links:
             return
-        root = self.tree.root_link
         floating_tree = add_base_joints(self.tree, freedoms)
-        self.links, self._all_joints = dict(floating_tree.links), dict(floating_tree.joints)
-        self.joints = {
-            name: joint for name, joint in floating_tree.joints.items() if joint.is_movable
-        }
-        bodies = {link: root for link, body in self._body_of_link.items() if body == root}
-        self._body_of_link = (
-            {floating_tree.root_link: floating_tree.root_link} | self._body_of_link | bodies
-        )
+        self.links, self._all_joints, self.joints = {}, {}, {}
+        for part in floating_tree:
+            self._add_part(part)
 
     def filter_new_names(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
@@ -85,7 +77,7 @@ class TreeBuilder:
         if isinstance(part, Link):
             self.links[part.name] = part
             return
-        self._all_joints[part.name] = part
+        self._all_joints[part.name] = self._parent_joints[part.child] = part
         if part.is_movable:
             self.joints[part.name] = part
 
@@ -102,26 +94,11 @@ class TreeBuilder:
         if (earlier := self._find_same_name(joint)) is not None:
             raise _duplicate_name_error(joint, earlier)
         self._add_part(joint)
-        self._body_of_link[urdf.root_link] = self._body_of_link.get(chain.parent, urdf.root_link)
 
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
         is_follow_up = not self.is_complete or not name
         return FollowUpError(message) if is_follow_up else DescriptionError(message)
-
-    def _assign_bodies(self, urdf: UrdfModel) -> None:
-        """Find out which links of a chain make one body."""
-        joints_by_parent = (
-            urdf.tree.joints_by_parent()
-        )  # which is a forest, see `crane.formats.urdf.link_joint_elements`
-        pending = [urdf.root_link]
-        while pending:
-            link = pending.pop()
-            for joint in joints_by_parent.get(link, ()):
-                self._body_of_link[joint.child] = (
-                    joint.child if joint.is_movable else self._body_of_link[link]
-                )
-                pending.append(joint.child)
 
     def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
@@ -144,12 +121,6 @@ class TreeBuilder:
             )
             raise self.unknown_name_error(problem, link)
 
-    def read_joint_name(self, section: YamlSection) -> str:
-        """The joint that a section names."""
-        joint = section.text("joint")
-        self.check_joint(joint, section.source_location("joint"))
-        return joint
-
     def read_frame_pair(self, section: YamlSection) -> tuple[str, str]:
         """The two frames that a section is between, on two bodies.
 
@@ -162,8 +133,8 @@ class TreeBuilder:
         for link in links:
             self.check_link(link, where, "the frame")
         first, second = links
-        body = self._body_of_link.get(first)
-        if body is not None and body == self._body_of_link.get(second):
+        body = body_of(self._parent_joints, first)
+        if body == body_of(self._parent_joints, second):
             raise section.error_at(
                 "between",
                 f"'{first}' and '{second}' are both on the body '{body}', choose frames of two "
@@ -173,8 +144,8 @@ class TreeBuilder:
 
     def check_loop(self, loop: LoopSpec) -> None:
         """Raise for a loop between frames that do not move against each other."""
-        body = self._body_of_link.get(loop.predecessor)
-        if body is not None and body == self._body_of_link.get(loop.successor):
+        body = body_of(self._parent_joints, loop.predecessor)
+        if body == body_of(self._parent_joints, loop.successor):
             raise DescriptionError(
                 f"{loop.source_location}: loop '{loop.name}' joins '{loop.predecessor}' and "
                 f"'{loop.successor}', both on the body '{body}': choose frames of two bodies"
@@ -182,9 +153,7 @@ class TreeBuilder:
 
     def is_movable(self, link: str) -> bool:
         """Whether a link is not fixed to the world."""
-        return not self.is_complete or self._body_of_link.get(link) != next(
-            iter(self._body_of_link)
-        )
+        return not self.is_complete or body_of(self._parent_joints, link) != self.tree.root_link
 
     def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""

@@ -16,7 +16,7 @@ from crane.hydraulics.circuit_elements import CircuitPathError, ComponentParamet
 Item = TypeVar("Item")
 
 
-def _parse_with_base(
+def parse_with_base(
     file: Path, schema: SectionSchema, including_files: tuple[Path, ...]
 ) -> LocatedMapping:
     """A machine file put over the one that it extends, which may extend another.
@@ -42,7 +42,7 @@ def _parse_with_base(
             EXTENDS_KEY, f"'{base_name}' is a variant of this file itself, extend another"
         )
     del variant[EXTENDS_KEY]
-    data = _parse_with_base(base_file, schema, including_files)
+    data = parse_with_base(base_file, schema, including_files)
     data.update_from_variant(variant)
     return data
 
@@ -57,7 +57,7 @@ class YamlSection(YamlValues):
         Raises:
             DescriptionError: A file is missing, not YAML, or not a mapping of these keys.
         """
-        section = cls(_parse_with_base(file, schema, ()), schema)
+        section = cls(parse_with_base(file, schema, ()), schema)
         section.check_keys(schema.keys)
         return section
 
@@ -103,14 +103,31 @@ class YamlSection(YamlValues):
         except InputError as error:
             raise self.error_at(None, str(error)) from None
 
-    def read_map(self, key: str, read: "Callable[[str, YamlSection], Item]") -> dict[str, Item]:
+    def read_map(
+        self,
+        key: str,
+        read: "Callable[[str, YamlSection], Item]",
+        check_name: Callable[[str, str], None] = lambda name, location: None,
+    ) -> dict[str, Item]:
         """What is read of each mapping of a mapping, by name; an error ends only its item.
 
         Args:
             key: The key.
             read: Called with each name and mapping.
+            check_name: As for `value_map`.
         """
-        return self.value_map(key, lambda outer, name: read(name, outer._nonempty_item(name)))
+
+        def read_item(outer: YamlSection, name: str) -> Item:
+            spec = outer._key(name)
+            assert isinstance(spec, SectionKey)
+            title = f"{spec.section.title} '{name}'"
+            item = outer.section(name, title)
+            if item is None or not list(item):
+                problem = f"{title} is empty, its keys are {', '.join(spec.section.keys)}"
+                raise outer.error_at(name, problem)
+            return read(name, item)
+
+        return self.value_map(key, read_item, check_name)
 
     def read_items(self, key: str, read: "Callable[[YamlSection], Item]") -> tuple[Item, ...]:
         """What is read of each mapping of a list."""
@@ -119,16 +136,6 @@ class YamlSection(YamlValues):
             with error_recovery():
                 found.append(read(item))
         return tuple(found)
-
-    def _nonempty_item(self, name: str) -> "YamlSection":
-        spec = self._key(name)
-        assert isinstance(spec, SectionKey)
-        title = f"{spec.section.title} '{name}'"
-        item = self.section(name, title)
-        if item is None or not list(item):
-            problem = f"{title} is empty, its keys are {', '.join(spec.section.keys)}"
-            raise self.error_at(name, problem)
-        return item
 
     def value_map(
         self,
