@@ -15,8 +15,7 @@ from crane.description.key_types import (
 )
 from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
-from crane.formats.machine_file.structure_sections import read_home
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
 from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value
 from crane.formats.machine_file.yaml_section import YamlSection
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES

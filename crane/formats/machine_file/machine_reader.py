@@ -28,18 +28,18 @@ from crane.formats.machine_file.circuit_section import (
     circuit_locations,
     read_hydraulics,
 )
-from crane.formats.machine_file.estimation_section import read_estimation
-from crane.formats.machine_file.external_force_sections import read_external_forces
 from crane.formats.machine_file.force_sections import (
     read_end_stops,
+    read_external_forces,
     read_forces,
     read_friction,
     read_gas_springs,
     read_ropes,
 )
+from crane.formats.machine_file.identification_sections import read_estimation, read_sensors
 from crane.formats.machine_file.open_loop_warning import warn_about_open_loops
-from crane.formats.machine_file.sensor_section import read_sensors
 from crane.formats.machine_file.structure_sections import (
+    TreeBuilder,
     read_chains,
     read_couplings,
     read_drives,
@@ -47,7 +47,6 @@ from crane.formats.machine_file.structure_sections import (
     read_loops,
 )
 from crane.formats.machine_file.task_section import read_tasks
-from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection, parse_with_base
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.formats.robot_files import is_robot_file

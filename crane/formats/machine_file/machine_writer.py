@@ -34,8 +34,8 @@ from crane.description.machine_schema import (
 )
 from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
 from crane.description.specification import Task
-from crane.formats.machine_file.estimation_section import estimation_data
-from crane.formats.machine_file.external_force_sections import external_force_data, load_data
+from crane.formats.machine_file.force_sections import external_force_data, load_data
+from crane.formats.machine_file.identification_sections import estimation_data
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.urdf_elements import add_joint, add_link

@@ -238,4 +238,4 @@ def _item_title(title: str, item: LocatedMapping) -> str:
     name = item.get("name", item.get("joint", item.get("between")))
     if isinstance(name, list) and all(isinstance(frame, str) for frame in name):
         return f"the {title.removesuffix(' of')} between {' and '.join(map(repr, name))}"
-    return f"{title} '{name}'" if isinstance(name, str) else f"a {title}"
+    return f"{title} '{name}'" if isinstance(name, str) else f"a {title.removesuffix(' of')}"

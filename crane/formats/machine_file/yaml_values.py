@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import DescriptionError, suggest_names
-from crane.description.findings import error_recovery, report_error
+from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.key_types import (
     REQUIRED,
     FileKey,
@@ -78,6 +78,8 @@ class YamlValues:
             DescriptionError: The nearest known key is named. Where findings are collected, the
                 value is read as if it had that name.
         """
+        if isinstance(names, UnknownNames):
+            return
         names = tuple(names)
         for key in [key for key in self._data if key not in names]:
             near = get_close_matches(key, names, 1, 0.75)

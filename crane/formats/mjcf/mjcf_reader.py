@@ -21,7 +21,7 @@ from crane.description.kinematic_tree import (
 )
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import Chain, MachineSpec, source_locations
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
 from crane.formats.mjcf.joint_effects import (
     isotropic_rotor_inertia,
