@@ -127,8 +127,12 @@ def add_floating_base(spec: MachineSpec, freedoms: bool | Sequence[str] = True) 
     """
     if not freedoms or floating_series(spec):
         return spec
-    base_freedoms = FLOATING_FREEDOMS if freedoms is True else check_freedoms(freedoms)
-    return dataclasses.replace(spec, tree=add_base_joints(spec.tree, base_freedoms))
+    return dataclasses.replace(
+        spec,
+        tree=add_base_joints(
+            spec.tree, FLOATING_FREEDOMS if freedoms is True else check_freedoms(freedoms)
+        ),
+    )
 
 
 def check_freedoms(names: object) -> tuple[str, ...]:

@@ -148,8 +148,10 @@ class Contact(ExternalForce):
     @property
     def channels(self) -> list[tuple[str, str]]:
         """See `ExternalForce`: N, and N over the area."""
-        pressure = [(f"pressure_{self.name}", "Pa")] if self.area else []
-        return [(f"support_{self.name}", "N"), *pressure]
+        return [
+            (f"support_{self.name}", "N"),
+            *([(f"pressure_{self.name}", "Pa")] if self.area else []),
+        ]
 
     def outputs(self, motion: FrameMotion) -> Sequence[Scalar]:
         """See `ExternalForce`."""

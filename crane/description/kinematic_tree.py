@@ -217,8 +217,9 @@ def body_of(parent_joints: Mapping[str, Joint], link: str) -> str:
 
 def with_rotor_inertias(tree: Tree, rotor_inertias: Mapping[str, float]) -> Tree:
     """Return the tree with rotor inertias [kg m2], [kg] by joint."""
-    joints = (replace(tree.joints[name], rotor_inertia=x) for name, x in rotor_inertias.items())
-    return tree.with_parts(*joints)
+    return tree.with_parts(
+        *(replace(tree.joints[name], rotor_inertia=x) for name, x in rotor_inertias.items())
+    )
 
 
 def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
@@ -235,10 +236,9 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
     normal = np.asarray(axis, dtype=np.float64)
     first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
     first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
     return (
         ("x", "prismatic", to_vector(first)),
-        ("y", "prismatic", to_vector(second)),
+        ("y", "prismatic", to_vector(np.cross(normal, first))),
         ("rz", "revolute", to_vector(normal)),
     )
 

@@ -63,8 +63,7 @@ def tree_parameters(
 def value_at(owner: Any, field_path: FieldPath) -> Any:
     """Return what a field path of an object leads to."""
     for key in field_path:
-        is_container = isinstance(owner, Mapping | tuple)
-        owner = owner[key] if is_container else getattr(owner, str(key))
+        owner = owner[key] if isinstance(owner, Mapping | tuple) else getattr(owner, str(key))
     return owner
 
 

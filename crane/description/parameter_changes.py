@@ -71,8 +71,9 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
     for name, value in values.items():
         if name not in sensor_changes and paths[name][0] == "hydraulics":
             _warn_about_unit(spec, name, value)
-    sensors = with_sensor_parameters(spec.sensors, sensor_changes)
-    changed = dataclasses.replace(changed, sensors=MappingProxyType(sensors))
+    changed = dataclasses.replace(
+        changed, sensors=MappingProxyType(with_sensor_parameters(spec.sensors, sensor_changes))
+    )
     return _add_payload(changed, payload_mass) if payload_mass else changed
 
 
@@ -88,8 +89,9 @@ def _check_change(
     elif name not in names:
         raise InputError(unknown_parameter_text(spec, names, name))
     if name.endswith((".mass", ".rotor_inertia")):
-        unit = "kg" if name.endswith(".mass") else ""
-        return as_nonnegative_number(new_value, f"parameter '{name}'", unit)
+        return as_nonnegative_number(
+            new_value, f"parameter '{name}'", "kg" if name.endswith(".mass") else ""
+        )
     value = as_number(new_value, f"parameter '{name}'", "")
     if name.startswith(PINS_PREFIX) and value <= 0:
         raise InputError(f"parameter '{name}' is {value:g} N, give a force above 0")
@@ -141,8 +143,9 @@ def _add_payload(spec: MachineSpec, mass: float) -> MachineSpec:
                 scaled = dataclasses.replace(inertial, mass=scale * inertial.mass, tensor=tensor)
                 part = dataclasses.replace(part, inertial=scaled)
             parts.append(part)
-        chains = (*spec.chains, spec.payload.chain)
-        return dataclasses.replace(spec, tree=tree.with_parts(*parts), chains=chains)
+        return dataclasses.replace(
+            spec, tree=tree.with_parts(*parts), chains=((*spec.chains, spec.payload.chain))
+        )
     import pinocchio as pin
 
     from crane.description.pinocchio_conversion import add_rigid_load
@@ -152,8 +155,9 @@ def _add_payload(spec: MachineSpec, mass: float) -> MachineSpec:
         Link("payload", PAYLOAD_MASS),
         Joint("payload_fixed", "fixed", tip, "payload", PAYLOAD_MASS),
     )
-    point_mass = pin.Inertia(mass, np.zeros(3), np.zeros((3, 3)))
-    return dataclasses.replace(spec, tree=add_rigid_load(tree, tip, point_mass))
+    return dataclasses.replace(
+        spec, tree=add_rigid_load(tree, tip, pin.Inertia(mass, np.zeros(3), np.zeros((3, 3))))
+    )
 
 
 def lock_joints(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:

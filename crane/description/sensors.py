@@ -87,8 +87,9 @@ class Sensor:
             if self.delay:
                 raise signal_delay_error(quantity_name, quantity_name)
             return self.apply(readings)
-        undelayed = np.interp(time + self.delay, time, readings) if self.delay else readings
-        return self.invert(undelayed)
+        return self.invert(
+            np.interp(time + self.delay, time, readings) if self.delay else readings
+        )
 
     def parameters(self) -> dict[str, float]:
         """Return its parameters by the last part of their names."""

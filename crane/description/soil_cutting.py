@@ -54,8 +54,7 @@ class Soil:
     def __post_init__(self) -> None:
         units = ("N/m3", "Pa", "rad", "rad", "Pa", "Pa")
         for field, unit in zip(fields(self), units, strict=True):
-            value = getattr(self, field.name)
-            as_nonnegative_number(value, f"the {field.name} of the soil", unit)
+            as_nonnegative_number(getattr(self, field.name), f"the {field.name} of the soil", unit)
         if self.friction > MAX_FRICTION_ANGLE:
             raise InputError(
                 f"the friction of the soil is {self.friction:g} rad, give at most "
@@ -72,8 +71,7 @@ class Soil:
     @property
     def max_rake(self) -> float:
         """Rake angle that replaces a steeper blade [rad], see `SoilCutting`."""
-        largest_angle = math.pi - self.friction - self.tool_friction - MIN_WEDGE_ANGLE
-        return min(0.5 * math.pi, largest_angle)
+        return min(0.5 * math.pi, math.pi - self.friction - self.tool_friction - MIN_WEDGE_ANGLE)
 
     def cutting_factors(
         self, cosine_rake: Scalar, sine_rake: Scalar
@@ -129,7 +127,7 @@ class Soil:
         """
         slope = math.tan(self.friction)
         logarithm = math.pi * slope + 2.0 * math.asinh(slope)
-        return (math.expm1(logarithm) / slope if slope else math.pi + 2.0), math.exp(logarithm)
+        return math.expm1(logarithm) / slope if slope else math.pi + 2.0, math.exp(logarithm)
 
 
 def _typical_soil(unit_weight: float, cohesion: float, degrees: float, adhesion: float) -> Soil:

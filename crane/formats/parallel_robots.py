@@ -207,19 +207,25 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
         links = [name if name in tree.links else child_links.get(name, "") for name in pair]
         unknown_frames = [name for name, link in zip(pair, links, strict=True) if not link]
         if unknown_frames:
-            problem = (
-                f"the frame '{unknown_frames[0]}' is unknown, "
-                f"{suggest_names(tree.links, unknown_frames[0])}"
+            raise top.error_at(
+                "closed_loop",
+                (
+                    f"the frame '{unknown_frames[0]}' is unknown, "
+                    f"{suggest_names(tree.links, unknown_frames[0])}"
+                ),
             )
-            raise top.error_at("closed_loop", problem)
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
             raise top.error_at(
                 "closed_loop", f"{pair[0]} and {pair[1]} are closed twice, once will do"
             )
-        where = top.source_location("closed_loop")
         loop = LoopSpec(
-            name, _LOOP_TYPES[kind.lower()], links[0], links[1], (0.0, 0.0, 1.0), where
+            name,
+            _LOOP_TYPES[kind.lower()],
+            links[0],
+            links[1],
+            (0.0, 0.0, 1.0),
+            top.source_location("closed_loop"),
         )
         tree.check_loop(loop)
         loops[name] = loop
@@ -240,8 +246,9 @@ def _read_pairs(top: YamlSection, key: str) -> list[list[str]]:
         "write pairs as [a, b]",
     )
     for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
-        problem = f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
-        raise top.error_at(key, problem)
+        raise top.error_at(
+            key, f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
+        )
     return pairs
 
 

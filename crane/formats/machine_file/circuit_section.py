@@ -85,8 +85,9 @@ def read_hydraulics(
     named_joints = (*driving_joints, *joints_by_component["valve"])
     for joint, component in itertools.product(named_joints, ("cylinder", "valve")):
         if joint not in joints_by_component[component]:
-            problem = f"'{joint}' has no {component}, add it"
-            report_error(section.error_at(f"{component}s", problem))
+            report_error(
+                section.error_at(f"{component}s", f"'{joint}' has no {component}, add it")
+            )
     control = section.read_map(
         "control", lambda _, item: read_component(item, item.values()), check_joint
     )
@@ -96,8 +97,9 @@ def read_hydraulics(
         listed = ", ".join(driving_joints)
         report_error(section.error_at("control", f"give gains of all of {listed}, or none"))
     if not driving_joints:
-        problem = "'hydraulics' drives nothing, give cylinders and valves"
-        report_error(section.error_at(None, problem))
+        report_error(
+            section.error_at(None, "'hydraulics' drives nothing, give cylinders and valves")
+        )
     network = _read_network(section)
     lacks_gains = control and not cylinders.keys() <= control.keys()
     if supply is None or lacks_gains or not cylinders.keys() == valves.keys() <= set(active):
@@ -188,8 +190,11 @@ def _warn_about_unit(
     """Warn about a number that is possible and hardly in its SI unit."""
     text = implausible_value_text(key, value, is_rotary, section.schema.component)
     if text and math.isfinite(value):
-        message = f"{section.source_location(key)}: '{key}' of {section.title} {text}"
-        warnings.warn(message, CraneWarning, stacklevel=2)
+        warnings.warn(
+            f"{section.source_location(key)}: '{key}' of {section.title} {text}",
+            CraneWarning,
+            stacklevel=2,
+        )
 
 
 def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinder) -> None:
@@ -200,25 +205,32 @@ def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinde
     if 0 < cylinder.relief <= supply.pressure and not implausible_value_text(
         "relief", cylinder.relief
     ):
-        message = (
-            f"{section.source_location('relief')}: 'relief' of {section.title} is "
-            f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
-            "pump gives flows off there before it can press, give a higher one"
+        warnings.warn(
+            (
+                f"{section.source_location('relief')}: 'relief' of {section.title} is "
+                f"{cylinder.relief:g} Pa, not above the supply's {supply.pressure:g} Pa: what the "
+                "pump gives flows off there before it can press, give a higher one"
+            ),
+            CraneWarning,
+            stacklevel=2,
         )
-        warnings.warn(message, CraneWarning, stacklevel=2)
 
 
 def _read_cylinder(
     joint: str, item: YamlSection, tree: TreeBuilder, supply: Supply | None
 ) -> Cylinder:
     if missing_limit := tree.missing_limit_text(joint):
-        problem = f"joint '{joint}' {missing_limit}, a cylinder needs the limits of its stroke"
-        report_error(item.error_at(None, problem))
+        report_error(
+            item.error_at(
+                None, f"joint '{joint}' {missing_limit}, a cylinder needs the limits of its stroke"
+            )
+        )
     is_rotary = joint in tree.joints and tree.joints[joint].kind == "revolute"
     for key in (*BORE_KEYS, "count", "tube"):
         if is_rotary and key in item and (key != "tube" or item.number(key)):
-            problem = f"{item.title} turns its joint, give area_a and area_b [m3/rad]"
-            raise item.error_at(key, problem)
+            raise item.error_at(
+                key, f"{item.title} turns its joint, give area_a and area_b [m3/rad]"
+            )
     if "rod" in item and "bore" not in item:
         raise item.error_at("rod", f"'rod' of {item.title} goes with 'bore', give it")
     values = item.values()
@@ -234,8 +246,9 @@ def _read_cylinder(
     if "bore" in item:
         bore, rod = values.pop("bore"), values.pop("rod", 0.0)
         if not bore > rod:
-            problem = f"'bore' of {item.title} is {bore:g} m, give more than the rod"
-            raise item.error_at("bore", problem)
+            raise item.error_at(
+                "bore", f"'bore' of {item.title} is {bore:g} m, give more than the rod"
+            )
         for key, value in (("bore", bore), ("rod", rod)):
             _warn_about_unit(item, key, value)
         area = count * math.pi / 4.0
@@ -358,10 +371,9 @@ def curve_data(coefficient: float, curve: OpeningCurve) -> dict[str, object]:
 
 def _normalize_curve(points: Sequence[tuple[float, float]]) -> tuple[float, OpeningCurve]:
     coefficient = max((value for _, value in points), default=0.0)
-    curve = OpeningCurve(
+    return coefficient, OpeningCurve(
         tuple((u, value / coefficient if coefficient > 0 else value) for u, value in points)
     )
-    return coefficient, curve
 
 
 def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
@@ -374,8 +386,12 @@ def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
 def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
     """What a file has over |u|, and its points."""
     try:
-        text = read_plain_file(path, MAX_FILE_SIZE).decode("utf-8-sig")
-        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True))
+        rows = list(
+            csv.DictReader(
+                io.StringIO(read_plain_file(path, MAX_FILE_SIZE).decode("utf-8-sig"), newline=""),
+                skipinitialspace=True,
+            )
+        )
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path.name} cannot be read ({error}), give a CSV file") from None
     names = [name for name in ("flow", "area", "coefficient") if rows and name in rows[0]]

@@ -53,8 +53,9 @@ def read_forces(top: YamlSection, tree: TreeBuilder) -> tuple[ForceElement, ...]
             tree.check_joint(item.text("joint"), item.source_location("joint"))
         element = ForceElement(**item.values("between"), between=between)
         if not (element.stiffness or element.damping or element.force):
-            problem = f"the {element_name(element)} does nothing, give stiffness, damping or force"
-            raise item.error_at(None, problem)
+            raise item.error_at(
+                None, f"the {element_name(element)} does nothing, give stiffness, damping or force"
+            )
         return element
 
     return top.read_items("forces", read_element)
@@ -85,8 +86,9 @@ def read_end_stops(top: YamlSection, tree: TreeBuilder) -> tuple[EndStop, ...]:
     def read_stop(joint: str, item: YamlSection) -> EndStop:
         if missing_limit := tree.missing_limit_text(joint):
             hint = "make it revolute" if missing_limit == "is continuous" else "give it both"
-            problem = f"joint '{joint}' {missing_limit}, a stop needs limits: {hint}"
-            raise item.error_at(None, problem)
+            raise item.error_at(
+                None, f"joint '{joint}' {missing_limit}, a stop needs limits: {hint}"
+            )
         return EndStop(joint, **item.values())
 
     return tuple(top.read_map("end_stops", read_stop, tree.check_joint).values())
@@ -109,7 +111,7 @@ def read_external_forces(
     def read_contact(item: YamlSection) -> Contact:
         frame = _read_moving_frame(item, tree)
         _check_section(top, item, "contacts without a ground", "ground", "{height: 0}")
-        return item.create(Contact, frame, ground, **(contact_law | item.values("frame")))
+        return item.create(Contact, frame, ground, **contact_law | item.values("frame"))
 
     return (
         *read_loads(top, tree),
@@ -122,8 +124,9 @@ def _read_moving_frame(item: YamlSection, tree: TreeBuilder) -> str:
     frame: str = item.text("frame")
     tree.check_link(frame, item.source_location("frame"), "the frame")
     if not tree.is_movable(frame):
-        problem = f"'{frame}' does not move, a load on it does nothing"
-        raise tree.unknown_name_error(str(item.error_at("frame", problem)))
+        raise tree.unknown_name_error(
+            str(item.error_at("frame", f"'{frame}' does not move, a load on it does nothing"))
+        )
     return frame
 
 
@@ -208,9 +211,13 @@ def external_force_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
         if type(force) is Wrench:
             data["loads"].append(load_data(force))
         elif type(force) is Contact:
-            law = {key: getattr(force, key) for key in CONTACT_LAW_KEYS}
-            item = CONTACT.values_of(force, "name") | law
-            data["contacts"].append(item | _name_data(force))
+            data["contacts"].append(
+                (
+                    CONTACT.values_of(force, "name")
+                    | ({key: getattr(force, key) for key in CONTACT_LAW_KEYS})
+                )
+                | _name_data(force)
+            )
         elif type(force) is SoilCutting:
             data["cutters"].append(CUTTER.values_of(force, "name") | _name_data(force))
         else:
@@ -227,8 +234,11 @@ def load_data(force: Wrench) -> dict[str, Any]:
     is_time_series = len(force.times) > 1
     for key, part in (("force", force.values[:, :3]), ("moment", force.values[:, 3:])):
         data[key] = part.tolist() if is_time_series else part[0].tolist()
-    time_key = "phases" if isinstance(force, PhasedWrench) else "times"
-    return data | ({time_key: force.times.tolist()} if is_time_series else {})
+    return data | (
+        {("phases" if isinstance(force, PhasedWrench) else "times"): force.times.tolist()}
+        if is_time_series
+        else {}
+    )
 
 
 def _name_data(force: ExternalForce) -> dict[str, str]:

@@ -77,12 +77,14 @@ def read_sensors(top: YamlSection, tree: TreeBuilder) -> dict[str, Sensor]:
         unit = quantity_unit(tree.tree, name)
         if unit is None:
             known = suggest_names(quantity_names(tree.tree), name)
-            problem = f"'{name}' is no quantity of this machine, {known}"
-            raise tree.unknown_name_error(str(item.error_at(None, problem)))
+            raise tree.unknown_name_error(
+                str(item.error_at(None, f"'{name}' is no quantity of this machine, {known}"))
+            )
         units = accepted_units(unit)
         if "unit" in item and (given := item.text("unit")) not in units:
-            problem = f"'{name}' is in [{given}], give {' or '.join(units) or 'no unit'}"
-            raise item.error_at("unit", problem)
+            raise item.error_at(
+                "unit", f"'{name}' is in [{given}], give {' or '.join(units) or 'no unit'}"
+            )
         if name == TIME and any(key in item for key in SENSOR_PARAMETERS):
             raise item.error_at(None, "time has a column and a unit, and no numbers of a sensor")
         if name.startswith(VALVE_SIGNAL_PREFIX) and "delay" in item:

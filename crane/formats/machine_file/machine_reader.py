@@ -199,8 +199,14 @@ def _read_supports(
     for link in names:
         tree.check_link(link, top.source_location("supports"), "the support")
         if tree.is_movable(link) and link not in contacts:
-            problem = f"support '{link}' moves, name links of the base or those of contacts"
-            raise tree.unknown_name_error(str(top.error_at("supports", problem)))
+            raise tree.unknown_name_error(
+                str(
+                    top.error_at(
+                        "supports",
+                        f"support '{link}' moves, name links of the base or those of contacts",
+                    )
+                )
+            )
     if names and len(names) < 3:
         raise top.error_at("supports", f"{len(names)} supports make no area, name three or more")
     return names
@@ -213,8 +219,9 @@ def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -
     def check_name(name: str, location: str) -> None:
         if name not in names:
             known = suggest_names(names, name)
-            problem = f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
-            raise tree.unknown_name_error(problem)
+            raise tree.unknown_name_error(
+                f"{location}: '{name}' under 'pins' is no joint or loop, {known}"
+            )
 
     return top.value_map("pins", YamlSection.number, check_name)
 
@@ -251,8 +258,9 @@ def _read_tip(top: YamlSection, tree: TreeBuilder) -> str | None:
     with error_recovery(harmless=True):
         tree.check_link(tip, top.source_location("tip"), "the tip frame")
         if not tree.is_movable(tip):
-            problem = f"the tip frame '{tip}' does not move, choose another"
-            raise tree.unknown_name_error(str(top.error_at("tip", problem)))
+            raise tree.unknown_name_error(
+                str(top.error_at("tip", f"the tip frame '{tip}' does not move, choose another"))
+            )
     return tip
 
 

@@ -33,7 +33,7 @@ from crane.description.machine_schema import (
     VIA_POINT,
 )
 from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
-from crane.description.specification import Task
+from crane.description.specification import LoopSpec, Task
 from crane.formats.machine_file.force_sections import external_force_data, load_data
 from crane.formats.machine_file.identification_sections import estimation_data
 from crane.formats.machine_file.machine_reader import read_machine_spec
@@ -195,8 +195,13 @@ class MachineDraft:
     ) -> None:
         """Append a sub-chain; `extra_data` is what its entry says beside its name and file."""
         self.urdfs[name] = robot
-        file = self._path_from_file(f"{len(self.urdfs)}_{portable_file_name(name)}.urdf")
-        self.data["chains"].append({"name": name, "urdf": file, **extra_data})
+        self.data["chains"].append(
+            {
+                "name": name,
+                "urdf": self._path_from_file(f"{len(self.urdfs)}_{portable_file_name(name)}.urdf"),
+                **extra_data,
+            }
+        )
 
     def urdf_of_link(self, link: str) -> etree._Element:
         """The URDF that a link is in."""
@@ -204,8 +209,11 @@ class MachineDraft:
 
     def file_paths(self, file: str) -> list[str]:
         """Paths of all files from the folder on, that of the machine file first."""
-        urdfs = [chain["urdf"] for chain in self.data["chains"]]
-        return [file, *urdfs, *([self.data["payload"]["urdf"]] if self._payload_file else [])]
+        return [
+            file,
+            *[chain["urdf"] for chain in self.data["chains"]],
+            *([self.data["payload"]["urdf"]] if self._payload_file else []),
+        ]
 
     def write(self, folder: Path, file: str) -> None:
         """Write all into a folder, the machine file by this name."""
@@ -213,8 +221,13 @@ class MachineDraft:
         notes = {element: "; ".join(texts) for element, texts in self._element_notes.items()}
         for chain in self.data["chains"]:
             robot = self.urdfs[chain["name"]]
-            own = [(x, text) for x, text in notes.items() if robot in x.iterancestors()]
-            (folder / chain["urdf"]).write_bytes(format_document(robot, self._comment, own))
+            (folder / chain["urdf"]).write_bytes(
+                format_document(
+                    robot,
+                    self._comment,
+                    [(x, text) for x, text in notes.items() if robot in x.iterancestors()],
+                )
+            )
         if self._payload_file is not None:
             (folder / self.data["payload"]["urdf"]).write_bytes(self._payload_file[1])
         nonempty = {key: value for key, value in self.data.items() if value not in (None, [], {})}
@@ -257,10 +270,7 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
     has_plain_drives = drives and all(list(x.factors.values()) == [1.0] for x in drives)
     data: dict[str, Any] = {
         "chains": [],
-        "loops": [
-            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]}
-            for loop in equations.loops
-        ],
+        "loops": [loop_data(loop) for loop in equations.loops],
         "couplings": [COUPLING.values_of(coupling) for coupling in equations.couplings],
         "active": [joint for motor in drives for joint in motor.factors]
         if has_plain_drives
@@ -282,6 +292,11 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
     }
     data |= MACHINE.values_of(machine, *data)
     return {key: data[key] for key in MACHINE.keys if key in data}
+
+
+def loop_data(loop: LoopSpec) -> dict[str, Any]:
+    """An entry of `loops` in a machine file."""
+    return LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]}
 
 
 def friction_data(law: Friction) -> dict[str, Any]:
@@ -335,8 +350,9 @@ def _motor_data(motor: Cylinder) -> dict[str, Any]:
                 f"{name} of the motor of '{motor.joint}' is {getattr(motor, name):g}, which a "
                 f"machine file has no motor with, leave it at {value:g}"
             )
-    size = {"displacement": motor.area_a, "volume": motor.hose_a}
-    return size | MOTOR.values_of(motor, "displacement", "gear", "volume")
+    return {"displacement": motor.area_a, "volume": motor.hose_a} | MOTOR.values_of(
+        motor, "displacement", "gear", "volume"
+    )
 
 
 def _valve_data(valve: Valve) -> dict[str, Any]:
@@ -344,8 +360,10 @@ def _valve_data(valve: Valve) -> dict[str, Any]:
     if valve.spool_b:
         values["spool_b"] = {name: getattr(valve.spool_b, name) for name in SPOOL.keys}
     for name, curve in valve.curves.items():
-        shape = [list(point) for point in curve.points]
-        values[name] = {"coefficient": getattr(valve, name), "shape": shape}
+        values[name] = {
+            "coefficient": getattr(valve, name),
+            "shape": ([list(point) for point in curve.points]),
+        }
     if not valve.margin:
         return {"type": "sharing" if valve.sharing else "orifice"} | values
     size = {"type": "compensated", "margin": valve.margin}

@@ -110,8 +110,11 @@ class TreeBuilder:
 
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
-        is_follow_up = not self.is_complete or not name
-        return FollowUpError(message) if is_follow_up else DescriptionError(message)
+        return (
+            FollowUpError(message)
+            if (not self.is_complete or not name)
+            else DescriptionError(message)
+        )
 
     def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
@@ -120,19 +123,21 @@ class TreeBuilder:
         if joint in self._all_joints:
             problem = f"{source_location}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        problem = (
-            f"{source_location}: joint '{joint}' is unknown, {suggest_names(self.joints, joint)}"
+        raise self.unknown_name_error(
+            f"{source_location}: joint '{joint}' is unknown, {suggest_names(self.joints, joint)}",
+            joint,
         )
-        raise self.unknown_name_error(problem, joint)
 
     def check_link(self, link: str, source_location: str, label: str) -> None:
         """Raise for a link that does not exist, called `label`."""
         if link not in self.links:
-            problem = (
-                f"{source_location}: {label} '{link}' is unknown, "
-                f"{suggest_names(self.links, link)}"
+            raise self.unknown_name_error(
+                (
+                    f"{source_location}: {label} '{link}' is unknown, "
+                    f"{suggest_names(self.links, link)}"
+                ),
+                link,
             )
-            raise self.unknown_name_error(problem, link)
 
     def read_frame_pair(self, section: YamlSection) -> tuple[str, str]:
         """The two frames that a section is between, on two bodies.
@@ -244,11 +249,15 @@ def _read_chain(
     if any(chain.name == name for chain in earlier_chains):
         report_error(item.error_at("name", f"two chains are named '{name}', rename one"))
     elif (earlier_chains or not are_all_read) and parent is None:
-        problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
-        report_error(item.error_at(None, problem))
+        report_error(
+            item.error_at(None, f"chain '{name}' has no 'parent', name the frame it hangs from")
+        )
     elif not earlier_chains and are_all_read and parent is not None:
-        problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
-        report_error(item.error_at("parent", problem))
+        report_error(
+            item.error_at(
+                "parent", f"chain '{name}' is first and stands on the world, remove its 'parent'"
+            )
+        )
         parent = None
     urdf = read_urdf(file)
     for loop in urdf.loops[:1]:
@@ -274,10 +283,12 @@ def _read_loop(section: YamlSection, tree: TreeBuilder, earlier_names: Container
     for end in ("predecessor", "successor"):
         frame = section.text(end)
         if frame and frame not in tree.links and tree.is_complete:
-            problem = (
-                f"{label} has the unknown {end} '{frame}', {suggest_names(tree.links, frame)}"
+            report_error(
+                section.error_at(
+                    end,
+                    f"{label} has the unknown {end} '{frame}', {suggest_names(tree.links, frame)}",
+                )
             )
-            report_error(section.error_at(end, problem))
         frames.append(frame)
     axis = None
     with error_recovery():
@@ -314,8 +325,12 @@ def _read_coupling(
         raise item.error_at("name", f"two couplings are named '{name}', rename one")
     if joints is None or len(list(joints)) < 2:
         raise item.error_at("joints", f"coupling '{name}' joins less than two joints, add some")
-    factors = item.value_map("joints", YamlSection.number, tree.check_joint)
-    return Coupling(name, factors, item.number("offset"), item.source_location())
+    return Coupling(
+        name,
+        item.value_map("joints", YamlSection.number, tree.check_joint),
+        item.number("offset"),
+        item.source_location(),
+    )
 
 
 def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:

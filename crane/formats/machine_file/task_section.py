@@ -39,8 +39,9 @@ def read_tasks(
         item.check_exclusive_keys()
         lever_key = "phases" if has_phases else "joystick"
         if lever_key in item and not valves:
-            problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
-            raise item.error_at(lever_key, problem)
+            raise item.error_at(
+                lever_key, f"task '{name}' moves levers of no valve, add 'hydraulics'"
+            )
         if tip is None and "tip" in item:
             raise _missing_tip_error(name, item, "tip")
         if has_phases:
@@ -50,8 +51,9 @@ def read_tasks(
         else:
             task = _read_continuous_task(name, item, spaces)
         description = item.text("description")
-        loads = read_loads(item, tree, has_phases)
-        return dataclasses.replace(task, description=description, loads=loads)
+        return dataclasses.replace(
+            task, description=description, loads=read_loads(item, tree, has_phases)
+        )
 
     return top.read_map("tasks", read_task)
 
@@ -68,8 +70,9 @@ def _read_continuous_task(
     motion.check_keys(spaces[space])
     if space == "joystick":
         levers = item.value_map(space, lambda part, joint: _read_lever(part, joint, duration))
-        start = _read_start(name, item, spaces["active"])
-        return Task(name, "", duration, space, {}, levers, start=start)
+        return Task(
+            name, "", duration, space, {}, levers, start=_read_start(name, item, spaces["active"])
+        )
     coefficients = {}
     for coordinate in spaces[space]:
         with error_recovery():
@@ -108,17 +111,18 @@ def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: s
     joint_names = [x for x in point_of_coordinate if x in active]
     if joint_names and len(joint_names) < len(point_of_coordinate):
         other = next(x for x in point_of_coordinate if x not in active)
-        problem = f"task '{name}' mixes '{joint_names[0]}' with '{other}', name joints or x, y, z"
-        raise point_of_coordinate[other].error_at(other, problem)
+        raise point_of_coordinate[other].error_at(
+            other, f"task '{name}' mixes '{joint_names[0]}' with '{other}', name joints or x, y, z"
+        )
     for previous, via_point, point in zip(via_points, via_points[1:], points[1:], strict=False):
         if via_point.time <= previous.time:
             problem = f"times of task '{name}' go from {previous.time:g} to {via_point.time:g} s"
             raise point.error_at("time", f"{problem}, let them increase")
     if via_points[0].time != 0:
-        problem = (
-            f"task '{name}' begins at {via_points[0].time:g} s, give its first point the time 0"
+        raise points[0].error_at(
+            "time",
+            f"task '{name}' begins at {via_points[0].time:g} s, give its first point the time 0",
         )
-        raise points[0].error_at("time", problem)
     space, required = "active", active
     if not joint_names:
         if tip is None:
@@ -163,8 +167,10 @@ def _attitude_coordinates(
     if not groups:
         return ()
     if len(groups) > 1:
-        problem = f"task '{name}' has an inclination and roll, pitch, yaw, give one of both"
-        raise point_of_coordinate["inclination"].error_at("inclination", problem)
+        raise point_of_coordinate["inclination"].error_at(
+            "inclination",
+            f"task '{name}' has an inclination and roll, pitch, yaw, give one of both",
+        )
     for point, via in points:
         for values in (via.point, via.rates):
             if 0 < sum(x in values for x in groups[0]) < len(groups[0]):
@@ -229,8 +235,7 @@ def _read_phased_task(
             phases.append(phase)
     if not phases and not item.raw_value("phases"):
         raise item.error_at("phases", f"task '{name}' has no phases, give one at least")
-    max_duration = sum(phase.within for phase in phases)
     return Task(
-        name, "", max_duration, "joystick", {}, start=start_positions,
+        name, "", sum(phase.within for phase in phases), "joystick", {}, start=start_positions,
         phases=tuple(phases), ramp=item.number("ramp"),
     )  # fmt: skip

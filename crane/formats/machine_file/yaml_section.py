@@ -73,8 +73,9 @@ class YamlSection(YamlValues):
             return None
         title = title or f"'{key}'"
         if not isinstance(value, LocatedMapping):
-            problem = f"{title} is {format_value(value)}, give a mapping 'name: value'"
-            raise self.error_at(key, problem)
+            raise self.error_at(
+                key, f"{title} is {format_value(value)}, give a mapping 'name: value'"
+            )
         spec = self._key(key)
         spec = next((x for x in getattr(spec, "types", ()) if isinstance(x, SectionKey)), spec)
         schema = SectionSchema(title, {}, others=getattr(spec, "item", Key()))
@@ -123,8 +124,9 @@ class YamlSection(YamlValues):
             title = f"{spec.section.title} '{name}'"
             item = outer.section(name, title)
             if item is None or not list(item):
-                problem = f"{title} is empty, its keys are {', '.join(spec.section.keys)}"
-                raise outer.error_at(name, problem)
+                raise outer.error_at(
+                    name, f"{title} is empty, its keys are {', '.join(spec.section.keys)}"
+                )
             return read(name, item)
 
         return self.value_map(key, read_item, check_name)
@@ -178,16 +180,23 @@ class YamlSection(YamlValues):
         if value is None:
             return
         if not isinstance(value, list):
-            problem = f"'{key}' is {format_value(value)}, give a list, its items with '- '"
-            report_error(self.error_at(key, problem))
+            report_error(
+                self.error_at(
+                    key, f"'{key}' is {format_value(value)}, give a list, its items with '- '"
+                )
+            )
             self.is_complete = False
             return
         assert isinstance(spec, ListKey) and isinstance(spec.item, SectionKey)
         schema = spec.item.section
         for item in value:
             if not isinstance(item, LocatedMapping):
-                problem = f"'{key}' lists {format_value(item)}, write each item as {{key: value}}"
-                report_error(self.error_at(key, problem))
+                report_error(
+                    self.error_at(
+                        key,
+                        f"'{key}' lists {format_value(item)}, write each item as {{key: value}}",
+                    )
+                )
                 self.is_complete = False
                 continue
             section = YamlSection(item, schema, _item_title(title or schema.title, item))
@@ -227,10 +236,14 @@ class YamlSection(YamlValues):
         if outer is None:
             return ()
         names = self.item_names(key)
-        is_valid = isinstance(outer, LocatedMapping) and all(
-            isinstance(outer[x], LocatedMapping) for x in names
+        return (
+            names
+            if (
+                isinstance(outer, LocatedMapping)
+                and all(isinstance(outer[x], LocatedMapping) for x in names)
+            )
+            else UnknownNames()
         )
-        return names if is_valid else UnknownNames()
 
 
 def _item_title(title: str, item: LocatedMapping) -> str:

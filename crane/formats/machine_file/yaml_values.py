@@ -85,8 +85,12 @@ class YamlValues:
             near = get_close_matches(key, names, 1, 0.75)
             near = near or [name for name in names if name.lower() == key.lower()]
             is_meant = bool(near) and near[0] not in self._data
-            problem = f"unknown key '{key}' in {self.title}, {suggest_names(names, key)}"
-            report_error(self.error_at(key, problem), harmless=True)
+            report_error(
+                self.error_at(
+                    key, f"unknown key '{key}' in {self.title}, {suggest_names(names, key)}"
+                ),
+                harmless=True,
+            )
             if is_meant:
                 self._data[near[0]] = self._data[key]
                 self._data.locations[near[0]] = self._data.locations[key]
@@ -169,8 +173,9 @@ class YamlValues:
             other = next((x for x in second if x in self._data and x != key), None)
             if key is not None and other is not None:
                 names = {"key": key, "other": other, "title": self.title}
-                place = None if first == second else key
-                raise self.error_at(place, problem.format_map(self._data | names))
+                raise self.error_at(
+                    (None if first == second else key), problem.format_map(self._data | names)
+                )
 
     def text(self, key: str) -> Any:
         """A non-empty string, None where there may be none; empty where its error is reported."""
@@ -232,8 +237,11 @@ class YamlValues:
         """A list of finite numbers."""
         value = self.raw_value(key)
         if not isinstance(value, list | tuple) or not value:
-            shown = "empty" if value == [] else format_value(value)
-            raise self._value_error(key, shown, "give a list such as [0, 1]")
+            raise self._value_error(
+                key,
+                ("empty" if value == [] else format_value(value)),
+                "give a list such as [0, 1]",
+            )
         return tuple(self._read_number(key, item) for item in value)
 
     def rows(self, key: str) -> list[list[float]]:
@@ -242,8 +250,9 @@ class YamlValues:
         is_nested = isinstance(value, list | tuple) and any(isinstance(x, list) for x in value)
         rows = value if is_nested else [value]
         if not all(isinstance(row, list | tuple) and row for row in rows):
-            hint = "give a list such as [0, 0, 1], or one of such lists"
-            raise self._value_error(key, format_value(value), hint)
+            raise self._value_error(
+                key, format_value(value), "give a list such as [0, 0, 1], or one of such lists"
+            )
         return [[self._read_number(key, item) for item in row] for row in rows]
 
     def read_list(
