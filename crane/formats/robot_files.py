@@ -6,7 +6,6 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +31,6 @@ _PACKAGE_ROOT = Path(__file__).resolve().parents[2]
 _TIMEOUT = 10 * xacro_process.MAX_SECONDS  # [s], for systems without CPU limits
 
 
-def needs_xacro(xml: XmlFile) -> bool:
-    """Whether a file has elements of xacro, or the suffix .xacro."""
-    if xml.file.suffix.lower() == ".xacro":
-        return True
-    return any(
-        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
-        for element in xml.root.iter()
-    )
-
-
 def expand_xacro(xml: XmlFile) -> XmlFile:
     """Return a file with its macros expanded and the source locations of its elements.
 
@@ -57,7 +46,12 @@ def expand_xacro(xml: XmlFile) -> XmlFile:
         raise DescriptionError(f"{xml.file.name}: {_INSTALL_HINT}")
     if "wrong" in answer:
         raise _expansion_error(xml.file, answer)
-    _check_arguments(xml.file, answer["arguments"])
+    known_arguments = answer["arguments"]
+    for name in load_options().arguments:
+        if name not in (*known_arguments, *OWN_ARGUMENTS):
+            raise InputError(
+                f"{xml.file.name} has no argument '{name}', {suggest_names(known_arguments, name)}"
+            )
     root = etree.fromstring(
         answer["text"].encode("utf-8"),
         etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True),
@@ -110,47 +104,29 @@ def _expansion_error(file: Path, answer: dict[str, Any]) -> CraneError:
     return DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
 
 
-def _check_arguments(file: Path, known_arguments: list[str]) -> None:
-    for name in load_options().arguments:
-        if name not in (*known_arguments, *OWN_ARGUMENTS):
-            raise InputError(
-                f"{file.name} has no argument '{name}', {suggest_names(known_arguments, name)}"
-            )
-
-
 _SDF_SUFFIXES = (".sdf", ".world")
 _ROBOT_SUFFIXES, _AMBIGUOUS_SUFFIXES = (".urdf", ".xacro", *_SDF_SUFFIXES), (".xml", ".mjcf")
 
 
-@dataclass(frozen=True)
-class RobotDocument:
-    """A robot as URDF.
-
-    Attributes:
-        xml: Its elements with their source locations.
-        springs: Springs, which URDF does not have.
-    """
-
-    xml: XmlFile
-    springs: tuple[ForceElement, ...] = ()
-
-
-def open_robot(file: Path) -> RobotDocument:
-    """Return the robot of a file as URDF.
+def open_robot(file: Path) -> tuple[XmlFile, tuple[ForceElement, ...]]:
+    """Return the robot of a file as URDF, and its springs, which URDF does not have.
 
     Raises:
         DescriptionError: The file cannot be read, expanded or translated.
     """
     xml = XmlFile(file)
-    if needs_xacro(xml):
+    if file.suffix.lower() == ".xacro" or any(
+        isinstance(element.tag, str) and element.tag.startswith("{") and "xacro" in element.tag
+        for element in xml.root.iter()
+    ):
         xml = expand_xacro(xml)
     if file.suffix.lower() in _SDF_SUFFIXES and xml.root.tag not in ("sdf", "robot"):
         raise xml.error_at(xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>")
     if xml.root.tag == "sdf":
         from crane.formats.sdf.sdf_translation import translate_to_urdf  # few files are SDF
 
-        return RobotDocument(*translate_to_urdf(xml))
-    return RobotDocument(xml)
+        return translate_to_urdf(xml)
+    return xml, ()
 
 
 def is_robot_file(file: Path) -> bool:
@@ -187,7 +163,7 @@ def open_robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterat
         with warnings.catch_warnings():  # they were issued when it was loaded
             warnings.simplefilter("ignore", CraneWarning)
             documents = [
-                open_robot(chain.urdf).xml
+                open_robot(chain.urdf)[0]
                 for chain in machine.chains
                 if is_robot_file(chain.urdf) and (not chain_names or chain.name in chain_names)
             ]

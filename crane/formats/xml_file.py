@@ -1,6 +1,7 @@
 """Strict reading of XML: no entities, no network access, source locations in all errors."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -9,7 +10,7 @@ from lxml import etree
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import read_plain_file
-from crane.description.findings import report_error
+from crane.description.findings import error_recovery, report_error
 from crane.description.kinematic_tree import Placement, Vector
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
@@ -29,61 +30,20 @@ class SourceLocations:
 
     Args:
         file: Name of the file, the location of elements without another.
-
-    Attributes:
-        locations: All locations.
     """
 
     def __init__(self, file: str):
-        self.locations = [file]
-        self._location_numbers = {file: 0}
+        self._numbers = {file: 0}
+
+    @property
+    def locations(self) -> list[str]:
+        """All locations."""
+        return list(self._numbers)
 
     def set_location(self, element: etree._Element, location: str) -> None:
         """Set the location of an element."""
-        number = self._location_numbers.setdefault(location, len(self.locations))
-        if number == len(self.locations):
-            self.locations.append(location)
+        number = self._numbers.setdefault(location, len(self._numbers))
         element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
-
-
-class _RootDetector:
-    """Parser target that stops at the root element or document type, in any encoding."""
-
-    class RootElementReached(Exception):  # noqa: N818
-        """The root element was reached."""
-
-    class DocumentTypeReached(Exception):  # noqa: N818
-        """A document type was reached."""
-
-    def doctype(self, *_: object) -> None:
-        """Called before the declarations of the document type."""
-        raise self.DocumentTypeReached
-
-    def start(self, *_: object) -> None:
-        """Called at each element."""
-        raise self.RootElementReached
-
-    def end(self, *_: object) -> None:
-        """Never called."""
-
-    def close(self) -> None:
-        """Called at the end of a file without elements."""
-
-
-def _refuse_document_type(file: Path, data: bytes) -> None:
-    """Raise for <!DOCTYPE>, whose entities can expand without bounds or read other files."""
-    try:
-        etree.fromstring(data, etree.XMLParser(target=_RootDetector(), no_network=True))
-    except _RootDetector.DocumentTypeReached:
-        line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
-        raise DescriptionError(
-            f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
-        ) from None
-    except (
-        _RootDetector.RootElementReached,
-        etree.XMLSyntaxError,
-    ):  # errors are reported by the actual parsing
-        pass
 
 
 class XmlFile:
@@ -116,7 +76,6 @@ class XmlFile:
         if not data.strip():
             root = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
             raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
-        _refuse_document_type(file, data)
         if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
             try:
                 data.decode("utf-8")
@@ -128,13 +87,22 @@ class XmlFile:
         parser = etree.XMLParser(
             resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
         )
+        line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
+        # its entities can expand without bounds or read other files
+        document_type_error = DescriptionError(
+            f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
+        )
         try:
             self.root = etree.fromstring(data, parser)
         except etree.XMLSyntaxError as error:
+            if b"<!DOCTYPE" in data or re.search("amplification|reference loop", error.msg or ""):
+                raise document_type_error from None
             text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
             raise DescriptionError(
                 f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
             ) from None
+        if self.root.getroottree().docinfo.doctype:
+            raise document_type_error
 
     @classmethod
     def from_root(cls, file: Path, root: etree._Element, locations: Sequence[str]) -> "XmlFile":
@@ -260,27 +228,15 @@ class XmlFile:
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
         """Read finite numbers, see `number`."""
-        try:
-            return self._read_vector(element, name, label, length, default)
-        except DescriptionError as error:
-            report_error(error)
-            return (math.nan,) * length
-
-    def _read_vector(
-        self,
-        element: etree._Element,
-        name: str,
-        label: str,
-        length: int,
-        default: tuple[float, ...] | None,
-    ) -> tuple[float, ...]:
-        text = element.get(name)
-        if text is None:
-            if default is None:
+        with error_recovery():
+            text = element.get(name)
+            if text is None and default is not None:
+                return default
+            if text is None:
                 raise self.error_at(element, f'{label} has no {name}, add {name}="..."')
-            return default
-        short_text = text if len(text) < _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "..."
-        return self.parse_numbers(element, text, f'{name}="{short_text}" of {label}', length)
+            short = text if len(text) < _MAX_VALUE_LENGTH else f"{text[:_MAX_VALUE_LENGTH]}..."
+            return self.parse_numbers(element, text, f'{name}="{short}" of {label}', length)
+        return (math.nan,) * length
 
     def parse_numbers(
         self, element: etree._Element, text: str, label: str, length: int

@@ -41,6 +41,7 @@ class TreeBuilder:
         self.is_complete = True
         self._all_joints: dict[str, Joint] = {}
         self._parent_joints: dict[str, Joint] = {}
+        self._root = ""
 
     @property
     def tree(self) -> Tree:
@@ -53,6 +54,7 @@ class TreeBuilder:
         Raises:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
+        self._root = self._root or urdf.root_link
         with error_recovery():
             self._attach_to_parent(chain, urdf)
         parts = list(urdf.tree)
@@ -68,6 +70,7 @@ class TreeBuilder:
             return
         floating_tree = add_base_joints(self.tree, freedoms)
         self.links, self._all_joints, self.joints = {}, {}, {}
+        self._root = floating_tree.root_link
         for part in floating_tree:
             self._add_part(part)
 
@@ -110,11 +113,8 @@ class TreeBuilder:
 
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
-        return (
-            FollowUpError(message)
-            if (not self.is_complete or not name)
-            else DescriptionError(message)
-        )
+        is_follow_up = not self.is_complete or not name
+        return FollowUpError(message) if is_follow_up else DescriptionError(message)
 
     def check_joint(self, joint: str, source_location: str) -> None:
         """Raise for a joint that does not exist or does not move."""
@@ -171,7 +171,7 @@ class TreeBuilder:
 
     def is_movable(self, link: str) -> bool:
         """Whether a link is not fixed to the world."""
-        return not self.is_complete or body_of(self._parent_joints, link) != self.tree.root_link
+        return not self.is_complete or body_of(self._parent_joints, link) != self._root
 
     def missing_limit_text(self, joint: str) -> str:
         """How a joint lacks a finite range, in words; empty if it has one, or is unknown."""
@@ -312,25 +312,15 @@ def read_couplings(top: YamlSection, tree: TreeBuilder) -> tuple[Coupling, ...]:
     found: dict[str, Coupling] = {}
     for item in top.list_items("couplings"):
         with error_recovery():
-            coupling = _read_coupling(item, tree, found)
-            found[coupling.name] = coupling
+            name, joints = item.text("name"), item.section("joints")
+            if name in found:
+                raise item.error_at("name", f"two couplings are named '{name}', rename one")
+            if joints is None or len(list(joints)) < 2:
+                problem = f"coupling '{name}' joins less than two joints, add some"
+                raise item.error_at("joints", problem)
+            factors = item.value_map("joints", YamlSection.number, tree.check_joint)
+            found[name] = Coupling(name, factors, item.number("offset"), item.source_location())
     return tuple(found.values())
-
-
-def _read_coupling(
-    item: YamlSection, tree: TreeBuilder, earlier_names: Container[str]
-) -> Coupling:
-    name, joints = item.text("name"), item.section("joints")
-    if name in earlier_names:
-        raise item.error_at("name", f"two couplings are named '{name}', rename one")
-    if joints is None or len(list(joints)) < 2:
-        raise item.error_at("joints", f"coupling '{name}' joins less than two joints, add some")
-    return Coupling(
-        name,
-        item.value_map("joints", YamlSection.number, tree.check_joint),
-        item.number("offset"),
-        item.source_location(),
-    )
 
 
 def read_drives(top: YamlSection, tree: TreeBuilder) -> tuple[Drive, ...]:

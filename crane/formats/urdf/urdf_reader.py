@@ -128,8 +128,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     Raises:
         DescriptionError: The file is wrong; the message has file and line.
     """
-    source = open_robot(file)
-    xml = source.xml
+    xml, springs = open_robot(file)
     record_parsed_file(xml)
     _check_elements(xml, edit)
     links, joints = _elements_by_name(xml, "link"), _elements_by_name(xml, "joint")
@@ -180,7 +179,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         home_lines,
         read_tip(xml, links),
         is_complete=not xml.unnamed_kinds,
-        springs=source.springs,
+        springs=springs,
     )
 
 
