@@ -79,8 +79,7 @@ def info(
 
 def _print_names(machine: str, assembly: AssemblyOptions, pattern: str | None) -> None:
     from crane.common.package_search import check_package_folders, use_load_options
-    from crane.description.machine_parameters import parameters
-    from crane.description.name_search import names_by_kind, search_names
+    from crane.description.machine_parameters import names_by_kind, parameters, search_names
     from crane.formats.machine_file.machine_reader import read_machine_spec
 
     files = assembly.package_values()

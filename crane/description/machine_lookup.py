@@ -16,15 +16,11 @@ FOLDER_FILES = ("robot.yaml", "model.sdf")  # of example-parallel-robots and Gaz
 MACHINE_SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 
 
-def _models_folder() -> Path:
-    package = Path(__file__).resolve().parents[1]
-    installed = package / "models"
-    return installed if installed.is_dir() else package.parent / "models"
-
-
 def bundled_machines() -> dict[str, Path]:
     """Return the machine files of the machines in the package by name."""
-    return {path.stem: path for path in sorted(_models_folder().glob("*.yaml"))}
+    package = Path(__file__).resolve().parents[1]
+    folder = package / "models" if (package / "models").is_dir() else package.parent / "models"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def machine_summary(path: Path) -> str:

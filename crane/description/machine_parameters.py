@@ -1,15 +1,38 @@
-"""Parameters of a machine: names, values and where they are in its description."""
+"""Parameters of a machine: names, values, units and where they are in its description."""
 
 import dataclasses
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from typing import Any
 
+from crane.common.errors import InputError
+from crane.description.circuit_schema import (
+    ACCUMULATOR,
+    CYLINDER,
+    ELEMENT,
+    ENGINE,
+    FIRST_PUMP,
+    LINE,
+    OIL,
+    VALVE,
+    VALVE_CONTROL,
+)
 from crane.description.force_elements import Friction
+from crane.description.key_types import NumberKey
 from crane.description.kinematic_tree import Joint, Link, Tree
 from crane.description.machine_lookup import bundled_machines, command_line_arguments
+from crane.description.machine_schema import END_STOP, FORCE, FRICTION, GAS_SPRING, ROPE
 from crane.description.sensors import (
+    PRESSURE_PREFIX,
+    SENSOR_PREFIX,
+    SUPPLY_PRESSURE,
+    TANK_PRESSURE,
+    VALVE_SIGNAL_PREFIX,
+    parse_sensor_parameter,
+    quantity_names,
+    quantity_unit,
     sensor_parameters,
 )
 from crane.description.specification import Chain, MachineSpec, PIGains
@@ -164,3 +187,134 @@ def unknown_parameter_text(spec: MachineSpec, names: Iterable[str], unknown_name
         f"parameter '{unknown_name}' is unknown, {suggestion}crane info "
         f"{command_line_arguments(machine_name)} --names lists all names"
     )
+
+
+_INERTIAL_UNITS = {"com": "m", "inertia": "kg m2"}
+_PLACEMENT_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
+_SECTIONS = {
+    "friction": FRICTION, "spring": FORCE, "gas_spring": GAS_SPRING, "end_stop": END_STOP,
+    "rope": ROPE, "cylinder": CYLINDER, "valve": VALVE, "valve_control": VALVE_CONTROL,
+    "supply": FIRST_PUMP, "oil": OIL, "engine": ENGINE, "line": LINE, "accumulator": ACCUMULATOR,
+    "element": ELEMENT,
+}  # fmt: skip
+
+
+def parameter_unit(tree: Tree, name: str) -> str:
+    """SI unit of a number as `crane.description.parameters` names it, "" of one without.
+
+    Numbers of several, with `*`, are common factors, and have none.
+    """
+    if "*" in name:
+        return ""
+    if name.startswith(SENSOR_PREFIX):
+        quantity, sensor_parameter = parse_sensor_parameter(name)
+        return {"scale": "", "delay": "s"}.get(
+            sensor_parameter, quantity_unit(tree, quantity) or ""
+        )
+    prefix, _, rest = name.partition(".")
+    part, _, key = name.rpartition(".")
+    owner = rest.rpartition(".")[0]
+    if name.startswith(PINS_PREFIX):
+        return "N"
+    if prefix == "control":  # gains of two kinds of controllers
+        return ""
+    if prefix not in _SECTIONS:
+        return _tree_parameter_unit(tree, part, key)
+    is_rotary = owner in tree.joints and tree.joints[owner].kind == "revolute"
+    value = _SECTIONS[prefix].keys.get(key)
+    value = next(iter(getattr(value, "types", ())), value)  # an edge, which may be a curve
+    if not isinstance(value, NumberKey):
+        return ""
+    return value.rotary_unit or value.unit if is_rotary else value.unit
+
+
+def _tree_parameter_unit(tree: Tree, part: str, key: str) -> str:
+    kind = part.rpartition(".")[2]
+    if kind in _INERTIAL_UNITS and part not in tree.links:
+        return _INERTIAL_UNITS[kind]
+    if key == "mass":
+        return "kg"
+    if part in tree.joints and key in ("lower", "upper", "rotor_inertia"):
+        is_rotary = tree.joints[part].kind == "revolute"
+        if key == "rotor_inertia":
+            return "kg m2" if is_rotary else "kg"
+        return "rad" if is_rotary else "m"
+    return _PLACEMENT_UNITS.get(key, "")
+
+
+NamesByKind = dict[str, dict[str, str]]  # kind -> name -> short description
+_MAX_SUGGESTIONS, _MIN_SIMILARITY = 5, 0.6
+
+
+def names_by_kind(spec: MachineSpec) -> NamesByKind:
+    """Return the names of joints, frames, columns of recordings and parameters of a machine.
+
+    Returns:
+        By kind and name a short description: type of the joint, joint or link that carries the
+        frame, unit of the column, value of the parameter with its unit.
+    """
+    tree = spec.tree
+    cylinders = {} if spec.hydraulics is None else spec.hydraulics.cylinders
+
+    def is_available(name: str) -> bool:  # whether the circuit has that valve or chamber
+        heads = PRESSURE_PREFIX, VALVE_SIGNAL_PREFIX, "spool_"
+        head = next((head for head in heads if name.startswith(head)), "")
+        rest = name.removeprefix(head)
+        if name in (SUPPLY_PRESSURE, TANK_PRESSURE):
+            return bool(cylinders)
+        return not head or not cylinders.keys().isdisjoint((rest, rest[:-2]))
+
+    parents = {joint.child: joint for joint in tree.joints.values()}
+    return {
+        "joint": {joint.name: joint.kind for joint in tree.moving_joints},
+        "frame": {
+            link: f"{'moved by' if parents[link].is_movable else 'on'} "
+            f"{parents[link].name if parents[link].is_movable else parents[link].parent}"
+            if link in parents
+            else "root"
+            for link in tree.links
+        },
+        "column": {
+            name: quantity_unit(tree, name) or ""
+            for name in quantity_names(tree)
+            if is_available(name)
+        },
+        "parameter": {
+            name: f"{value:.6g} {parameter_unit(tree, name)}".rstrip()
+            for name, value in parameters(spec).items()
+        },
+    }
+
+
+def search_names(names: NamesByKind, pattern: str) -> NamesByKind:
+    """Select the names that a pattern matches.
+
+    Args:
+        names: As `names_by_kind` returns them.
+        pattern: With `*`, `?` or `[...]` it has to match a whole name, else a part of a name.
+
+    Raises:
+        InputError: No name matches; the message lists similar names.
+    """
+    lowercase_pattern = pattern.lower()
+    glob = lowercase_pattern if set(lowercase_pattern) & set("*?[") else f"*{lowercase_pattern}*"
+    found = {
+        kind: {name: text for name, text in values.items() if fnmatchcase(name.lower(), glob)}
+        for kind, values in names.items()
+    }
+    if any(found.values()):
+        return found
+    name_of_word: dict[str, str] = {}  # first name that contains a word
+    for name in [name for values in names.values() for name in values]:
+        for word in (name, *name.split("."), *name.replace("_", ".").split(".")):
+            name_of_word.setdefault(word.lower(), name)
+    similar_words = get_close_matches(
+        lowercase_pattern.strip("*?[]"), name_of_word, _MAX_SUGGESTIONS, _MIN_SIMILARITY
+    )
+    suggestions = list(dict.fromkeys(repr(name_of_word[word]) for word in similar_words))
+    hint = (
+        f"did you mean {' or '.join(suggestions)}?"
+        if suggestions
+        else "leave it out for all parameters"
+    )
+    raise InputError(f"nothing is called like '{pattern}', {hint}")

@@ -80,7 +80,6 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
 def _check_change(
     spec: MachineSpec, names: Mapping[str, float], name: str, new_value: object
 ) -> float:
-    """Return the new value of a parameter as a number."""
     if name.startswith(SENSOR_PREFIX):
         quantity, _ = parse_sensor_parameter(name)
         if quantity_unit(spec.tree, quantity) is None and quantity not in spec.sensors:
@@ -120,7 +119,6 @@ def _replace_values(owner: T, new_values: Mapping[FieldPath, Any]) -> T:
 
 
 def _warn_about_unit(spec: MachineSpec, name: str, value: float) -> None:
-    """Warn of a parameter of the circuit that is implausible in its SI unit."""
     part, _, key = name.rpartition(".")
     kind, _, joint = part.partition(".")
     is_rotary = joint in spec.tree.joints and spec.tree.joints[joint].kind != "prismatic"
@@ -355,7 +353,6 @@ def _propagate_locks(
 
 
 def _check_lock_coordinate(joint: Joint, value: float) -> None:
-    """Raise if a coordinate [m], [rad] is outside of the limits of a joint."""
     lower, upper = joint.limits.lower, joint.limits.upper
     tolerance = _LIMIT_TOLERANCE * max(1.0, abs(value))
     if not lower - tolerance <= value <= upper + tolerance:
@@ -367,7 +364,6 @@ def _check_lock_coordinate(joint: Joint, value: float) -> None:
 
 
 def _fix_joint(joint: Joint, value: float) -> Joint:
-    """Return a fixed joint in place of one at a coordinate."""
     from scipy.spatial.transform import Rotation
 
     fixed_joint = dataclasses.replace(joint, kind="fixed", limits=Limits(), rotor_inertia=0.0)

@@ -243,7 +243,6 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
 
 
 def _home_element_text(spec: MachineSpec) -> str:
-    """Return the name of the section or element of a file that contains home."""
     if spec.path.suffix.lower() in (".yaml", ".yml"):
         return "under 'home:'"
     if is_sdf_file(spec.path):

@@ -93,7 +93,6 @@ def _replace_text(path: Path, text: str) -> None:
 
 
 def _without_lenience(machine: Machine) -> Machine:
-    """Return a machine whose load arguments do not accept any home."""
     arguments = {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
     return replace(machine, arguments=MappingProxyType(arguments))
 
@@ -115,7 +114,6 @@ def _check_is_writable(machine: Machine, path: Path) -> None:
 
 
 def _check_written_home(path: Path, expected: Machine) -> None:
-    """Load the file that was written, and compare its home."""
     try:
         machine = load(
             path,
@@ -136,7 +134,6 @@ def _check_written_home(path: Path, expected: Machine) -> None:
 
 
 def _yaml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
-    """Return the edits of a machine file or robot.yaml."""
     line_break = "\r\n" if "\r\n" in text else "\n"
     top = yaml.compose(text, yaml.SafeLoader)
     assert isinstance(top, yaml.MappingNode), "it was read before"
@@ -193,7 +190,6 @@ def _yaml_text(value: str | float) -> str:
 
 
 def _xml_edits(text: str, home: Mapping[str, float]) -> list[TextEdit]:
-    """Return the edits of a URDF."""
     data = text.encode("utf-8")
     line_break = "\r\n" if "\r\n" in text else "\n"
     home_elements: list[tuple[int, int]] = []  # start of the start tag and of the end tag

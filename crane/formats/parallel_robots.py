@@ -68,7 +68,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         raise DescriptionError(f"{path}: there is no {URDF_FILE} beside it, add it")
     replaced_types = _replaced_joint_types(top)
     urdf = read_urdf(file, lambda xml: _replace_joint_types(xml, replaced_types, top))
-    for joint, (kind, _) in replaced_types.items():
+    for joint, kind in replaced_types.items():
         if kind not in ("SPHERICAL", "FIXED"):
             universal_axes = _UNIVERSAL_PATTERN.fullmatch(kind)
             urdf = _split_universal_joint(
@@ -93,8 +93,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         if joint not in tree.joints and joint in replaced_types:
             raise top.error_at(
                 "name_mot",
-                f"the motor '{joint}' is {replaced_types[joint][0]}, drive a joint with one "
-                "freedom",
+                f"the motor '{joint}' is {replaced_types[joint]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.source_location("name_mot"))
     home, home_lines = read_home(top, tree)
@@ -121,8 +120,8 @@ def read_parallel_robot(path: Path) -> MachineSpec:
     )
 
 
-def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
-    """Return the new type of joints of the URDF, and its source location, by joint."""
+def _replaced_joint_types(top: YamlSection) -> dict[str, str]:
+    """Return the new type of joints of the URDF by joint."""
     names = top.names("joint_name")
     if not names:
         return {}
@@ -140,16 +139,12 @@ def _replaced_joint_types(top: YamlSection) -> dict[str, tuple[str, str]]:
                 "joint_type",
                 f"joint type '{kind}' is unknown, {suggest_names(_JOINT_TYPES, kind)}",
             )
-    where = top.source_location("joint_type")
-    return {name: (kind, where) for name, kind in zip(names, types, strict=True)}
+    return dict(zip(names, types, strict=True))
 
 
-def _replace_joint_types(
-    xml: XmlFile, replaced_types: dict[str, tuple[str, str]], top: YamlSection
-) -> None:
-    """Write other types of joints into a URDF."""
+def _replace_joint_types(xml: XmlFile, replaced_types: dict[str, str], top: YamlSection) -> None:
     joints = {joint.get("name", "").strip(): joint for joint in xml.root.iterfind("joint")}
-    for name, (kind, _) in replaced_types.items():
+    for name, kind in replaced_types.items():
         if name not in joints:
             raise top.error_at(
                 "joint_name", f"joint '{name}' is unknown, {suggest_names(joints, name)}"
@@ -233,12 +228,10 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
 
 
 def _read_texts(top: YamlSection, key: str) -> list[str]:
-    """A list of texts."""
     return top.read_list(key, "give a list such as [a, b]", _is_text, "which is no text, quote it")
 
 
 def _read_pairs(top: YamlSection, key: str) -> list[list[str]]:
-    """A list of pairs of names."""
     pairs = top.read_list(
         key,
         "give a list of pairs [[a, b]]",

@@ -113,7 +113,6 @@ def format_document(
 
 
 def _comment_text(comment: str) -> str:
-    """Return a text that is allowed in an XML comment."""
     return re.sub("-(?=-)", "- ", " ".join(format_one_line(comment).split())).strip(" -")
 
 

@@ -42,7 +42,6 @@ def main() -> None:
 
 
 def _limit_resources() -> None:
-    """Limit time and memory, if the system supports it."""
     try:
         import resource
     except ImportError:
@@ -73,16 +72,13 @@ class _ReadFiles:
         class LocationBuilder(expatbuilder.ExpatBuilderNS):
             def start_element_handler(self, name: str, attributes: list[str]) -> None:
                 super().start_element_handler(name, attributes)
-                files.set_location(self.curNode, number, self.getParser().CurrentLineNumber)
+                element, line = self.curNode, self.getParser().CurrentLineNumber
+                if not element.tagName.startswith(_XACRO_PREFIX):
+                    element.setAttribute(LOCATION_ATTRIBUTE, f"{number}:{line}")
+                elif element.localName == "arg":
+                    files.arguments[element.getAttribute("name")] = None
 
         return LocationBuilder().parseString(Path(file).read_bytes())
-
-    def set_location(self, element: Any, number: int, line: int) -> None:
-        """Record where an element is written."""
-        if not element.tagName.startswith(_XACRO_PREFIX):
-            element.setAttribute(LOCATION_ATTRIBUTE, f"{number}:{line}")
-        elif element.localName == "arg":
-            self.arguments[element.getAttribute("name")] = None
 
 
 def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:

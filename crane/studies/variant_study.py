@@ -19,7 +19,7 @@ from crane.common.errors import (
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
-from crane.description.parameter_units import parameter_unit
+from crane.description.machine_parameters import parameter_unit
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.machine_loading import MachineVariants, load
 from crane.machine.machine import Machine

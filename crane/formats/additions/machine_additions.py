@@ -176,7 +176,6 @@ def add_cylinder(
 
 
 def _choice_notes(distances: DistanceCurve, start_index: int, shares_load: bool) -> list[str]:
-    """Return notes on the choice of the driven joint and of the home configuration."""
     notes = []
     if distances.alternative_joints and not shares_load:
         notes.append(

@@ -224,7 +224,6 @@ class _OpenLoopSearch:
         return inertial is None or inertial.mass <= _MAX_DUMMY_MASS * min(1.0, self.largest_mass)
 
     def _is_away_from_origin(self, link: str) -> bool:
-        """Whether a frame is not at the origin of its body."""
         return bool(
             np.abs(
                 self.placements[link].translation - self.placements[self.bodies[link]].translation
@@ -236,7 +235,6 @@ class _OpenLoopSearch:
         return frozenset(self.bodies[link] for link in pair)
 
     def _joints_between(self, first: str, second: str) -> list[Joint]:
-        """Return the movable joints of the tree between two links."""
         return sorted(
             joints_between(self.parent_joints, first, second), key=lambda joint: joint.name
         )

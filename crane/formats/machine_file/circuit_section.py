@@ -187,7 +187,6 @@ def read_component(
 def _warn_about_unit(
     section: YamlSection, key: str, value: float, is_rotary: bool = False
 ) -> None:
-    """Warn about a number that is possible and hardly in its SI unit."""
     text = implausible_value_text(key, value, is_rotary, section.schema.component)
     if text and math.isfinite(value):
         warnings.warn(

@@ -133,7 +133,6 @@ def _read_moving_frame(item: YamlSection, tree: TreeBuilder) -> str:
 def _check_section(
     top: YamlSection, item: YamlSection, problem: str, key: str, example: str
 ) -> None:
-    """Raise where a section that an item needs is absent."""
     if key not in top:
         raise item.error_at(None, f"{problem}, add '{key}: {example}'")
 

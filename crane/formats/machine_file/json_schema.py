@@ -108,7 +108,6 @@ class _SchemaDefinitions:
         )
 
     def _value(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
-        """The values that a key may have."""
         match key:
             case SectionKey():
                 return self.section(name, key.section, is_partial) | {"type": "object"}

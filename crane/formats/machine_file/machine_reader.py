@@ -62,19 +62,18 @@ def read_machine_spec(name: str | Path) -> MachineSpec:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
     path = find_machine_file(name)
-    spec = _read_by_format(path)
+    if is_robot_file(path):
+        spec = _read_robot(path)
+    elif path.suffix.lower() in (".xml", ".mjcf"):
+        from crane.formats.mjcf.mjcf_reader import read_mjcf  # few files are MJCF
+
+        spec = read_mjcf(path)
+    elif is_parallel_robot(path):
+        spec = read_parallel_robot(path)
+    else:
+        spec = _read_machine(path)
     warn_about_open_loops(spec)
     return spec
-
-
-def _read_by_format(path: Path) -> MachineSpec:
-    if is_robot_file(path):
-        return _read_robot(path)
-    if path.suffix.lower() in (".xml", ".mjcf"):
-        from crane.formats.mjcf.mjcf_reader import read_mjcf  # Pinocchio is in it
-
-        return read_mjcf(path)
-    return read_parallel_robot(path) if is_parallel_robot(path) else _read_machine(path)
 
 
 def _read_robot(path: Path) -> MachineSpec:
@@ -193,7 +192,6 @@ def _read_machine(path: Path) -> MachineSpec:
 def _read_supports(
     top: YamlSection, tree: TreeBuilder, external_forces: Sequence[ExternalForce]
 ) -> tuple[str, ...]:
-    """Links that the machine stands on."""
     names = top.names("supports")
     contacts = {force.frame for force in external_forces if isinstance(force, Contact)}
     for link in names:
@@ -229,7 +227,6 @@ def _read_pins(top: YamlSection, tree: TreeBuilder, loops: Sequence[LoopSpec]) -
 def _read_free_joints(
     top: YamlSection, tree: TreeBuilder, active: Container[str]
 ) -> tuple[str, ...]:
-    """Independent coordinates that nothing drives."""
     free: tuple[str, ...] = ()
     with error_recovery(harmless=True):
         free = top.names("free")

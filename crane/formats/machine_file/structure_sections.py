@@ -56,7 +56,15 @@ class TreeBuilder:
         """
         self._root = self._root or urdf.root_link
         with error_recovery():
-            self._attach_to_parent(chain, urdf)
+            if chain.parent is not None and chain.parent not in self.links:
+                raise self.unknown_name_error(
+                    f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', "
+                    f"no frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
+                    chain.parent,
+                )
+            attachments = [chain.attachment_joint(urdf.root_link)] * (chain.parent is not None)
+            for joint in self.filter_new_names(attachments):
+                self._add_part(joint)
         parts = list(urdf.tree)
         free = list(self.filter_new_names(parts))
         # what is not there goes by another name
@@ -77,17 +85,19 @@ class TreeBuilder:
     def filter_new_names(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
         for part in parts:
-            earlier = self._find_same_name(part)
+            is_link = isinstance(part, Link)
+            earlier = (self.links if is_link else self._all_joints).get(part.name)
             if earlier is None:
                 yield part
                 continue
-            report_error(_duplicate_name_error(part, earlier))
+            report_error(
+                DescriptionError(
+                    f"{part.source_location}: {'link' if is_link else 'joint'} '{part.name}' is "
+                    f"also in {earlier.source_location}, rename one"
+                )
+            )
             if earlier.source_location == part.source_location:
                 return  # one file twice: the rest of it is there, too
-
-    def _find_same_name(self, part: Link | Joint) -> Link | Joint | None:
-        names = self.links if isinstance(part, Link) else self._all_joints
-        return names.get(part.name)
 
     def _add_part(self, part: Link | Joint) -> None:
         if isinstance(part, Link):
@@ -96,20 +106,6 @@ class TreeBuilder:
         self._all_joints[part.name] = self._parent_joints[part.child] = part
         if part.is_movable:
             self.joints[part.name] = part
-
-    def _attach_to_parent(self, chain: Chain, urdf: UrdfModel) -> None:
-        if chain.parent is None:
-            return
-        if chain.parent not in self.links:
-            raise self.unknown_name_error(
-                f"{chain.source_location}: chain '{chain.name}' hangs from '{chain.parent}', no "
-                f"frame of an earlier chain, {suggest_names(self.links, chain.parent)}",
-                chain.parent,
-            )
-        joint = chain.attachment_joint(urdf.root_link)
-        if (earlier := self._find_same_name(joint)) is not None:
-            raise _duplicate_name_error(joint, earlier)
-        self._add_part(joint)
 
     def unknown_name_error(self, message: str, name: str = "?") -> CraneError:
         """The error about a name, unless a chain is not there or the name has been refused."""
@@ -188,14 +184,6 @@ class TreeBuilder:
         parents = {joint.parent for joint in self._all_joints.values()}
         leaves = [name for name in self.links if name not in parents]
         return leaves[0] if len(leaves) == 1 else None
-
-
-def _duplicate_name_error(part: Link | Joint, earlier: Link | Joint) -> DescriptionError:
-    kind = "link" if isinstance(part, Link) else "joint"
-    return DescriptionError(
-        f"{part.source_location}: {kind} '{part.name}' is also in {earlier.source_location}, "
-        f"rename one"
-    )
 
 
 def read_chains(

@@ -143,7 +143,6 @@ def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: s
 
 
 def _read_via_point(point: YamlSection, title: str) -> ViaPoint:
-    """A via point with the coordinates that it names."""
     time = point.number("time")
     coordinates = {x: point.number(x) for x in point if x not in ("time", "rates")}
     if not coordinates:
@@ -160,7 +159,6 @@ def _attitude_coordinates(
     point_of_coordinate: dict[str, YamlSection],
     points: Sequence[tuple[YamlSection, ViaPoint]],
 ) -> tuple[str, ...]:
-    """Coordinates of the attitude that the points of a task name."""
     groups = [
         group for group in ATTITUDE_COORDINATES if any(x in point_of_coordinate for x in group)
     ]

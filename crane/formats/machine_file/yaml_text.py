@@ -47,7 +47,13 @@ def format_yaml(data: Mapping[str, Any], notes: Mapping[KeyPath, str] | None = N
     lines, top = text.split("\n"), yaml.compose(text, yaml.SafeLoader)
     assert top is not None, "it was just written"
     for key_path, note in notes.items():
-        lines[_find_node(top, key_path).end_mark.line] += f"  # {format_one_line(note)}"
+        node: Any = top
+        for key in key_path:
+            if isinstance(key, int):
+                node = node.value[key]
+            else:
+                node = next(value for name, value in node.value if name.value == key)
+        lines[node.end_mark.line] += f"  # {format_one_line(note)}"
     return "\n".join(lines)
 
 
@@ -65,12 +71,3 @@ def _with_block_mappings(item: Any, key_path: KeyPath, block_paths: set[KeyPath]
             for i, value in enumerate(item)
         ]
     return item
-
-
-def _find_node(top: yaml.Node, key_path: KeyPath) -> yaml.Node:
-    for key in key_path:
-        if isinstance(key, int):
-            top = top.value[key]
-        else:
-            top = next(value for name, value in top.value if name.value == key)
-    return top

@@ -105,11 +105,9 @@ class YamlValues:
         return DescriptionError(f"{self.source_location(key)}: {problem}")
 
     def _value_error(self, key: str, value_text: str, hint: str) -> DescriptionError:
-        """An error about the value of a key."""
         return self.error_at(key, f"'{key}' of {self.title} is {value_text}, {hint}")
 
     def _key(self, name: str) -> Key:
-        """Type of the value of a key."""
         return self.schema.keys.get(name) or self.schema.others or Key()
 
     def _get_value(self, key: str) -> Any:

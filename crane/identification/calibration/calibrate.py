@@ -11,7 +11,7 @@ from crane.common.errors import suggest_names as known_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.description.parameter_units import parameter_unit
+from crane.description.machine_parameters import parameter_unit
 from crane.description.sensors import (
     PRESSURE_PREFIX,
     SENSOR_PREFIX,
