@@ -1,8 +1,8 @@
 """Programs: straight-line formulas, and routines that call them in loops.
 
 A formula reads arrays and writes one, without branches; its operations come from a `Tape`. A
-routine adds sequences, loops over samples, conditions and local arrays. Programs do not depend on
-the target language: an emitter (`crane.codegen.llvm`) translates them.
+routine adds sequences, loops over samples, conditions and local arrays. `crane.codegen.llvm`
+translates both.
 
     with program.add_routine("each", counts=("count",), arrays=("inputs", "out")) as r:
         with r.loop(r.count) as i:
@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen.intermediate_representation import Formula, Layout, Routine, layout_of
 from crane.codegen.llvm.machine_code import MachineCode
+from crane.codegen.llvm.routine_builder import Routine
 from crane.codegen.program_cache import FunctionSignature, ProgramRecord, cache_entry_name
 from crane.codegen.symbolic import Scalar, required_operations
+from crane.codegen.vector_layout import Formula, Layout
 
 MAX_OPERATIONS = 200_000  # operations of a formula; longer ones take minutes to compile
 
@@ -116,9 +117,10 @@ class Program:
         if operations > MAX_OPERATIONS:
             raise FormulaTooLongError(operations)
         self.max_formula_length = max(self.max_formula_length, operations)
-        formula = self.functions[name] = Formula(name, input_count, flat, layout_of(parts))
-        self._signatures[name] = FunctionSignature(formula.argument_kinds, formula.layout)
-        return formula.layout
+        layout = Layout(**{part: len(values) for part, values in parts.items()})
+        formula = self.functions[name] = Formula(name, input_count, flat, layout)
+        self._signatures[name] = FunctionSignature(formula.argument_kinds, layout)
+        return layout
 
     @contextmanager
     def add_routine(

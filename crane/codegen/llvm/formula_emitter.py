@@ -10,9 +10,9 @@ one.
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from crane.codegen.intermediate_representation import Formula
 from crane.codegen.llvm.vector_functions import MAX_VECTOR_WIDTH, VECTOR_FUNCTIONS, format_real
 from crane.codegen.symbolic import Scalar, SymbolicExpression, required_operations
+from crane.codegen.vector_layout import Formula
 
 # Allows fused multiply-add; reordering sums would gain nothing and could cancel NaN.
 FAST_MATH_FLAGS = "nsz arcp contract"
