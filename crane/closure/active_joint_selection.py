@@ -115,8 +115,11 @@ def condition_number(gamma: Array, scales_of_motion: Array, active: Indices) -> 
     Returns:
         () or (N,), at least 1.
     """
-    scaled_gamma = gamma * scales_of_motion[active] / scales_of_motion[:, None]
-    return np.asarray(np.linalg.norm(scaled_gamma, 2, axis=(-2, -1)))
+    return np.asarray(
+        np.linalg.norm(
+            gamma * scales_of_motion[active] / scales_of_motion[:, None], 2, axis=(-2, -1)
+        )
+    )
 
 
 def select_columns(
@@ -202,10 +205,8 @@ def propose_active_joints(
         candidates: Columns to select from; all if not given.
         required: Columns that are selected in any case.
     """
-    scale = motion_scales(model)
-    basis = null_space_basis(jacobian, scale, DEAD_CENTRE_TOLERANCE)
-    coordinates = Coordinates(model)
-    names = coordinates.names
+    basis = null_space_basis(jacobian, motion_scales(model), DEAD_CENTRE_TOLERANCE)
+    names = Coordinates(model).names
     columns = range(model.nv) if candidates is None else candidates
     free = [i for i in columns if i not in coupled]
     effort = np.asarray(model.effortLimit)

@@ -211,8 +211,9 @@ class _AssemblyModeSearch:
             self._loop_subsets[loop_indices] = self.equations.subset(
                 [names[i] for i in loop_indices]
             )
-        subset_rows = np.flatnonzero(np.isin(loop_of_row, loop_indices))
-        return self._loop_subsets[loop_indices], np.searchsorted(subset_rows, rows)
+        return self._loop_subsets[loop_indices], np.searchsorted(
+            np.flatnonzero(np.isin(loop_of_row, loop_indices)), rows
+        )
 
     def _block_indices(self, block: int) -> tuple[Indices, Indices]:
         rows, columns = self.blocks[block]
@@ -221,13 +222,15 @@ class _AssemblyModeSearch:
     def _is_dyad(self, block: int) -> bool:
         """Whether a block has translations of one loop only: circles or lines that intersect."""
         rows, _ = self._block_indices(block)
-        loops = set(self.equations.loop_of_row[rows].tolist())
-        return len(loops) == 1 and bool(self.equations.is_translation[rows].all())
+        return len(set(self.equations.loop_of_row[rows].tolist())) == 1 and bool(
+            self.equations.is_translation[rows].all()
+        )
 
     def _starts_across_home(self, rows: Indices, columns: Indices) -> Array:
         """(4, nq) configurations on both sides of home, along the least determined direction."""
-        jacobian = self.equations.evaluate_scaled(self.home)[1][np.ix_(rows, columns)]
-        least_determined_direction = np.linalg.svd(jacobian)[2][-1]
+        least_determined_direction = np.linalg.svd(
+            self.equations.evaluate_scaled(self.home)[1][np.ix_(rows, columns)]
+        )[2][-1]
         out = np.tile(self.home, (4, 1))
         out[:, columns] += np.outer(
             [0.5, -0.5, 1.5, -1.5], least_determined_direction * self._coordinate_units[columns]
@@ -265,8 +268,7 @@ class _AssemblyModeSearch:
         equations, rows = self._equations_of_rows(rows)
         for _ in range(_MAX_ITERATIONS):
             phi, jacobian = equations.evaluate_scaled(q)
-            residual = np.abs(phi[rows]).max(initial=0.0)
-            if residual < 1e-13:
+            if np.abs(phi[rows]).max(initial=0.0) < 1e-13:
                 break
             try:
                 step = solve_linear(jacobian[np.ix_(rows, columns)], -phi[rows])
@@ -293,8 +295,7 @@ class _AssemblyModeSearch:
         return q
 
     def _determinant_sign(self, q: Array, rows: Indices, columns: Indices) -> float:
-        jacobian = self.equations.evaluate(q)[1][np.ix_(rows, columns)]
-        return float(np.linalg.slogdet(jacobian)[0])
+        return float(np.linalg.slogdet(self.equations.evaluate(q)[1][np.ix_(rows, columns)])[0])
 
     def _block_solutions_from_guesses(self, q: Array, block: int) -> list[Array]:
         """Solutions of a block with all else fixed, started from the guess and from home."""
@@ -348,8 +349,9 @@ class _AssemblyModeSearch:
         ratio = _DISTANCE_RATIO if is_decisive else _LOOSE_DISTANCE_RATIO
         if distance > ratio * home_distance and not home_outside_limits:
             return None
-        loops = sorted(set(self.equations.loop_of_row[rows].tolist()))
-        names = tuple(self.equations.names[i] for i in loops)
+        names = tuple(
+            self.equations.names[i] for i in sorted(set(self.equations.loop_of_row[rows].tolist()))
+        )
         largest_deviation, home_deviation = (
             self._largest_deviation(q, compared),
             self._largest_deviation(self.home, compared),

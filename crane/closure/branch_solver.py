@@ -47,8 +47,9 @@ class BranchSolver:
         self._units, self._with_machine_code = equations.coordinate_units, with_machine_code
         coordinates = equations.coordinates
         ranges = (coordinates.upper - coordinates.lower)[active]
-        limited = np.isfinite(ranges) & (ranges > 0)
-        self._active_ranges = np.where(limited, ranges, self._units[active])
+        self._active_ranges = np.where(
+            np.isfinite(ranges) & (ranges > 0), ranges, self._units[active]
+        )
         self.continuation = NewtonContinuation(*self._parts, self._active_ranges)
         self._thread_local = threading.local()
 
@@ -96,8 +97,9 @@ class BranchSolver:
             return
         solution = self.continuation.home if guess is None else nearest(guess)
         for i, target in enumerate(targets):
-            sample = f" (sample {i})" if stacked else ""
-            solution = self.continuation.continue_to(target, solution, sample)
+            solution = self.continuation.continue_to(
+                target, solution, f" (sample {i})" if stacked else ""
+            )
             out[i] = solution.q
 
     def _follow_stack(

@@ -122,8 +122,9 @@ class Closure(OneLineRepr):
         if keep_revolutions:
             revolutions = np.round((initial_guess - self.structure.home) / (2 * np.pi))
             revolutions[coordinates.is_translation] = 0.0
-            home = self.structure.home + 2 * np.pi * revolutions
-            self.structure = dataclasses.replace(self.structure, home=home)
+            self.structure = dataclasses.replace(
+                self.structure, home=self.structure.home + 2 * np.pi * revolutions
+            )
         self._start_solver()
 
     def _start_solver(self, with_machine_code: bool = True) -> None:

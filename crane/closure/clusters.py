@@ -71,8 +71,7 @@ def _joints_between(parents: Sequence[int], joints: set[int]) -> list[int]:
     """Some joints and all joints on the paths between them."""
     paths = [_path_to_world(parents, parents[joint]) for joint in joints]
     common = set(paths[0]).intersection(*paths[1:])
-    between = {body for way in paths for body in way if body not in common}
-    return sorted(joints | between)
+    return sorted(joints | {body for way in paths for body in way if body not in common})
 
 
 def _path_to_world(parents: Sequence[int], body: int) -> list[int]:

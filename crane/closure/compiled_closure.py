@@ -270,11 +270,15 @@ class CompiledClosure:
         """
         coordinates = tape.load_vector(q_argument, 0, self._nq)
         numbers = self.geometry.constants if folded_constants is None else folded_constants
-        constants = FormulaConstants(tape, geometry_argument, numbers)
-        kinematics = PositionKinematics(self.geometry, constants, coordinates)
+        kinematics = PositionKinematics(
+            self.geometry, FormulaConstants(tape, geometry_argument, numbers), coordinates
+        )
         columns = self._active_columns, self._passive_columns
-        loops = LoopFormulas(self._equations, self._structure, *columns, kinematics)
-        return coordinates, kinematics, loops
+        return (
+            coordinates,
+            kinematics,
+            LoopFormulas(self._equations, self._structure, *columns, kinematics),
+        )
 
     def add_newton_formula(self, program: Program, signs: Array) -> None:
         """Add `newton`: one Newton step with residual, gamma and singularity checks.

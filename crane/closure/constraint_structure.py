@@ -166,8 +166,9 @@ class _ConstraintAnalysis:
     def run(self) -> ConstraintStructure:
         """The structure of a machine with loops."""
         first = self._constraints.close_loops(self._guess, np.arange(self._equations.model.nv))
-        place = f"from the home guess{self._active_text}"
-        self._check_closed(first, place, "correct the frames or the guess")
+        self._check_closed(
+            first, f"from the home guess{self._active_text}", "correct the frames or the guess"
+        )
         jacobians = [self._constraints.intended_jacobian(q) for q in self._neighbours(first)]
         self._check_that_loops_lock(jacobians)
         rank = max(_numerical_rank(jacobian * self._units) for jacobian in jacobians)
@@ -185,8 +186,9 @@ class _ConstraintAnalysis:
         """A closed configuration and others near it."""
         found, nv = [first], self._equations.model.nv
         for _ in range(4):
-            perturbed = first + self._random.uniform(-0.02, 0.02, nv) * self._units
-            closed = self._constraints.close_loops(perturbed, np.arange(nv))
+            closed = self._constraints.close_loops(
+                first + self._random.uniform(-0.02, 0.02, nv) * self._units, np.arange(nv)
+            )
             if self._constraints.is_closed(closed):
                 found.append(closed)
         return found
@@ -194,8 +196,10 @@ class _ConstraintAnalysis:
     def _check_that_loops_lock(self, jacobians: Sequence[Array]) -> None:
         for index, name in enumerate(self._equations.names):
             rows = self._equations.loop_of_row == index
-            sizes = (np.abs(jacobian[rows] * self._units).max() for jacobian in jacobians)
-            if max(sizes) < _ZERO_TOLERANCE:
+            if (
+                max(np.abs(jacobian[rows] * self._units).max() for jacobian in jacobians)
+                < _ZERO_TOLERANCE
+            ):
                 raise MechanismError(
                     f"loop '{name}' locks nothing that the joints do not lock already: remove it",
                     f"loop {name}",
@@ -207,16 +211,21 @@ class _ConstraintAnalysis:
         lock = self._constraints.find_locked_equation(q, mobility, _SINGULAR_TOLERANCE)
         if lock is not None:
             raise self._overconstrained_error(*lock)
-        rank_here = _numerical_rank(jacobians[0] * self._units, _SINGULAR_TOLERANCE)
-        if mobility != len(active) and rank_here < rank:
+        if (
+            mobility != len(active)
+            and _numerical_rank(jacobians[0] * self._units, _SINGULAR_TOLERANCE) < rank
+        ):
             raise HomeError(
                 f"the home configuration{self._active_text} is singular, where the linkage may "
                 "continue in several ways: choose another under 'home'",
                 "home",
                 "the configuration is singular",
             )
-        passive_ranks = (_numerical_rank((x * self._units)[:, self._passive]) for x in jacobians)
-        if mobility == len(active) and max(passive_ranks) == rank:
+        if (
+            mobility == len(active)
+            and max(_numerical_rank((x * self._units)[:, self._passive]) for x in jacobians)
+            == rank
+        ):
             return
         undetermined, found = self._undetermined_joints(jacobians), self._propose(jacobians[0])
         if mobility == len(active):
@@ -241,8 +250,9 @@ class _ConstraintAnalysis:
         """Home with the active joints as in the guess."""
         home = self._constraints.close_loops(self._guess, self._passive)
         home = self._remove_revolutions(home)
-        hint = "choose other values or guess more passive joints"
-        self._check_closed(home, f"at home{self._active_text}", hint)
+        self._check_closed(
+            home, f"at home{self._active_text}", "choose other values or guess more passive joints"
+        )
         opposed_loop = self._equations.find_opposed_loop(home)
         if opposed_loop is not None:
             raise HomeError(
@@ -289,8 +299,9 @@ class _ConstraintAnalysis:
         lower, upper = self._coordinates.lower, self._coordinates.upper
         periodic = periodic_coordinates(self._equations)
         periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
-        nearby = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
-        return remove_revolutions(home, nearby, periodic, lower, upper)
+        return remove_revolutions(
+            home, np.where(np.isinf(lower) | np.isinf(upper), 0.0, home), periodic, lower, upper
+        )
 
     def _propose(self, jacobian: Array, **choice: Sequence[int]) -> list[ActiveJointSelection]:
         coupled = np.flatnonzero((self._equations.coupling_factors != 0).any(axis=0)).tolist()
@@ -381,8 +392,7 @@ def block_triangular_form(incidence: NDArray[np.bool_]) -> list[Block] | None:
         Blocks (rows, columns) in the order of solution; None if the equations are structurally
         singular.
     """
-    size = len(incidence)
-    if size == 0:
+    if len(incidence) == 0:
         return []
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching

@@ -394,8 +394,9 @@ class RoundedConstraints(ExactConstraints):
 
     def intended_jacobian(self, q: Array) -> Array:
         """(m, nv) Jacobian without the singular values that are due to the file precision."""
-        jacobian = self._equations.evaluate_scaled(q)[1]
-        left, values, right = np.linalg.svd(jacobian, full_matrices=False)
+        left, values, right = np.linalg.svd(
+            self._equations.evaluate_scaled(q)[1], full_matrices=False
+        )
         values[values < _MIN_SINGULAR_VALUE_RATIO * values[0]] = 0.0
         return np.asarray((left * values @ right) / self._coordinate_units)
 

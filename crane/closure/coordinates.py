@@ -90,8 +90,9 @@ class Coordinates:
 
     def format_values(self, columns: NDArray[np.intp], values: Array) -> str:
         """Values of some coordinates as text, "lift = 0.5, tilt = 0.1"."""
-        pairs = zip(columns, values, strict=True)
-        return ", ".join(f"{self.names[int(i)]} = {value:.6g}" for i, value in pairs)
+        return ", ".join(
+            f"{self.names[int(i)]} = {value:.6g}" for i, value in zip(columns, values, strict=True)
+        )
 
     def configuration(self, q: Array) -> Array:
         """Pinocchio's configuration (nq,) or (N, nq) from coordinates (nv,) or (N, nv)."""
@@ -111,8 +112,9 @@ class Coordinates:
         out: Array = configuration[..., self._configuration_indices]
         for column in self.floating_base_columns:
             at = self._configuration_indices[column]
-            quaternion = configuration[..., at + 3 : at + 7]
-            out[..., column + 3 : column + 6] = _rotation_vector(quaternion)
+            out[..., column + 3 : column + 6] = _rotation_vector(
+                configuration[..., at + 3 : at + 7]
+            )
         return out
 
     def coordinate_derivatives(self, q: Array, v: Array) -> Array:

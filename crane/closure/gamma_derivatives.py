@@ -129,8 +129,9 @@ class GammaDerivatives:
                         + 2.0 * _power_between_bodies(once, rate, loops.rows[r])
                         + _power_between_bodies(loops.rows[r].wrench, known, loops.rows[r])
                     )
-        known_rows: dict[int, Vector] = {joint: [0.0] * n for joint in loops.active_joints}
-        solution, _ = loops.solve_passive(known_rows, right_sides)
+        solution, _ = loops.solve_passive(
+            {joint: [0.0] * n for joint in loops.active_joints}, right_sides
+        )
         return {
             j: {i: solution[i][j] for i in cluster.joints}
             for cluster, own in zip(self.clusters, self.own, strict=True)
@@ -165,11 +166,13 @@ class GammaDerivatives:
         out = {}
         for i in cluster.joints:
             once = cross_motion(velocities[i], self._joint_axes[i])
-            twice = add_spatial(
-                cross_motion(accelerations[i], self._joint_axes[i]),
-                cross_motion(velocities[i], once),
+            out[i] = (
+                once,
+                add_spatial(
+                    cross_motion(accelerations[i], self._joint_axes[i]),
+                    cross_motion(velocities[i], once),
+                ),
             )
-            out[i] = once, twice
         return out
 
     def twist_derivatives(
@@ -243,8 +246,9 @@ class GammaDerivatives:
                 row.wrench, twist_changes, row
             ) + _power_between_bodies(rate, self.twists[j], row)
             right_sides[r] = [-1.0 * relative_power]
-        known_rows: dict[int, Vector] = {joint: [0.0] for joint in self._loops.active_joints}
-        solution, _ = self._loops.solve_passive(known_rows, right_sides)
+        solution, _ = self._loops.solve_passive(
+            {joint: [0.0] for joint in self._loops.active_joints}, right_sides
+        )
         return {i: solution[i][0] for i in cluster.joints}
 
 

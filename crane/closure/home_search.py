@@ -167,8 +167,9 @@ def find_cached_home(
         return find_home(equations, active, passive, initial_guess, specified, movable)
     columns = None if specified is None else tuple(specified), tuple(movable)
     dependencies = ("home", (equations.cache_key, active, initial_guess, *columns))
-    classes = ConstraintStructure, RedundancyGap, HomeSearchResult
-    return cached_result(dependencies, find, "scipy.linalg", classes)
+    return cached_result(
+        dependencies, find, "scipy.linalg", (ConstraintStructure, RedundancyGap, HomeSearchResult)
+    )
 
 
 def within_limits(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:

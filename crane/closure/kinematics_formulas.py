@@ -254,8 +254,9 @@ class PositionKinematics:
         """Axes (columns of a rotation) and origin of a loop frame."""
         body = self.geometry.frame_bodies[index]
         rotation, origin = self._constants.placement(len(self.geometry.parents) - 1 + index)
-        axes = matmul(self.rotation[body], rotation)
-        return axes, add_vectors(self.origin[body], matvec(self.rotation[body], origin))
+        return matmul(self.rotation[body], rotation), add_vectors(
+            self.origin[body], matvec(self.rotation[body], origin)
+        )
 
 
 def largest_scaled_value(

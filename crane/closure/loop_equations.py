@@ -128,8 +128,9 @@ class LoopEquations:
                 row[column] = factor
             is_length.append(bool(self.coordinates.is_translation[column]))
         self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
-        coupling_indices = len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)
-        self.loop_of_row = np.concatenate([self._loop_index, coupling_indices])
+        self.loop_of_row = np.concatenate(
+            [self._loop_index, len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)]
+        )
         self.is_translation = np.concatenate(
             [self._is_loop_translation, np.array(is_length, dtype=bool)]
         )
@@ -154,8 +155,9 @@ class LoopEquations:
             connected = np.isin(group, group[row])
             group[connected] = group[connected].min(initial=len(group))
         group = np.unique(group, return_inverse=True)[1]
-        of_name = [int(group[tie][0]) if tie.any() else -1 for tie in involved]
-        return group, np.array(of_name, dtype=np.intp)[self.loop_of_row]
+        return group, np.array(
+            [int(group[tie][0]) if tie.any() else -1 for tie in involved], dtype=np.intp
+        )[self.loop_of_row]
 
     def subset(self, names: Collection[str]) -> "LoopEquations":
         """The equations of some loops and couplings only, in the same coordinates."""
@@ -178,8 +180,11 @@ class LoopEquations:
         loops = tuple(
             (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis)) for x in self.loops
         )
-        couplings = tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings)
-        return self.model.saveToString(), loops, couplings
+        return (
+            self.model.saveToString(),
+            loops,
+            tuple((x.name, tuple(x.factors.items()), x.offset) for x in self.couplings),
+        )
 
     @property
     def data(self) -> pin.Data:
@@ -195,8 +200,9 @@ class LoopEquations:
         bodies = self.data.oMi
         placements = [bodies[joint] * local for joint, local in self.frames]
         rotations = np.array([placement.rotation for placement in placements])
-        origins = np.array([placement.translation for placement in placements])
-        return self._row_geometry(rotations, origins)
+        return self._row_geometry(
+            rotations, np.array([placement.translation for placement in placements])
+        )
 
     def _row_geometry(self, rotations: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
         """The same (..., m, 3) from rotations (..., 2 l, 3, 3) and origins (..., 2 l, 3)."""
@@ -240,8 +246,9 @@ class LoopEquations:
         coupling_residuals = self.coupling_factors @ q - self.coupling_offsets
         if not self.loops:
             return coupling_residuals, self.coupling_factors.copy()
-        configuration = self.coordinates.configuration(q)
-        jacobian = _as_jacobian(pin.computeJointJacobians(self.model, self.data, configuration))
+        jacobian = _as_jacobian(
+            pin.computeJointJacobians(self.model, self.data, self.coordinates.configuration(q))
+        )
         self._thread_local.last = a, b, p1, p2 = self._frame_geometry()
         phi = np.einsum("ij,ij->i", a, np.where(self._is_loop_translation[:, None], p2 - p1, b))
         loop_jacobian = self._row_joint_signs * (self._assemble_wrenches(a, b, p2) @ jacobian)
@@ -284,9 +291,11 @@ class LoopEquations:
             if not aligned:
                 continue
             (j1, local1), (j2, local2) = self.frames[2 * index : 2 * index + 2]
-            turn1 = (self.data.oMi[j1] * local1).rotation
-            turn2 = (self.data.oMi[j2] * local2).rotation
-            cosines = np.einsum("ik,ik->k", turn1, turn2)
+            cosines = np.einsum(
+                "ik,ik->k",
+                (self.data.oMi[j1] * local1).rotation,
+                (self.data.oMi[j2] * local2).rotation,
+            )
             if any(cosines[k] < 0 for k in aligned):
                 return loop.name
         return None

@@ -64,8 +64,9 @@ class LoopEquationFormula:
     ) -> SpatialVector:
         """Time derivative of the wrench."""
         axis, arm = self.axis_and_arm_rates(first_motion, second_motion)
-        moment = add_vectors(cross(arm, self.axis), cross(self.arm, axis))
-        return (axis if self.is_translation else [0.0] * 3), moment
+        return (axis if self.is_translation else [0.0] * 3), add_vectors(
+            cross(arm, self.axis), cross(self.arm, axis)
+        )
 
 
 def _coupling_formula(factors: Array, offset: float, q: Sequence[Scalar]) -> LoopEquationFormula:
@@ -144,8 +145,9 @@ class LoopFormulas:
         for column, sign in enumerate(equations.sign[one // 2]):
             if sign:
                 linear, angular = kinematics.joint_axes[column + 1]
-                derivative = dot(wrench[0], linear) + dot(wrench[1], angular)
-                jacobian[column + 1] = float(sign) * derivative
+                jacobian[column + 1] = float(sign) * (
+                    dot(wrench[0], linear) + dot(wrench[1], angular)
+                )
         bodies = kinematics.geometry.frame_bodies
         locks_all_translations = all(LOOP_TYPES[equations.loops[one // 2].type][:3])
         has_fixed_axis = (
@@ -177,8 +179,9 @@ class LoopFormulas:
             matrix = [[self.rows[r].jacobian.get(joint, 0.0) for joint in joints] for r in rows]
             # the block order accounts for derivatives that vanish everywhere
             before = {joint: row for joint, row in x.items() if joint not in joints}
-            sides = [self._right_side(r, before, right_sides[r]) for r in rows]
-            found, determinant = solve_linear_system(matrix, sides)
+            found, determinant = solve_linear_system(
+                matrix, [self._right_side(r, before, right_sides[r]) for r in rows]
+            )
             determinants.append(determinant)
             x |= dict(zip(joints, found, strict=True))
         return x, determinants
@@ -211,8 +214,9 @@ class LoopFormulas:
     @cached_property
     def newton_step(self) -> dict[int, Scalar]:
         """Newton step of the passive joints, by joint."""
-        held: dict[int, Vector] = {joint: [0.0] for joint in self.active_joints}
-        x, _ = self.solve_passive(held, [[-row.phi] for row in self.rows])
+        x, _ = self.solve_passive(
+            {joint: [0.0] for joint in self.active_joints}, [[-row.phi] for row in self.rows]
+        )
         return {joint: x[joint][0] for joint in self.passive_joints}
 
     @property

@@ -40,8 +40,7 @@ def sort_samples(scaled: Array) -> Indices | None:
     if np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR_SAMPLE_DISTANCE:
         return None
     cells = np.floor(scaled * len(scaled) ** (1 / scaled.shape[1]))
-    order: Indices = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
-    return order
+    return np.asarray(np.lexsort((scaled[:, -1], *cells[:, :-1].T)))
 
 
 def follow_motion(

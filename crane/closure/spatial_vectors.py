@@ -112,8 +112,9 @@ def rotation_vector_derivative(
 def wrap_rotation_vector(vector: Sequence[Scalar]) -> list[Scalar]:
     """The same rotation with a vector of length pi or less, from one shorter than 2 pi."""
     length = _regularized_norm(vector)
-    factor = where_positive(length - math.pi, 1.0 - 2.0 * math.pi / length, 1.0)
-    return scale_vector(factor, vector)
+    return scale_vector(
+        where_positive(length - math.pi, 1.0 - 2.0 * math.pi / length, 1.0), vector
+    )
 
 
 def _regularized_norm(vector: Sequence[Scalar]) -> Scalar:

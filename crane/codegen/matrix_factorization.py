@@ -75,16 +75,17 @@ def lu_factorize(matrix: Sequence[Sequence[Scalar]]) -> Matrix:
         matrix: (k, k).
     """
     rows = [list(row) for row in matrix]
-    size = len(rows)
-    for k in range(size):
+    for k in range(len(rows)):
         inverse = 1.0 / rows[k][k]
         rows[k][k] = inverse
         for row in rows[k + 1 :]:
             if not isinstance(row[k], SymbolicExpression) and row[k] == 0:
                 continue
             row[k] = factor = row[k] * inverse
-            below = zip(row[k + 1 :], rows[k][k + 1 :], strict=True)
-            row[k + 1 :] = [entry - factor * pivot for entry, pivot in below]
+            row[k + 1 :] = [
+                entry - factor * pivot
+                for entry, pivot in zip(row[k + 1 :], rows[k][k + 1 :], strict=True)
+            ]
     return rows
 
 

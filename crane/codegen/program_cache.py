@@ -180,8 +180,9 @@ def cache_entry_name(dependencies: Any, kind: str = "note") -> str | None:
     package = package_digest()
     if package is None:
         return None
-    tracing = sys.version, np.__version__
-    return file_cache.entry_name(repr((package, tracing, compiler_settings(), content)), kind)
+    return file_cache.entry_name(
+        repr((package, (sys.version, np.__version__), compiler_settings(), content)), kind
+    )
 
 
 @dataclass(frozen=True)

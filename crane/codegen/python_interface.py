@@ -27,8 +27,9 @@ class PythonCallback:
         self, function: Callable[[Array, Array], None], input_size: int, output_size: int
     ):
         self._function, self._sizes, self._exception = function, (input_size, output_size), None
-        kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
-        self._c_function = kind(self._call_from_machine_code)
+        self._c_function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)(
+            self._call_from_machine_code
+        )
         self.address = int(ctypes.cast(self._c_function, ctypes.c_void_p).value or 0)
 
     _exception: BaseException | None

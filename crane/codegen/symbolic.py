@@ -263,8 +263,7 @@ def solve_linear_system(
         determinant = a * d - b * c
         inverse = 1.0 / determinant
         top = [(d * x - b * y) * inverse for x, y in zip(*right, strict=True)]
-        bottom = [(a * y - c * x) * inverse for x, y in zip(*right, strict=True)]
-        return [top, bottom], determinant
+        return [top, [(a * y - c * x) * inverse for x, y in zip(*right, strict=True)]], determinant
     rows = [[*row, *more] for row, more in zip(matrix, right, strict=True)]
     determinant = 1.0
     diagonal: list[Scalar] = []

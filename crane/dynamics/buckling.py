@@ -219,8 +219,7 @@ def _cylinder_column(machine: Machine, cylinder: Cylinder) -> CylinderColumn | s
     if not machine.closure.equations.sign[:, index].any():
         return "it is in no loop, so it has no pin at either end"
     joint = int(machine.coordinates.joints[index])
-    carrier = int(machine.model.parents[joint])
-    for body in (carrier, joint):
+    for body in (int(machine.model.parents[joint]), joint):
         places, turns = (
             zip(*_pins_of_body(machine, body, joint), strict=True) if body else ((), ())
         )

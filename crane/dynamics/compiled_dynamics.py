@@ -184,8 +184,14 @@ class CompiledQuantity:
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
         """The quantity at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
         out = np.empty(self.size)
-        geometry = self._compiled_closure.geometry.constants
-        self._program.call("formula", geometry, self._formula_constants, q, inputs, out)
+        self._program.call(
+            "formula",
+            self._compiled_closure.geometry.constants,
+            self._formula_constants,
+            q,
+            inputs,
+            out,
+        )
         return out
 
     def evaluate_targets(self, targets: Array, inputs: Array, out: Array) -> int:
@@ -330,8 +336,9 @@ class CompiledParameterDerivatives:
             for i in np.flatnonzero(geometry_changes).tolist():
                 seeds[tape.load(0, i).index] = tape.load(4, i)
             opened = directional_derivative([row.phi for row in loops.rows], seeds)
-            held: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
-            moving, _ = loops.solve_passive(held, [[-1.0 * x] for x in opened])
+            moving, _ = loops.solve_passive(
+                {joint: [0.0] for joint in loops.active_joints}, [[-1.0 * x] for x in opened]
+            )
             seeds |= {_tape_index(q[i - 1]): rate for i, (rate,) in moving.items()}
             for i in np.flatnonzero(constants_change).tolist():
                 seeds[tape.load(1, i).index] = tape.load(5, i)
@@ -388,8 +395,9 @@ def _add_evaluation_routines(program: Program, nq: int, n: int) -> None:
     outputs = program.formula_outputs("formula").size
     with program.add_routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
         with r.loop(r.count) as i:
-            target = r.targets.row_pointer(i, n)
-            got = r.call("follow", 1, r.geometry, target, r.cursor, r.q, r.tolerances)
+            got = r.call(
+                "follow", 1, r.geometry, r.targets.row_pointer(i, n), r.cursor, r.q, r.tolerances
+            )
             with r.if_then(got < 1):
                 r.return_value(i)
             out = r.out.row_pointer(i, outputs)

@@ -96,7 +96,6 @@ class ConstantDerivatives:
             two_steps,
             *map(constants_at, range(3, len(_FORWARD_DIFFERENCE_WEIGHTS) + 1)),
         ]
-        derivative: Array = (
+        return np.asarray(
             _FORWARD_DIFFERENCE_WEIGHTS @ (np.array(rows) - nominal) / (_RELATIVE_STEP * unit)
         )
-        return derivative

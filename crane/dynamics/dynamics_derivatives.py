@@ -157,10 +157,9 @@ class DynamicsDerivatives:
                 for k in [k for k in own if k <= j]:
                     total: Scalar = 0.0
                     for i in cluster.joints:
-                        force = (
+                        total = total + gamma[i][k] * (
                             spatial_dot(self._joint_axes[i], wrenches[i]) + rotors[i] * gamma[i][j]
                         )
-                        total = total + gamma[i][k] * force
                     out[k][j] = out[j][k] = total
                 for k, body in self._carrying_coordinates(c):
                     out[k][j] = out[j][k] = spatial_dot(twists[k][body], wrenches[cluster.base])
@@ -348,8 +347,9 @@ class DynamicsDerivatives:
                 + spatial_dot(twice, wrench)
                 + 2.0 * dot(effect.transposed_product, rate[1])
             )
-            back = spatial_dot(rate, wrench) + dot(effect.transposed_product, twist[1])
-            by_v[j][k] = by_v[j][k] + 2.0 * back
+            by_v[j][k] = by_v[j][k] + 2.0 * (
+                spatial_dot(rate, wrench) + dot(effect.transposed_product, twist[1])
+            )
 
     def forward_dynamics_derivatives(self, tau: Sequence[Scalar]) -> tuple[Matrix, Matrix, Matrix]:
         """Derivatives (n, n) of a_A by q_A, v_A and tau_A.

@@ -374,9 +374,8 @@ class DynamicsFormulas(InertialForceFormulas):
         for i in sorted(
             set(range(1, self._body_count)) - self.kinematics.geometry.massless_bodies
         ):
-            turn = self.kinematics.geometry.body_rotations[i]
             axes = matmul(
-                self.kinematics.rotation[i], turn.T.tolist()
+                self.kinematics.rotation[i], self.kinematics.geometry.body_rotations[i].T.tolist()
             )  # columns: axes of the joint
             local = list(zip(*axes, strict=True))  # rows: reference body to joint
             origin = self.kinematics.origin[i]
@@ -425,5 +424,8 @@ def _body_regressor_row(u: Vector, r: Vector, w: Vector, e: Vector, a: Vector) -
             return r[j] * e[j] + s[j] * w[j]
         return r[j] * e[k] + r[k] * e[j] + s[j] * w[k] + s[k] * w[j]
 
-    pairs = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
-    return [dot(u, a), *first, *(entry(j, k) for j, k in pairs)]
+    return [
+        dot(u, a),
+        *first,
+        *(entry(j, k) for j, k in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))),
+    ]

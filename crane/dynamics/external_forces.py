@@ -86,8 +86,7 @@ def formula_key(machine: Machine) -> Hashable:
         machine.external_forces, reference_counts(machine.external_forces), strict=True
     ):
         tape = Tape()
-        parts = (tape.load_vector(i, 0, 3) for i in range(3))
-        place, velocity, spin = parts
+        place, velocity, spin = (tape.load_vector(i, 0, 3) for i in range(3))
         turn = [tape.load_vector(3, 3 * row, 3) for row in range(3)]
         references_and_states = (
             tape.load_vector(4, 0, count),
@@ -104,8 +103,13 @@ def formula_key(machine: Machine) -> Hashable:
             )  # fmt: skip
         ]
         joint, pose = _frame_placement(machine, force)
-        shape = count, force.state_count
-        out.append((repr((shape, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
+        out.append(
+            (
+                repr(((count, force.state_count), tape.operations, outputs)),
+                joint,
+                pose.homogeneous.tobytes(),
+            )
+        )
     return tuple(out)
 
 
@@ -138,8 +142,10 @@ def trace_external_forces(
         joint, pose = _frame_placement(machine, force)
         body = machine.coordinates.body_of_joint[joint]
         turn = geometry.body_rotations[body].T
-        arm = matvec(kinematics.rotation[body], (turn @ pose.translation).tolist())
-        at = add_vectors(kinematics.origin[body], arm)
+        at = add_vectors(
+            kinematics.origin[body],
+            matvec(kinematics.rotation[body], (turn @ pose.translation).tolist()),
+        )
         axes = matmul(kinematics.rotation[body], (turn @ pose.rotation).tolist())
         carriers = geometry.supporting_bodies(body)
         velocity: Vector = [0.0] * 3
@@ -216,9 +222,9 @@ class ExternalForceCallback(PythonCallback):
     def _evaluate_forces(self, inputs: Array, references: Array) -> None:
         for k, (force, place) in enumerate(self._reference_slices):
             x = inputs[_CALLBACK_INPUT_SIZE * k : _CALLBACK_INPUT_SIZE * (k + 1)].tolist()
-            turn = [x[4:7], x[7:10], x[10:13]]
-            here = FrameMotion(x[1:4], turn, x[13:16], x[16:], x[:1])
-            push, moment = force.wrench(here)
+            push, moment = force.wrench(
+                FrameMotion(x[1:4], [x[4:7], x[7:10], x[10:13]], x[13:16], x[16:], x[:1])
+            )
             references[place] = np.array([*push, *moment], dtype=np.float64)
 
 

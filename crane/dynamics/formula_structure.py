@@ -67,8 +67,13 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
             bodies.append([0.0] * BODY_SIZE)
             continue
         turn, inertia = geometry.body_rotations[i], machine.model.inertias[int(joint)]
-        tensor = turn.T @ inertia.inertia @ turn
-        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER_TRIANGLE]])
+        bodies.append(
+            [
+                inertia.mass,
+                *(turn.T @ inertia.lever),
+                *(turn.T @ inertia.inertia @ turn)[_UPPER_TRIANGLE],
+            ]
+        )
     gravity = machine.model.gravity.linear
     rotors = machine.model.armature
     joint_laws, distance_laws = np.split(forces.table, [len(bodies)])
@@ -77,8 +82,7 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
         turns = (
             geometry.body_rotations[machine.coordinates.body_of_joint[joint]] for joint, _ in ends
         )
-        places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
-        numbers += [law, *places]
+        numbers += [law, *(turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))]
     numbers += [
         [forces.moving_factor],
         forces.circuit_friction[list(forces.circuit_friction_columns)],

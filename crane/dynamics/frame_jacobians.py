@@ -27,8 +27,9 @@ class FrameJacobians:
 
     def set_configuration(self, q: Array) -> None:
         """Evaluate at a configuration (nq,), in this thread."""
-        configuration = self._machine.coordinates.configuration(q)
-        pin.computeJointJacobians(self._model, self._data, configuration)
+        pin.computeJointJacobians(
+            self._model, self._data, self._machine.coordinates.configuration(q)
+        )
 
     def frame_origins(self, q: Array, links: Sequence[str]) -> Array:
         """Origins (N, k, 3) of k links' frames in the world, at configurations (N, nq) [m]."""
@@ -137,8 +138,9 @@ class FrameDistances:
         if not count:
             return lengths, jacobians
         for i in np.ndindex(q.shape[:-1]):
-            configuration = self._coordinates.configuration(q[i])
-            pin.computeJointJacobians(self._model, self._workspace.value, configuration)
+            pin.computeJointJacobians(
+                self._model, self._workspace.value, self._coordinates.configuration(q[i])
+            )
             for k, (one, two) in enumerate(self.end_points):
                 (p1, j1), (p2, j2) = self._point(*one), self._point(*two)
                 vector = p2 - p1

@@ -55,8 +55,9 @@ class InertialForceFormulas(JointForceFormulas):
         self._joint_laws = [
             constants.vector(first + LAW_SIZE * i, LAW_SIZE) for i in range(bodies)
         ]
-        gravity = constants.vector((BODY_SIZE + LAW_SIZE) * bodies)
-        self._gravity = matvec(kinematics.rotation[0], gravity)
+        self._gravity = matvec(
+            kinematics.rotation[0], constants.vector((BODY_SIZE + LAW_SIZE) * bodies)
+        )
         self.rotor_inertias: Vector = [
             0.0,
             *constants.vector((BODY_SIZE + LAW_SIZE) * bodies + 3, bodies),
@@ -177,8 +178,10 @@ class InertialForceFormulas(JointForceFormulas):
         out: Vector = [0.0] * self._body_count
         for i in range(self._body_count - 1, 0, -1):
             force, moment = forces[i - 1], moments[i - 1]
-            axis = self.kinematics.joint_axis(i)
-            out[i] = dot(axis, moment if self.kinematics.geometry.is_revolute[i] else force)
+            out[i] = dot(
+                self.kinematics.joint_axis(i),
+                moment if self.kinematics.geometry.is_revolute[i] else force,
+            )
             carrier = self.formula_structure.carrier_bodies[i]
             if carrier:
                 arm = self.kinematics.offsets[i]
@@ -298,6 +301,7 @@ class InertialForceFormulas(JointForceFormulas):
         for found in self._law_values:
             total = total + found.stored_energy
         for mass, centre, _ in self.body_inertias:
-            height = subtract_vectors(centre, self.kinematics.origin[0])
-            total = total - mass * dot(self._gravity, height)
+            total = total - mass * dot(
+                self._gravity, subtract_vectors(centre, self.kinematics.origin[0])
+            )
         return total

@@ -63,8 +63,11 @@ def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes
         use_modes: Whether the stick-slip mode in `law` gives the sign instead of the velocity.
     """
     if has_stick_slip:
-        negative_sign = where_positive(-1.0 * velocity, -1.0, 0.0)
-        return law[SLIP_INDEX] if use_modes else where_positive(velocity, 1.0, negative_sign)
+        return (
+            law[SLIP_INDEX]
+            if use_modes
+            else where_positive(velocity, 1.0, where_positive(-1.0 * velocity, -1.0, 0.0))
+        )
     return apply_function("tanh", law[_SHARPNESS_INDEX] * velocity)
 
 
@@ -150,10 +153,10 @@ class JointForceFormulas:
         """Values of the force laws of all joints (nb + 1,)."""
         every = zip(self._joint_laws, self.q, self.joint_velocities[1:], strict=True)
         sticking = self._stick_slip_columns
-        laws = (
-            evaluate_force_law(*x, i in sticking, self._use_modes) for i, x in enumerate(every)
-        )
-        return [NO_FORCE, *laws]
+        return [
+            NO_FORCE,
+            *(evaluate_force_law(*x, i in sticking, self._use_modes) for i, x in enumerate(every)),
+        ]
 
     @cached_property
     def _distance_law_values(self) -> list[tuple[dict[int, Scalar], ForceLawValues, Scalar]]:

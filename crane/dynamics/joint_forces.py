@@ -69,8 +69,9 @@ class JointForces:
             find_circuit_friction_columns(machine),
             np.zeros(self._joint_count),
         )
-        friction_laws = dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
-        for joint, friction in friction_laws.items():
+        for joint, friction in (
+            dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
+        ).items():
             column = machine.column(joint)
             only_circuit_friction = column in self.sticking and not friction.has_stick_slip
             law_table[column, :7] = (
@@ -135,15 +136,16 @@ class JointForces:
     def _joint_breakaway(self) -> Array:
         """The same without circuit friction."""
         law = self.table[list(self.sticking)]
-        limits: Array = (
+        return np.asarray(
             law[:, _LAW_FIELDS.index("coulomb")] + law[:, _LAW_FIELDS.index("stiction")]
         )
-        return limits
 
     def friction_at_rest(self, limit_share: Array) -> Array:
         """(k,) friction of stick-slip joints at rest, from shares (k,) of its limit."""
-        offset: Array = self.table[list(self.sticking), _LAW_FIELDS.index("coulomb_offset")]
-        return offset + limit_share * self.breakaway
+        return (
+            self.table[list(self.sticking), _LAW_FIELDS.index("coulomb_offset")]
+            + limit_share * self.breakaway
+        )
 
     @property
     def stick_slip_modes(self) -> tuple[Array, Array, Array]:

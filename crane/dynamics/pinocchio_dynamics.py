@@ -120,16 +120,16 @@ class PinocchioDynamics:
         roots: dict[int, list[int]] = {}
         root_of = {0: 0}
         for body in range(1, self._model.njoints):
-            carrier = joints[carrier_bodies[self._model.joints[body].idx_v + 1]]
-            root_of[body] = root_of[carrier] or body
+            root_of[body] = (
+                root_of[joints[carrier_bodies[self._model.joints[body].idx_v + 1]]] or body
+            )
             roots.setdefault(root_of[body], []).append(body)
         return list(roots.values())
 
     @property
     def inertial_parameters(self) -> Array:
         """See `Dynamics.parameters`."""
-        inertias = list(self._model.inertias)[1:]
-        bodies = [inertia.toDynamicParameters() for inertia in inertias]
+        bodies = [inertia.toDynamicParameters() for inertia in list(self._model.inertias)[1:]]
         return np.concatenate([*bodies, self._armature[self._rotor_columns]])
 
     def evaluate(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
@@ -168,8 +168,13 @@ class PinocchioDynamics:
                 return self._kinetic_and_potential_energy(state)
             case "rates":
                 a_a, _, margin, _ = self._accelerations_with_stick_slip(state, x)
-                rates = self._coordinates.coordinate_derivatives(q, v)
-                return np.concatenate([rates, a_a, [self._dissipated_power(state), margin]])
+                return np.concatenate(
+                    [
+                        self._coordinates.coordinate_derivatives(q, v),
+                        a_a,
+                        [self._dissipated_power(state), margin],
+                    ]
+                )
             case "observation":
                 _, joint_friction, _, holding_forces = self._accelerations_with_stick_slip(
                     state, x
@@ -211,8 +216,11 @@ class PinocchioDynamics:
         model, data = self._model, self._workspace.value.data
         jacobian = pin.jacobianCenterOfMass(model, data, self._coordinates.configuration(q), False)
         still, moving = model.inertias[0], data.mass[0]
-        moment = moving * data.com[0] + still.mass * still.lever
-        out = [moment, moving * jacobian @ gamma, [moving + still.mass]]
+        out = [
+            moving * data.com[0] + still.mass * still.lever,
+            moving * jacobian @ gamma,
+            [moving + still.mass],
+        ]
         out.append(gamma.T @ self._joint_forces.passive_forces(q, state.v))
         if self._tip_point is not None:
             joint, place = self._tip_point
@@ -246,8 +254,9 @@ class PinocchioDynamics:
         if len(held_indices):
             rows = state.gamma[stick_slip][held_indices]
             unit_accelerations = np.array([self._solve_mass_matrix(state, row) for row in rows])
-            required = rows @ a_a + state.drift[stick_slip][held_indices]
-            constraint_forces = np.linalg.solve(rows @ unit_accelerations.T, required)
+            constraint_forces = np.linalg.solve(
+                rows @ unit_accelerations.T, rows @ a_a + state.drift[stick_slip][held_indices]
+            )
             a_a = (a_a - constraint_forces @ unit_accelerations) * forces.moving_factor
             holding_forces[held_indices] = constraint_forces
             joint_friction[stick_slip] += holding_forces
@@ -331,6 +340,7 @@ class PinocchioDynamics:
         configuration, memory = self._coordinates.configuration(q), self._workspace.value
         pin.forwardKinematics(self._model, memory.data, configuration)
         for part in memory.subtrees:
-            base = memory.data.oMi[part.base_body].rotation
-            part.model.gravity.linear = base.T @ self._model.gravity.linear
+            part.model.gravity.linear = (
+                memory.data.oMi[part.base_body].rotation.T @ self._model.gravity.linear
+            )
             yield part, configuration[part.configuration_indices]

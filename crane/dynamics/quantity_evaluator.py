@@ -262,8 +262,9 @@ class QuantityEvaluator(OneLineRepr):
         rows = np.zeros((count, 2 * n))
         for i, array in enumerate(checked):
             rows[:, i * n : (i + 1) * n] = array
-        targets = np.ascontiguousarray(np.broadcast_to(q_a, (count, n)))
-        out = self._evaluate_stack(quantity, targets, rows, q_a.ndim == 2)
+        out = self._evaluate_stack(
+            quantity, np.ascontiguousarray(np.broadcast_to(q_a, (count, n))), rows, q_a.ndim == 2
+        )
         if shape:
             return out.reshape(shape if length is None else (count, *shape))
         return out[0] if length is None else out

@@ -177,8 +177,9 @@ class Reactions(OneLineRepr):
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         load = np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)
         carried = -self._is_carried_by[body][None, :, None, None] * load[:, None]
-        none = np.zeros((len(rows), self._model.nv, 3))
-        out = self._solve_loop_forces(kinematics, rows, carried, none)[0]
+        out = self._solve_loop_forces(
+            kinematics, rows, carried, np.zeros((len(rows), self._model.nv, 3))
+        )[0]
         return out if stacked else out[0]
 
     def joint_axes(self, q: ArrayLike) -> Array:
@@ -210,14 +211,18 @@ class Reactions(OneLineRepr):
         rows, stacked = self._as_stack(q, "q")
         kinematics = self._evaluate_kinematics(rows)
         passive = self.machine.closure.passive
-        basis = np.linalg.qr(kinematics.scaled_jacobian[:, :, passive], mode="complete")[0]
-        stress = basis[:, :, len(passive) :]
+        stress = np.linalg.qr(kinematics.scaled_jacobian[:, :, passive], mode="complete")[0][
+            :, :, len(passive) :
+        ]
         none = np.zeros((len(rows), len(self._local_axes), 6, stress.shape[2]))
         wrenches = self._wrenches_with_loop_forces(
             kinematics, none, stress / self._equations.residual_units[:, None]
         )
-        halves = wrenches.reshape(*wrenches.shape[:2], 2, 3, -1)
-        own = np.einsum("nkab,nkhac->nkhbc", self._axes_in_world(kinematics), halves)
+        own = np.einsum(
+            "nkab,nkhac->nkhbc",
+            self._axes_in_world(kinematics),
+            wrenches.reshape(*wrenches.shape[:2], 2, 3, -1),
+        )
         own[:, :, 0] *= self._equations.characteristic_length
         tolerance = _ZERO_STRESS_FACTOR * self.machine.closure.structure.redundancy.tolerance
         out = np.abs(own).max(axis=-1, initial=0.0).reshape(len(rows), -1, 6) < tolerance
@@ -303,8 +308,7 @@ class Reactions(OneLineRepr):
             np.einsum("nsi,nisc->nic", kinematics.columns, carried[:, self._joint_of_column])
             - joint_forces
         )
-        passive_jacobian = kinematics.scaled_jacobian[:, :, closure.passive]
-        turn, pivots = np.linalg.qr(passive_jacobian)
+        turn, pivots = np.linalg.qr(kinematics.scaled_jacobian[:, :, closure.passive])
         size = np.abs(np.diagonal(pivots, axis1=1, axis2=2))
         if (
             edge := size.min(axis=1, initial=1.0)
@@ -333,8 +337,9 @@ class Reactions(OneLineRepr):
             * multipliers[:, : kinematics.loop_wrenches.shape[1], None, :]
         )
         loops = np.einsum("lr,nrsc->nlsc", self._loop_of_row, loaded)
-        joints = carried - np.einsum("lj,nlsc->njsc", self._loop_paths, loops)
-        out = np.concatenate([joints, loops], axis=1)
+        out = np.concatenate(
+            [carried - np.einsum("lj,nlsc->njsc", self._loop_paths, loops), loops], axis=1
+        )
         at = np.concatenate(
             [kinematics.origins[:, 1:], kinematics.loop_frames[1][:, 1::2]], axis=1
         )
@@ -390,8 +395,9 @@ class Reactions(OneLineRepr):
         self, kinematics: _StackKinematics, body: int, local_point: Array
     ) -> Array:
         """(N, 3) positions of a point of a body in the world."""
-        out: Array = kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
-        return out
+        return np.asarray(
+            kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
+        )
 
     def _as_stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
         given = as_samples(value, self._model.nv, what, self.machine.joints)

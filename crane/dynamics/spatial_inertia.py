@@ -192,8 +192,9 @@ class ClusterMassColumns:
         for k in count:
             column = [row[k] for row in moved.values()]
             for j in range(k + 1):
-                entry = dot([row[j] for row in gamma.values()], column)
-                self.mass_block[j][k] = self.mass_block[k][j] = entry
+                self.mass_block[j][k] = self.mass_block[k][j] = dot(
+                    [row[j] for row in gamma.values()], column
+                )
 
 
 def propagate_wrench(
@@ -309,8 +310,13 @@ class MassMoments:
             for p, row in zip(momentum, spun, strict=True)
         ]
         sums = [k[1][1] + k[2][2], k[0][0] + k[2][2], k[0][0] + k[1][1]]
-        mixed = [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)]
-        return cls(mass, first, inertia, momentum, mixed)
+        return cls(
+            mass,
+            first,
+            inertia,
+            momentum,
+            [[sums[r] if r == c else -k[r][c] for c in range(3)] for r in range(3)],
+        )
 
     def __add__(self, other: "MassMoments") -> "MassMoments":
         return MassMoments(

@@ -31,8 +31,11 @@ _SECTIONS_OF_ACTIVE_JOINTS = {
 
 def specified_driven_joints(spec: MachineSpec) -> tuple[str, ...]:
     """Joints that the file specifies as driven, each once, in its order."""
-    named = [joint for drive in spec.drives for joint in drive.factors] or list(spec.active or ())
-    return tuple(dict.fromkeys(named))
+    return tuple(
+        dict.fromkeys(
+            [joint for drive in spec.drives for joint in drive.factors] or list(spec.active or ())
+        )
+    )
 
 
 def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
@@ -48,8 +51,11 @@ def specified_active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, .
 
 def specified_free_joints(spec: MachineSpec) -> tuple[str, ...]:
     """Coordinates that the file names as free, and those of floating bases."""
-    floating = (joint for series in floating_series(spec).values() for joint in series)
-    return tuple(dict.fromkeys((*spec.free, *floating)))
+    return tuple(
+        dict.fromkeys(
+            (*spec.free, *(joint for series in floating_series(spec).values() for joint in series))
+        )
+    )
 
 
 def select_free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:
@@ -101,8 +107,9 @@ def complete_active_joints(
     if not mobility or is_undecided or (is_dependent and not spec.drives):
         return None
     if not driven:
-        free = [names.index(name) for name in undriven]
-        found = propose_active_joints(model, jacobian, coupled, required=free)
+        found = propose_active_joints(
+            model, jacobian, coupled, required=[names.index(name) for name in undriven]
+        )
         if not found:
             return None
         driven_selections = [
@@ -115,8 +122,7 @@ def complete_active_joints(
         return found[0].joints, f"{_format_mobility(mobility)} and {text}"
     independent = _independent_columns(basis, [names.index(name) for name in specified])
     redundant = [name for name in specified if names.index(name) not in independent]
-    others = [i for i in range(len(names)) if i not in coupled]
-    chosen = select_columns(basis, others, independent)
+    chosen = select_columns(basis, [i for i in range(len(names)) if i not in coupled], independent)
     if chosen is None:
         chosen = select_columns(basis, range(len(names)), independent)
     if chosen is None:

@@ -235,8 +235,9 @@ def _add_joint(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -
         parent_frame.placement * se3_from_xyz_rpy(joint.xyz, joint.rpy),
     )
     if not joint.is_movable:
-        fixed = pin.FrameType.FIXED_JOINT
-        frame = model.addFrame(pin.Frame(joint.name, parent_joint, parent, placement, fixed, mass))
+        frame = model.addFrame(
+            pin.Frame(joint.name, parent_joint, parent, placement, pin.FrameType.FIXED_JOINT, mass)
+        )
         return int(model.addBodyFrame(joint.child, parent_joint, placement, frame))
     limits = (
         np.array([getattr(joint.limits, key)]) for key in ("effort", "velocity", "lower", "upper")
@@ -259,8 +260,9 @@ def _add_floating_base(
     index = model.addJoint(parent_frame.parentJoint, pin.JointModelFreeFlyer(), placement, name)
     model.addJointFrame(index, frames[joints[0].parent])
     last = joints[-1].child
-    mass = inertia_from_inertial(tree.links[last].inertial)
-    model.appendBodyToJoint(index, mass, pin.SE3.Identity())
+    model.appendBodyToJoint(
+        index, inertia_from_inertial(tree.links[last].inertial), pin.SE3.Identity()
+    )
     for joint in joints:
         frames[joint.child] = int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), -1))
     return last
@@ -272,8 +274,9 @@ def _pinocchio_joint_model(joint: Joint) -> pin.JointModel:
     for direction, kinds in zip(np.eye(3), _AXIS_ALIGNED_JOINTS, strict=True):
         if np.linalg.norm(axis - direction) < _DIRECTION_TOLERANCE:
             return kinds[0]() if is_revolute else kinds[1]()
-    kind = pin.JointModelRevoluteUnaligned if is_revolute else pin.JointModelPrismaticUnaligned
-    return kind(axis)
+    return (pin.JointModelRevoluteUnaligned if is_revolute else pin.JointModelPrismaticUnaligned)(
+        axis
+    )
 
 
 def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
@@ -289,8 +292,7 @@ def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
     floating = floating_bases(spec)
     for index in range(1, model.njoints):
         name = model.names[index]
-        joint = spec.tree.joints[floating[name][-1] if name in floating else name]
-        link = links[joint.child]
+        link = links[spec.tree.joints[floating[name][-1] if name in floating else name].child]
         if link.composite_joint is not None or index in refused_joints:
             continue
         with error_recovery(harmless=True):
@@ -304,8 +306,9 @@ def _has_inertia_finding(link: Link) -> bool:
 def _check_body_inertia(link: Link, inertia: pin.Inertia, has_finding: bool) -> None:
     """Refuse an infeasible inertia; formal problems that were already reported are accepted."""
     problem = inertia_problem(inertia.mass, inertia.inertia)
-    is_accepted = has_finding and (_has_inertia_finding(link) or not is_strict())
-    if problem is not None and not (is_accepted and problem.is_formal):
+    if problem is not None and not (
+        (has_finding and (_has_inertia_finding(link) or not is_strict())) and problem.is_formal
+    ):
         raise DescriptionError(
             f"{link.source_location}: link '{link.name}' with what is fixed to it has {problem}"
         )

@@ -149,8 +149,9 @@ def emit_formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
         )
     if len(pieces) == 1 and len(copied_outputs) <= PIECE_LENGTH:
         texts = [[line for text in texts for line in text]]
-    inputs = [f"ptr noalias readonly %in{i}" for i in range(formula.input_count)]
-    arguments = ", ".join([*inputs, "ptr noalias %out"])
+    arguments = ", ".join(
+        [*[f"ptr noalias readonly %in{i}" for i in range(formula.input_count)], "ptr noalias %out"]
+    )
     head = f"define void @{formula.name}({arguments}) "
     if len(texts) <= 1:
         head += f"{_FRAME_POINTER_ATTRIBUTES} {{"
@@ -181,8 +182,9 @@ def _group_operations(operations: Sequence[tuple], formula: Formula) -> list[lis
         for i in level:
             if operations[i][0] in _VECTORIZED:
                 name = operations[i][:1]
-                alike = shared_operands(operations[i]) if name == ("dot",) else name
-                same.setdefault(alike, []).append(i)
+                same.setdefault(
+                    shared_operands(operations[i]) if name == ("dot",) else name, []
+                ).append(i)
         for _, indices in sorted(same.items(), key=lambda item: item[0][0]):
             steps += [
                 indices[start : start + MAX_VECTOR_WIDTH]
@@ -245,8 +247,9 @@ class _FormulaPiece:
                     lines += self._emit_load(x, memory_slots)
             if self._operations[step[0]][0] == "dot":
                 lines += emit_dot_products(step, [self._operations[i][1:] for i in step], vectors)
-                lanes = ((at, k) for k, i in enumerate(step) for at in output_indices.get(i, ()))
-                lines += emit_dot_product_stores(step, lanes)
+                lines += emit_dot_product_stores(
+                    step, ((at, k) for k, i in enumerate(step) for at in output_indices.get(i, ()))
+                )
             else:
                 lines += self._emit_step(step, functions)
                 for index in step:
@@ -323,8 +326,9 @@ def _dependency_levels(operations: Sequence[tuple], indices: Sequence[int]) -> l
     out: list[list[int]] = []
     for index in indices:
         operation = operations[index]
-        before = max((level[x] for x in _operand_indices(operation)), default=0)
-        level[index] = before + (operation[0] in _VECTORIZED)
+        level[index] = max((level[x] for x in _operand_indices(operation)), default=0) + (
+            operation[0] in _VECTORIZED
+        )
         while len(out) <= level[index]:
             out.append([])
         out[level[index]].append(index)
