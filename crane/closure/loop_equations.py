@@ -291,11 +291,9 @@ class LoopEquations:
             if not aligned:
                 continue
             (j1, local1), (j2, local2) = self.frames[2 * index : 2 * index + 2]
-            cosines = np.einsum(
-                "ik,ik->k",
-                (self.data.oMi[j1] * local1).rotation,
-                (self.data.oMi[j2] * local2).rotation,
-            )
+            turn1 = (self.data.oMi[j1] * local1).rotation
+            turn2 = (self.data.oMi[j2] * local2).rotation
+            cosines = np.einsum("ik,ik->k", turn1, turn2)
             if any(cosines[k] < 0 for k in aligned):
                 return loop.name
         return None

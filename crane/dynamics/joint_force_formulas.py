@@ -63,11 +63,8 @@ def friction_sign(law: Vector, velocity: Scalar, has_stick_slip: bool, use_modes
         use_modes: Whether the stick-slip mode in `law` gives the sign instead of the velocity.
     """
     if has_stick_slip:
-        return (
-            law[SLIP_INDEX]
-            if use_modes
-            else where_positive(velocity, 1.0, where_positive(-1.0 * velocity, -1.0, 0.0))
-        )
+        negative_sign = where_positive(-1.0 * velocity, -1.0, 0.0)
+        return law[SLIP_INDEX] if use_modes else where_positive(velocity, 1.0, negative_sign)
     return apply_function("tanh", law[_SHARPNESS_INDEX] * velocity)
 
 

@@ -120,9 +120,8 @@ class PinocchioDynamics:
         roots: dict[int, list[int]] = {}
         root_of = {0: 0}
         for body in range(1, self._model.njoints):
-            root_of[body] = (
-                root_of[joints[carrier_bodies[self._model.joints[body].idx_v + 1]]] or body
-            )
+            carrier = joints[carrier_bodies[self._model.joints[body].idx_v + 1]]
+            root_of[body] = root_of[carrier] or body
             roots.setdefault(root_of[body], []).append(body)
         return list(roots.values())
 

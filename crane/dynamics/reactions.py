@@ -211,9 +211,8 @@ class Reactions(OneLineRepr):
         rows, stacked = self._as_stack(q, "q")
         kinematics = self._evaluate_kinematics(rows)
         passive = self.machine.closure.passive
-        stress = np.linalg.qr(kinematics.scaled_jacobian[:, :, passive], mode="complete")[0][
-            :, :, len(passive) :
-        ]
+        basis = np.linalg.qr(kinematics.scaled_jacobian[:, :, passive], mode="complete")[0]
+        stress = basis[:, :, len(passive) :]
         none = np.zeros((len(rows), len(self._local_axes), 6, stress.shape[2]))
         wrenches = self._wrenches_with_loop_forces(
             kinematics, none, stress / self._equations.residual_units[:, None]

@@ -274,9 +274,8 @@ def _pinocchio_joint_model(joint: Joint) -> pin.JointModel:
     for direction, kinds in zip(np.eye(3), _AXIS_ALIGNED_JOINTS, strict=True):
         if np.linalg.norm(axis - direction) < _DIRECTION_TOLERANCE:
             return kinds[0]() if is_revolute else kinds[1]()
-    return (pin.JointModelRevoluteUnaligned if is_revolute else pin.JointModelPrismaticUnaligned)(
-        axis
-    )
+    kind = pin.JointModelRevoluteUnaligned if is_revolute else pin.JointModelPrismaticUnaligned
+    return kind(axis)
 
 
 def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
@@ -306,9 +305,8 @@ def _has_inertia_finding(link: Link) -> bool:
 def _check_body_inertia(link: Link, inertia: pin.Inertia, has_finding: bool) -> None:
     """Refuse an infeasible inertia; formal problems that were already reported are accepted."""
     problem = inertia_problem(inertia.mass, inertia.inertia)
-    if problem is not None and not (
-        (has_finding and (_has_inertia_finding(link) or not is_strict())) and problem.is_formal
-    ):
+    is_accepted = has_finding and (_has_inertia_finding(link) or not is_strict())
+    if problem is not None and not (is_accepted and problem.is_formal):
         raise DescriptionError(
             f"{link.source_location}: link '{link.name}' with what is fixed to it has {problem}"
         )
