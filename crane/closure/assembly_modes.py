@@ -14,8 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.closure import Closure
-from crane.closure.constraint_structure import Indices
 from crane.closure.constraint_tolerances import FILE_PRECISION
+from crane.closure.coordinates import Indices
 from crane.closure.home_search import within_limits
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import MultiStartSearch, low_discrepancy_steps

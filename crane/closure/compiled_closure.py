@@ -9,7 +9,8 @@ import numpy as np
 
 from crane.closure.closure_routines import add_closure_routines
 from crane.closure.clusters import Cluster, find_clusters
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
     FormulaConstants,
     PositionKinematics,

@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from crane.closure.active_joint_selection import (
     ActiveJointSelection,
-    format_selections,
     propose_active_joints,
 )
 from crane.closure.constraint_tolerances import ExactConstraints, RedundancyGap
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import periodic_coordinates, remove_revolutions
 from crane.common.errors import MechanismError
 from crane.common.one_line_repr import format_count
 from crane.common.samples import Array
 
-Indices = NDArray[np.intp]
 Block = tuple[Indices, Indices]  # rows and columns
 
 _RANK_TOLERANCE = 1e-8  # relative singular value that still counts
@@ -304,8 +303,7 @@ class _ConstraintAnalysis:
         )
 
     def _propose(self, jacobian: Array, **choice: Sequence[int]) -> list[ActiveJointSelection]:
-        coupled = np.flatnonzero((self._equations.coupling_factors != 0).any(axis=0)).tolist()
-        return propose_active_joints(self._equations.model, jacobian, coupled, **choice)
+        return propose_active_joints(self._equations, jacobian, **choice)
 
     def _undetermined_joints(self, jacobians: Sequence[Array]) -> Indices:
         """Columns of the passive joints that can move while the active joints are held."""
@@ -366,7 +364,7 @@ def _numerical_rank(jacobian: Array, tolerance: float = _RANK_TOLERANCE) -> int:
 
 
 def _format_proposals(prefix: str, selections: Sequence[ActiveJointSelection]) -> str:
-    return f"{prefix}{format_selections(selections)}" if selections else ""
+    return prefix + ", or ".join(map(str, selections)) if selections else ""
 
 
 def _missing_active_joints_text(mobility: int) -> str:

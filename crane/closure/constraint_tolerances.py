@@ -24,11 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.active_joint_selection import (
-    Indices,
-    null_space_basis,
-    select_columns,
-)
+from crane.closure.active_joint_selection import null_space_basis, select_columns
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import damped_step
 from crane.common.samples import Array, solve_linear

@@ -33,7 +33,6 @@ from crane.closure.constraint_structure import (
     ActiveJointError,
     ConstraintStructure,
     HomeError,
-    Indices,
     analyse_constraints,
 )
 from crane.closure.constraint_tolerances import (
@@ -43,6 +42,7 @@ from crane.closure.constraint_tolerances import (
     RedundancyGap,
     RoundedConstraints,
 )
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.closure.multi_start_search import MultiStartSearch
 from crane.codegen import cached_result

@@ -2,14 +2,12 @@
 
 import threading
 from collections.abc import Collection, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.active_joint_selection import Indices, characteristic_length, motion_scales
-from crane.closure.coordinates import Coordinates
+from crane.closure.coordinates import Coordinates, Indices
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
 from crane.description.specification import LOOP_TYPES, Coupling, LoopSpec
@@ -83,9 +81,9 @@ class LoopEquations:
         names: Names of loops, then couplings.
         loop_of_row: (m,) index in `names` of every equation.
         is_translation: (m,) whether the equation is a length.
-        characteristic_length: Characteristic length [m], see
-            `crane.closure.active_joint_selection.characteristic_length`.
-        coordinate_units: (nv,) units of the coordinates: 1 rad, and the characteristic length [m].
+        characteristic_length: See `Coordinates.characteristic_length` [m].
+        coordinate_units: See `Coordinates.units`.
+        motion_scales: See `Coordinates.motion_scales`.
         residual_units: (m,) units of the residuals: 1 rad, and the characteristic length [m].
     """
 
@@ -134,10 +132,9 @@ class LoopEquations:
         self.is_translation = np.concatenate(
             [self._is_loop_translation, np.array(is_length, dtype=bool)]
         )
-        self.characteristic_length = characteristic_length(model)
-        self.coordinate_units = np.where(
-            self.coordinates.is_translation, self.characteristic_length, 1.0
-        )
+        self.characteristic_length = self.coordinates.characteristic_length
+        self.coordinate_units = self.coordinates.units
+        self.motion_scales = self.coordinates.motion_scales
         self.residual_units = np.where(self.is_translation, self.characteristic_length, 1.0)
 
     def coupled_groups(self, columns: Indices) -> tuple[Indices, Indices]:
@@ -168,11 +165,6 @@ class LoopEquations:
         )
         found._thread_local.data = self.data  # creating data is expensive
         return found
-
-    @cached_property
-    def motion_scales(self) -> Array:
-        """(nv,) comparable displacements of the joints, see `motion_scales`."""
-        return motion_scales(self.model)
 
     @property
     def cache_key(self) -> tuple[Any, ...]:

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
+from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import PositionKinematics, largest_scaled_value
 from crane.closure.loop_equations import LoopEquations, aligned_axes
 from crane.closure.spatial_vectors import (

@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from crane.closure.active_joint_selection import Indices
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.samples import Array
 from crane.description.specification import LOOP_TYPES

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.constraint_structure import ConstraintStructure, Indices
+from crane.closure.constraint_structure import ConstraintStructure
+from crane.closure.coordinates import Indices
 from crane.closure.loop_equations import LoopEquations
 from crane.common.errors import (
     MechanismError,

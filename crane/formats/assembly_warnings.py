@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.active_joint_selection import translational_coordinates
 from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly_modes
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
@@ -86,7 +85,7 @@ def _different_home_text(
     name = closure.equations.coordinates.names[joint]
     deviation_text = (
         f"{deviation * closure.units[joint]:.3g} "
-        f"{'m' if translational_coordinates(closure.model)[joint] else 'rad'}"
+        f"{'m' if closure.equations.coordinates.is_translation[joint] else 'rad'}"
     )
     loops = _list_names([f"'{loop}'" for loop in search.reversed])
     reversed_loops_text = f", loop {loops} the other way round" if loops else ""
@@ -113,7 +112,7 @@ def _home_search_text(spec: MachineSpec, closure: Closure, search: HomeSearchRes
     names = closure.equations.coordinates.names
     location = spec.source_locations.get("home", spec.path.name)
     joint, deviation = search.largest_deviation
-    unit = "m" if translational_coordinates(closure.model)[joint] else "rad"
+    unit = "m" if closure.equations.coordinates.is_translation[joint] else "rad"
     free = select_free_joints(spec, closure.active_names)
     driven_columns = [i for i in closure.active if names[int(i)] not in free]
     moved_text = _list_names([names[int(i)] for i in driven_columns if i in search.moved_columns])
@@ -217,7 +216,7 @@ def _alternative_text(spec: MachineSpec, closure: Closure, alternative: Assembly
         f"loop {alternative.loops[0]}", spec.path.name
     )
     names = closure.equations.coordinates.names
-    is_translation = translational_coordinates(closure.model)
+    is_translation = closure.equations.coordinates.is_translation
 
     def deviation_text(at: tuple[int, float]) -> str:
         return f"{names[at[0]]} {at[1]:.3g} {'m' if is_translation[at[0]] else 'rad'} off"

@@ -125,7 +125,7 @@ def _closure_with_completed_joints(
 ) -> Closure | None:
     """The closure with completed active joints, None if there is no selection."""
     equations = LoopEquations(model, loops, spec.couplings)
-    choice = complete_active_joints(spec, model, equations, active_joint_error.jacobian)
+    choice = complete_active_joints(spec, equations, active_joint_error.jacobian)
     if choice is None:
         return None
     names, text = choice
@@ -140,7 +140,7 @@ def _closure_with_completed_joints(
             return None
     if closure.home_search is not None:  # home is far from where they were selected
         jacobian = equations.evaluate(closure.home)[1][closure.structure.independent_rows]
-        improved = complete_active_joints(spec, model, equations, jacobian)
+        improved = complete_active_joints(spec, equations, jacobian)
         if improved is not None and improved[0] != names:
             text = improved[1]
             closure = _closure_by_other_joints(closure, improved[0])
