@@ -8,7 +8,6 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from crane.closure.closure_routines import add_closure_routines
-from crane.closure.clusters import Cluster, find_clusters
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import (
@@ -18,7 +17,7 @@ from crane.closure.kinematics_formulas import (
     largest_scaled_value,
     tree_geometry,
 )
-from crane.closure.loop_equations import LoopEquations
+from crane.closure.loop_equations import Cluster, LoopEquations, find_clusters
 from crane.closure.loop_formulas import LoopFormulas
 from crane.closure.newton_continuation import ClosedConfiguration
 from crane.codegen import Layout, LayoutView, Program, Scalar, Tape, max_abs, maximum

@@ -7,18 +7,16 @@ the two bodies that it joins. Differentiated along q_k, and twice along the moti
     w'' . dJ_j + 2 w' . dJ_j' + w . dJ_j'' = 0,    dJ_j = J_2,j - J_1,j.
 
 These are equations for d_k gamma_j and gamma_j'', each with the same matrix as gamma. Coordinates
-move joints of their own cluster only (`crane.closure.clusters`), so that motions are taken
+move joints of their own cluster only (`crane.closure.loop_equations`), so that motions are taken
 relative to the body that carries the cluster.
 """
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
-from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import PositionKinematics
-from crane.closure.loop_formulas import LoopEquationFormula, LoopFormulas
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     ZERO_VECTOR,
+    PositionKinematics,
     SpatialVector,
     Vector,
     add_spatial,
@@ -27,6 +25,8 @@ from crane.closure.spatial_vectors import (
     spatial_dot,
     subtract_spatial,
 )
+from crane.closure.loop_equations import Cluster
+from crane.closure.loop_formulas import LoopEquationFormula, LoopFormulas
 from crane.codegen.symbolic import Scalar, add_vectors, cross, dot, scale_vector
 
 BodyMotions = dict[int, SpatialVector]  # by body

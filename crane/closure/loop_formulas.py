@@ -7,14 +7,15 @@ from functools import cached_property
 from crane.closure.constraint_structure import ConstraintStructure
 from crane.closure.constraint_tolerances import CLOSED_TOLERANCE
 from crane.closure.coordinates import Indices
-from crane.closure.kinematics_formulas import PositionKinematics, largest_scaled_value
-from crane.closure.loop_equations import LoopEquations, aligned_axes
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
+    PositionKinematics,
     SpatialVector,
     Vector,
+    largest_scaled_value,
     spatial_dot,
     subtract_spatial,
 )
+from crane.closure.loop_equations import LoopEquations, aligned_axes
 from crane.codegen.symbolic import (
     Scalar,
     add_vectors,

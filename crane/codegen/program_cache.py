@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import crane
-from crane.codegen.llvm import compiler_settings
+from crane.codegen.llvm.machine_code import compiler_settings
 from crane.codegen.vector_layout import ArgumentKind, Layout
 from crane.common import file_cache
 from crane.common.serialization import deserialize, serialize

@@ -24,11 +24,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.clusters import Cluster, find_clusters
-from crane.closure.kinematics_formulas import PositionKinematics
-from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     ZERO_VECTOR,
+    PositionKinematics,
     SpatialVector,
     Vector,
     add_spatial,
@@ -37,8 +35,9 @@ from crane.closure.spatial_vectors import (
     shift_wrench,
     spatial_dot,
 )
-from crane.codegen.matrix_factorization import LdltFactorization
-from crane.codegen.symbolic import Scalar, dot
+from crane.closure.loop_equations import Cluster, find_clusters
+from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
+from crane.codegen.symbolic import LdltFactorization, Scalar, dot
 from crane.dynamics.spatial_inertia import ClusterMassColumns, SpatialInertia, forward_substitute
 from crane.machine.machine import Machine
 

@@ -14,8 +14,9 @@ and those of the wrench f = I A + V x* I V = I A + B V of a body are
 
 with sums over the points r of the body (Singh, Russell, Wensing 2022, equations (39) to (46), have
 the same for open trees, with other signs and names). The columns include the derivatives of gamma
-(`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.clusters`) move with its
-own coordinates only: sums over bodies are taken by cluster, with all bodies beyond as one inertia.
+(`crane.closure.gamma_derivatives`). Joints of one cluster (`crane.closure.loop_equations`) move
+with its own coordinates only: sums over bodies are taken by cluster, with all bodies beyond as one
+inertia.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from crane.closure.gamma_derivatives import BodyMotions, GammaDerivatives, JointRates
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     SpatialVector,
     Vector,
     add_spatial,
@@ -32,8 +33,8 @@ from crane.closure.spatial_vectors import (
     spatial_dot,
 )
 from crane.codegen.differentiation import directional_derivative
-from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     SymbolicExpression,
     add_vectors,

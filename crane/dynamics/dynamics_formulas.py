@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     Vector,
 )
-from crane.codegen.matrix_factorization import LdltFactorization
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     add_vectors,
     apply_function,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.spatial_vectors import Vector
+from crane.closure.kinematics_formulas import Vector
 from crane.codegen import PythonCallback, SymbolicExpression, Tape
 from crane.codegen.symbolic import (
     Scalar,

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 from crane.closure.kinematics_formulas import (
     PositionKinematics,
-)
-from crane.closure.spatial_vectors import (
     Vector,
 )
 from crane.codegen.symbolic import (

@@ -15,11 +15,9 @@ operations in proportion to its entries.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from crane.closure.clusters import Cluster
-from crane.closure.kinematics_formulas import PositionKinematics
-from crane.closure.loop_formulas import LoopFormulas
-from crane.closure.spatial_vectors import (
+from crane.closure.kinematics_formulas import (
     ZERO_VECTOR,
+    PositionKinematics,
     SpatialVector,
     Vector,
     add_spatial,
@@ -27,8 +25,10 @@ from crane.closure.spatial_vectors import (
     shift_wrench,
     spatial_dot,
 )
-from crane.codegen.matrix_factorization import LdltFactorization
+from crane.closure.loop_equations import Cluster
+from crane.closure.loop_formulas import LoopFormulas
 from crane.codegen.symbolic import (
+    LdltFactorization,
     Scalar,
     add_vectors,
     cross,

@@ -8,11 +8,11 @@ import numpy as np
 
 from crane.codegen import Program, RoutineValue, Scalar, Tape, select
 from crane.codegen.llvm.routine_builder import ArrayPointer
-from crane.codegen.matrix_factorization import lu_factorize
 from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
     dot,
+    lu_factorize,
     maximum,
     scale_vector,
     subtract_vectors,
