@@ -1,4 +1,4 @@
-"""The loop equations phi(q) = 0, their Jacobian and its time derivative, and clusters of joints."""
+"""The loop equations phi(q) = 0, their Jacobian and its rate, and clusters of joints."""
 
 import threading
 from collections.abc import Collection, Iterable, Sequence

@@ -32,8 +32,8 @@ from crane.dynamics.cluster_recursion import (
     joint_accelerations,
 )
 from crane.dynamics.inertial_force_formulas import InertialForceFormulas
-from crane.dynamics.joint_force_formulas import SLIP_INDEX, friction_sign
-from crane.dynamics.joint_forces import REST_ACCELERATION, REST_VELOCITY
+from crane.dynamics.joint_force_formulas import friction_sign
+from crane.dynamics.joint_forces import REST_ACCELERATION, REST_VELOCITY, SLIP_INDEX
 
 # degrees of freedom up to which factorizing M_A takes fewer operations than recursion
 _MAX_MOBILITY_FACTORIZED = 7
@@ -138,9 +138,9 @@ class DynamicsFormulas(InertialForceFormulas):
             *_flatten_by_row(map(self._rotate_to_world, jacobian)),
         ]
         out += [mass + self._fixed_inertia[0], *self.passive_force]
-        if self._tip_point is None or self.formula_structure.tip_body is None:
-            return out
         body = self.formula_structure.tip_body
+        if body is None:
+            return out
         point = add_vectors(
             kinematics.origin[body], matvec(kinematics.rotation[body], self._tip_point)
         )

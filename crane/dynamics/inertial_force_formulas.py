@@ -4,15 +4,11 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 
 from crane.closure.kinematics_formulas import (
-    FormulaConstants,
-    PositionKinematics,
     SpatialVector,
     Vector,
     rotation_matrix,
     rotation_vector_derivative,
 )
-from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.codegen import Scalar
 from crane.codegen.symbolic import (
     LdltFactorization,
     Scalar,
@@ -24,74 +20,12 @@ from crane.codegen.symbolic import (
     scale_vector,
     subtract_vectors,
 )  # fmt: skip
-from crane.dynamics.formula_structure import BODY_SIZE, FormulaStructure
-from crane.dynamics.joint_force_formulas import LAW_SIZE, JointForceFormulas
+from crane.dynamics.joint_force_formulas import JointForceFormulas
 from crane.dynamics.spatial_inertia import CompositeMassMatrix
 
 
 class InertialForceFormulas(JointForceFormulas):
     """Symbolic inertial forces and energies; base class of `DynamicsFormulas`."""
-
-    def __init__(
-        self,
-        kinematics: PositionKinematics,
-        loops: LoopFormulas,
-        constants: FormulaConstants,
-        q: Sequence[Scalar],
-        v_a: Sequence[Scalar],
-        formula_structure: FormulaStructure,
-        use_modes: bool = False,
-        drift: Vector | None = None,
-    ):
-        self.formula_structure, self._use_modes = formula_structure, use_modes
-        self._distance_bodies = formula_structure.distance_bodies
-        self._stick_slip_columns = formula_structure.stick_slip_columns
-        self.v_a = list(v_a)
-        self.kinematics, self.loops, self.q = kinematics, loops, q
-        self._body_count = len(kinematics.geometry.parents)
-        self._mobility = len(v_a)
-        bodies = self._body_count - 1
-        self._inertia_constants = [
-            constants.vector(BODY_SIZE * i, BODY_SIZE) for i in range(bodies)
-        ]
-        first = BODY_SIZE * bodies
-        self._joint_laws = [
-            constants.vector(first + LAW_SIZE * i, LAW_SIZE) for i in range(bodies)
-        ]
-        self._gravity = matvec(
-            kinematics.rotation[0], constants.vector((BODY_SIZE + LAW_SIZE) * bodies)
-        )
-        self.rotor_inertias: Vector = [
-            0.0,
-            *constants.vector((BODY_SIZE + LAW_SIZE) * bodies + 3, bodies),
-        ]
-        after = (BODY_SIZE + LAW_SIZE + 1) * bodies + 3
-        self._distance_constants = [
-            constants.vector(after + (LAW_SIZE + 6) * k, LAW_SIZE + 6)
-            for k in range(len(formula_structure.distance_bodies))
-        ]
-        last = after + (LAW_SIZE + 6) * len(formula_structure.distance_bodies)
-        self._moving_factor = constants[last]
-        self.circuit_friction = constants.vector(
-            last + 1, len(formula_structure.circuit_friction_columns)
-        )
-        last += len(formula_structure.circuit_friction_columns)
-        self._fixed_inertia = constants.vector(last + 1, 4)
-        self._tip_point = (
-            None if formula_structure.tip_body is None else constants.vector(last + 5)
-        )
-        self.gamma = loops.gamma
-        self.joint_velocities: Vector = [
-            0.0,
-            *(dot(self.gamma[i], v_a) for i in range(1, self._body_count)),
-        ]
-        # the drift of the loops is that of the whole machine in both formulations
-        tree_velocities, carrier_velocities = (
-            VelocityKinematics(kinematics, loops, self.joint_velocities, self._gravity, parents)
-            for parents in (kinematics.geometry.parents, formula_structure.carrier_bodies)
-        )
-        self.drift = tree_velocities.drift if drift is None else drift
-        self._tree_velocities, self._carrier_velocities = tree_velocities, carrier_velocities
 
     @cached_property
     def _body_jacobians(self) -> list[list[tuple[Vector, Vector]]]:

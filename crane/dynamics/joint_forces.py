@@ -20,10 +20,14 @@ _LAW_FIELDS = (
     "stop_stiffness", "stop_damping", "lower_limit", "upper_limit",
     "gas_force", "gas_area_per_volume", "gas_rest_position", "gas_exponent",
 )  # fmt: skip
-_MODE_FIELDS = slice(_LAW_FIELDS.index("slip_sign"), _LAW_FIELDS.index("inverse_velocity") + 1)
+LAW_SIZE = len(_LAW_FIELDS)  # values of a law, see `JointForces.table`
+SHARPNESS_INDEX = _LAW_FIELDS.index("sharpness")
+SLIP_INDEX = _LAW_FIELDS.index("slip_sign")  # first of the stick-slip mode
+END_STOP_INDEX = _LAW_FIELDS.index("stop_stiffness")  # first of the end stop
+_MODE_FIELDS = slice(SLIP_INDEX, _LAW_FIELDS.index("inverse_velocity") + 1)
 _SPRING_FIELDS = slice(_LAW_FIELDS.index("stiffness"), _LAW_FIELDS.index("energy_offset") + 1)
-_END_STOP_FIELDS = slice(_LAW_FIELDS.index("stop_stiffness"), _LAW_FIELDS.index("upper_limit") + 1)
-_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), len(_LAW_FIELDS))
+_END_STOP_FIELDS = slice(END_STOP_INDEX, _LAW_FIELDS.index("upper_limit") + 1)
+_GAS_FIELDS = slice(_LAW_FIELDS.index("gas_force"), LAW_SIZE)
 # for joints with circuit friction only, so that friction is never zero
 MIN_COULOMB_FRICTION = 1e-6
 REST_VELOCITY = 5e-10  # scaled velocity that counts as rest
@@ -63,7 +67,7 @@ class JointForces:
     def __init__(self, machine: Machine):
         rows, pairs = _table_rows(machine)
         self._joint_count, self.lengths = machine.model.nv, FrameDistances(machine, pairs)
-        law_table = self.table = np.zeros((self._joint_count + len(pairs), len(_LAW_FIELDS)))
+        law_table = self.table = np.zeros((self._joint_count + len(pairs), LAW_SIZE))
         self.sticking, self.moving_factor = find_stick_slip_columns(machine), 1.0
         self.circuit_friction_columns, self.circuit_friction = (
             find_circuit_friction_columns(machine),
@@ -193,7 +197,7 @@ class JointForces:
         sign = np.tanh(v * sharpness)
         if use_modes:
             stick_slip = list(self.sticking)
-            sign[stick_slip] = self.table[stick_slip, _LAW_FIELDS.index("slip_sign")]
+            sign[stick_slip] = self.table[stick_slip, SLIP_INDEX]
             coulomb = coulomb + self.circuit_friction
         stick_slip_columns = stiction * np.exp(-((v * stribeck) ** 2))
         return (

@@ -17,12 +17,7 @@ from crane.dynamics.compiled_dynamics import (
     CompiledParameterDerivatives,
     CompiledQuantity,
 )
-from crane.dynamics.formula_structure import (
-    FormulaStructure,
-    circuit_friction_indices,
-    dynamics_constants,
-    stick_slip_mode_indices,
-)
+from crane.dynamics.formula_structure import FormulaStructure, dynamics_constants
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.pinocchio_dynamics import PinocchioDynamics
 from crane.formats.machine_loading import MachineVariants
@@ -169,14 +164,13 @@ class QuantityEvaluator(OneLineRepr):
             )
         # constants to fold into formulas; NaN for those that change with the motion
         self.constant_pattern = self.formula_constants.copy()
-        self._mode_indices = (
-            stick_slip_mode_indices(machine, self.forces) if self.backend == "compiled" else []
-        )
-        self.constant_pattern[self._mode_indices] = np.nan
-        self._circuit_friction_indices = (
-            circuit_friction_indices(machine, self.forces) if self.backend == "compiled" else []
-        )
-        self.constant_pattern[self._circuit_friction_indices] = np.nan
+        self._mode_indices = self.formula_structure.stick_slip_mode_indices
+        self._circuit_friction_indices = self.formula_structure.constants_layout[
+            "circuit_friction"
+        ]
+        if self.backend == "compiled":
+            self.constant_pattern[self._mode_indices] = np.nan
+            self.constant_pattern[self._circuit_friction_indices] = np.nan
 
     @property
     def _mobility(self) -> int:
@@ -218,7 +212,7 @@ class QuantityEvaluator(OneLineRepr):
         They only affect the quantities of the integration, `STICK_SLIP_QUANTITIES`.
         """
         self.forces.set_stick_slip_modes(slip_sign, is_held, inverse_velocity, is_moving)
-        if self._mode_indices:
+        if self.backend == "compiled":
             self.formula_constants[self._mode_indices] = [
                 *np.column_stack([slip_sign, is_held, inverse_velocity]).ravel(),
                 is_moving,
