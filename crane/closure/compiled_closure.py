@@ -174,7 +174,7 @@ class CompiledClosure:
         add_closure_routines(program, self._nq, self._n)
 
     def cached_program(self, key: tuple, build: Callable[[Program], None]) -> Program:
-        """A further program of this machine, see `Program.from_cache`.
+        """A further program of this machine, kept in `programs`; see `Program.from_cache`.
 
         Args:
             key: What it depends on besides the loops.
@@ -183,7 +183,9 @@ class CompiledClosure:
         Raises:
             FormulaTooLongError: It would take too long to compile.
         """
-        return Program.from_cache((self._formula_key, key), build)
+        if key not in self.programs:
+            self.programs[key] = Program.from_cache((self._formula_key, key), build)
+        return self.programs[key]
 
     def formula_outputs(self, formula: str) -> Layout:
         """Layout of the outputs of a formula of the closure program."""

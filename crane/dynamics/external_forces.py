@@ -4,7 +4,6 @@ from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
 from crane.closure.kinematics_formulas import Vector
 from crane.codegen import PythonCallback, SymbolicExpression, Tape
@@ -22,7 +21,7 @@ from crane.codegen.symbolic import (
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS, ExternalForce, FrameMotion
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
-from crane.dynamics.frame_jacobians import FrameJacobians
+from crane.dynamics.frame_jacobians import FrameJacobians, frame_placement
 from crane.machine.machine import Machine
 
 _CALLBACK_INPUT_SIZE = 19  # inputs of a Python function
@@ -102,7 +101,7 @@ def formula_key(machine: Machine) -> Hashable:
                 force.state_rates(here),
             )  # fmt: skip
         ]
-        joint, pose = _frame_placement(machine, force)
+        joint, pose = frame_placement(machine, force.frame)
         out.append(
             (
                 repr(((count, force.state_count), tape.operations, outputs)),
@@ -139,7 +138,7 @@ def trace_external_forces(
     for force, count in zip(
         machine.external_forces, reference_counts(machine.external_forces), strict=True
     ):
-        joint, pose = _frame_placement(machine, force)
+        joint, pose = frame_placement(machine, force.frame)
         body = machine.coordinates.body_of_joint[joint]
         turn = geometry.body_rotations[body].T
         at = add_vectors(
@@ -286,9 +285,3 @@ def static_active_forces(machine: Machine, q: Array) -> Array:
         0.0, q, still, none
     )
     return np.asarray(machine.closure.gamma(q).T @ applied.generalized_forces)
-
-
-def _frame_placement(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:
-    """Pinocchio's joint that moves a force's frame, and the placement of the frame in it."""
-    frame = machine.model.frames[machine.frame(force.frame)]
-    return int(frame.parentJoint), frame.placement

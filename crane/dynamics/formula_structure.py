@@ -9,6 +9,7 @@ from crane.codegen import Layout
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array
 from crane.dynamics.cluster_recursion import RecursionPlan, plan_recursion
+from crane.dynamics.frame_jacobians import frame_placement
 from crane.dynamics.joint_forces import LAW_SIZE, SLIP_INDEX, JointForces
 from crane.machine.machine import Machine
 
@@ -86,18 +87,10 @@ def dynamics_constants(machine: Machine, geometry: TreeGeometry, forces: JointFo
     fixed_inertia = machine.model.inertias[0]
     numbers += [[fixed_inertia.mass], fixed_inertia.mass * fixed_inertia.lever]
     if machine.tip is not None:
-        body, place = tip_body_and_point(machine)
-        numbers.append(geometry.body_rotations[body].T @ place)
+        joint, placement = frame_placement(machine, machine.tip)
+        turn = geometry.body_rotations[machine.coordinates.body_of_joint[joint]]
+        numbers.append(turn.T @ placement.translation)
     return np.concatenate(numbers)
-
-
-def tip_body_and_point(machine: Machine) -> tuple[int, Array]:
-    """The body of a machine's tip, and the point on it (3,) [m]."""
-    assert machine.tip is not None
-    frame = machine.model.frames[machine.frame(machine.tip)]
-    return machine.coordinates.body_of_joint[frame.parentJoint], np.array(
-        frame.placement.translation
-    )
 
 
 @dataclass(frozen=True)
@@ -135,7 +128,7 @@ class FormulaStructure:
         spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.end_points)
         plan = plan_recursion(machine) if formulation == "exact" else ()
         kinds = forces.sticking, forces.circuit_friction_columns
-        tip = None if machine.tip is None else tip_body_and_point(machine)[0]
+        tip = None if machine.tip is None else bodies[frame_placement(machine, machine.tip)[0]]
         return cls(carrier_bodies(machine, formulation), plan, tuple(spans), *kinds, tip)
 
     @property

@@ -10,6 +10,12 @@ from crane.common.threads import ThreadLocal
 from crane.machine.machine import Machine
 
 
+def frame_placement(machine: Machine, link: str) -> tuple[int, pin.SE3]:
+    """Pinocchio's joint that moves a link's frame, and the placement of the frame in it."""
+    frame = machine.model.frames[machine.frame(link)]
+    return int(frame.parentJoint), frame.placement.copy()
+
+
 class FrameJacobians:
     """Poses and Jacobians of links at one configuration at a time.
 
@@ -33,7 +39,7 @@ class FrameJacobians:
 
     def frame_origins(self, q: Array, links: Sequence[str]) -> Array:
         """Origins (N, k, 3) of k links' frames in the world, at configurations (N, nq) [m]."""
-        placements = [self._frame_placement(link) for link in links]
+        placements = [frame_placement(self._machine, link) for link in links]
         joints = [joint for joint, _ in placements]
         local_origins = np.array([placement.translation for _, placement in placements]).reshape(
             -1, 3
@@ -52,19 +58,15 @@ class FrameJacobians:
 
     def frame_pose(self, link: str) -> pin.SE3:
         """Pose of a link's frame in the world."""
-        joint, placement = self._frame_placement(link)
+        joint, placement = frame_placement(self._machine, link)
         return self._data.oMi[joint] * placement
 
     def jacobian(self, link: str) -> Array:
         """(6, nv) Jacobian of a frame's origin and angular velocity, in the world's axes."""
-        joint, placement = self._frame_placement(link)
+        joint, placement = frame_placement(self._machine, link)
         if not joint:
             return np.zeros((6, self._model.nv))
         return point_jacobian(self._model, self._data, joint, placement.translation)
-
-    def _frame_placement(self, link: str) -> tuple[int, pin.SE3]:
-        frame = self._model.frames[self._machine.frame(link)]
-        return int(frame.parentJoint), frame.placement
 
 
 def point_jacobian(model: pin.Model, data: pin.Data, joint: int, point: Array) -> Array:
@@ -111,13 +113,9 @@ class FrameDistances:
 
     def __init__(self, machine: Machine, pairs: Sequence[FramePair]):
         self.pairs, self._coordinates = tuple(pairs), machine.coordinates
-        frames = machine.model.frames
+        placements = [[frame_placement(machine, link) for link in pair] for pair in self.pairs]
         self.end_points = [
-            [
-                (int(frames[i].parentJoint), frames[i].placement.translation.copy())
-                for i in map(machine.frame, pair)
-            ]
-            for pair in self.pairs
+            [(joint, placement.translation) for joint, placement in pair] for pair in placements
         ]
         if self.pairs:
             self._model = pin.Model(machine.model)

@@ -197,12 +197,7 @@ class QuantityEvaluator(OneLineRepr):
             return apply_per_sample(
                 lambda *one: self.tree_dynamics.evaluate(quantity, *one), q, v_a, x
             )
-        inputs = np.ascontiguousarray(np.concatenate([v_a, x], axis=-1))
-        if q.ndim == 1:
-            return formula.evaluate_closed(np.ascontiguousarray(q), inputs)
-        out = np.empty((len(q), formula.size))
-        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, out)
-        return out
+        return formula.evaluate_closed(q, np.concatenate([v_a, x], axis=-1))
 
     def set_stick_slip_modes(
         self, slip_sign: Array, is_held: Array, inverse_velocity: Array, is_moving: bool
@@ -282,10 +277,7 @@ class QuantityEvaluator(OneLineRepr):
 
     def _argument_derivatives(self, quantity: str, q: Array, inputs: Array) -> Array:
         """Derivatives (N, 3 size) by the arguments at closed configurations (N, nq)."""
-        formula = self._required_formula(DERIVATIVES_OF + quantity)
-        flat = np.empty((len(q), formula.size))
-        formula.evaluate_closed_stack(np.ascontiguousarray(q), inputs, flat)
-        return flat
+        return self._required_formula(DERIVATIVES_OF + quantity).evaluate_closed(q, inputs)
 
     def _parameter_derivatives_at(
         self, quantity: str, names: Sequence[str], q: Array, inputs: Array

@@ -12,7 +12,7 @@ from crane.common.errors import InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_samples
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics.frame_jacobians import MIN_LENGTH
+from crane.dynamics.frame_jacobians import MIN_LENGTH, frame_placement
 from crane.dynamics.joint_forces import JointForces
 from crane.machine.machine import Machine
 
@@ -170,10 +170,10 @@ class Reactions(OneLineRepr):
             (k, 6, 3) or (N, k, 6, 3): `joint_wrenches` of a unit force in the world's x, y, z,
             minus those without.
         """
-        body, place = self._frame_point(link)
+        body, placement = frame_placement(self.machine, link)
         rows, stacked = self._as_stack(q, "q")
         kinematics = self._evaluate_kinematics(rows)
-        point = self._point_in_world(kinematics, body, place)
+        point = self._point_in_world(kinematics, body, placement.translation)
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         load = np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)
         carried = -self._is_carried_by[body][None, :, None, None] * load[:, None]
@@ -262,7 +262,8 @@ class Reactions(OneLineRepr):
                     f"the wrench on '{link}' has {len(wrench)} samples and q "
                     f"{len(rows) if stacked else 'is one'}, give as many"
                 )
-            self._subtract_wrench(kinematics, carried, self._frame_point(link), wrench)
+            body, placement = frame_placement(self.machine, link)
+            self._subtract_wrench(kinematics, carried, (body, placement.translation), wrench)
         joint_forces = element_forces[:, :nv] - self._model.armature * accelerations
         if friction:
             joint_forces -= forces.friction_forces(velocities) + forces.breakaway_forces(
@@ -273,11 +274,6 @@ class Reactions(OneLineRepr):
         )
         wrench, drive = found[..., 0], drives[..., 0]
         return (wrench, drive) if stacked else (wrench[0], drive[0])
-
-    def _frame_point(self, link: str) -> tuple[int, Array]:
-        """The body that carries a link, and the origin of the link in that body's frame."""
-        frame = self._model.frames[self.machine.frame(link)]
-        return int(frame.parentJoint), frame.placement.translation
 
     def _subtract_wrench(
         self, kinematics: _StackKinematics, carried: Array, point: tuple[int, Array], wrench: Array
