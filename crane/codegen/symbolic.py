@@ -138,9 +138,11 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
     return math.nan if a != a or b != b else max(a, b)
 
 
-def minimum(a: Scalar, b: Scalar) -> Scalar:
-    """The smaller of two; NaN if one is NaN."""
-    return -maximum(-a, -b)
+def minimum(first: Scalar, *others: Scalar) -> Scalar:
+    """The smallest value; NaN if one is NaN."""
+    for other in others:
+        first = -maximum(-first, -other)
+    return first
 
 
 def where_positive(x: Scalar, if_positive: Scalar, otherwise: Scalar) -> Scalar:
@@ -168,6 +170,14 @@ def copysign(magnitude: Scalar, sign: Scalar) -> Scalar:
         return math.copysign(1.0, sign) * apply_function("abs", magnitude)
     first = magnitude.index if isinstance(magnitude, SymbolicExpression) else float(magnitude)
     return sign.tape.record("copysign", first, sign.index)
+
+
+def sum_scalars(values: Iterable[Scalar]) -> Scalar:
+    """Sum of values."""
+    total: Scalar = 0.0
+    for value in values:
+        total = total + value
+    return total
 
 
 def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:

@@ -18,7 +18,7 @@ A cluster is reduced in one of two equivalent ways:
 Accelerations are those of the origin of each body, in the axes of the reference body.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,7 @@ from crane.closure.kinematics_formulas import (
 )
 from crane.closure.loop_equations import Cluster, find_clusters
 from crane.closure.loop_formulas import LoopFormulas, VelocityKinematics
-from crane.codegen.symbolic import LdltFactorization, Scalar, dot
+from crane.codegen.symbolic import LdltFactorization, Scalar, dot, sum_scalars
 from crane.dynamics.spatial_inertia import ClusterMassColumns, SpatialInertia, forward_substitute
 from crane.machine.machine import Machine
 
@@ -150,7 +150,7 @@ class ArticulatedCluster:
         self._factorization = LdltFactorization(
             [
                 [
-                    _sum_scalars(
+                    sum_scalars(
                         step.constraint_forces[r] * step.constraint_forces[c] * step.inverse
                         for step in steps
                     )
@@ -161,7 +161,7 @@ class ArticulatedCluster:
         )
         self._constraint_bias = [
             -recursion.velocity_kinematics.acceleration_bias(row)
-            - _sum_scalars(x.constraint_forces[r] * x.net_force * x.inverse for x in steps)
+            - sum_scalars(x.constraint_forces[r] * x.net_force * x.inverse for x in steps)
             for r, row in enumerate(self._loop_rows)
         ]
         columns = self._constraint_wrenches[cluster.base]
@@ -244,13 +244,6 @@ class _ArticulatedJoint:
     inverse: Scalar
     net_force: Scalar
     constraint_forces: Vector
-
-
-def _sum_scalars(numbers: Iterable[Scalar]) -> Scalar:
-    total: Scalar = 0.0
-    for number in numbers:
-        total = total + number
-    return total
 
 
 class ProjectedCluster:

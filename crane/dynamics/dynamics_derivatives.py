@@ -42,6 +42,7 @@ from crane.codegen.symbolic import (
     dot_products,
     scale_vector,
     subtract_vectors,
+    sum_scalars,
     transpose,
 )  # fmt: skip
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
@@ -156,12 +157,11 @@ class DynamicsDerivatives:
             for j in own:
                 wrenches = self._unit_acceleration_wrenches[j]
                 for k in [k for k in own if k <= j]:
-                    total: Scalar = 0.0
-                    for i in cluster.joints:
-                        total = total + gamma[i][k] * (
-                            spatial_dot(self._joint_axes[i], wrenches[i]) + rotors[i] * gamma[i][j]
-                        )
-                    out[k][j] = out[j][k] = total
+                    out[k][j] = out[j][k] = sum_scalars(
+                        gamma[i][k]
+                        * (spatial_dot(self._joint_axes[i], wrenches[i]) + rotors[i] * gamma[i][j])
+                        for i in cluster.joints
+                    )
                 for k, body in self._carrying_coordinates(c):
                     out[k][j] = out[j][k] = spatial_dot(twists[k][body], wrenches[cluster.base])
         return out

@@ -268,7 +268,7 @@ class DynamicsFormulas(InertialForceFormulas):
                 self.forward_dynamics(tau, True),
                 none,
                 self.friction_force,
-                _minimum(slip_velocities),
+                minimum(1.0, *slip_velocities),
             )
         rows = [self.gamma[i + 1] for i in self._stick_slip_columns]
         right = self._net_force(tau)
@@ -287,7 +287,7 @@ class DynamicsFormulas(InertialForceFormulas):
             where_positive(w - 0.5, one, other)
             for w, one, other in zip(is_held, remaining_limit, slip_velocities, strict=True)
         ]
-        any_held = 1.0 - _minimum([1.0 - w for w in is_held])  # whether any is held
+        any_held = 1.0 - minimum(1.0, *[1.0 - w for w in is_held])  # whether any is held
         # of held joints, or a share of the limit, or all of it besides held joints
         at_rest = [
             where_positive(
@@ -313,7 +313,7 @@ class DynamicsFormulas(InertialForceFormulas):
             a_a,
             at_rest,
             add_vectors(self.friction_force, holding_active_forces),
-            _minimum(margins),
+            minimum(1.0, *margins),
         )
 
     def _holding_forces(
@@ -402,14 +402,6 @@ class DynamicsFormulas(InertialForceFormulas):
 def _flatten_by_row(columns: Iterable[Vector]) -> Vector:
     """The entries of a matrix (3, n) given by columns, row by row."""
     return [entry for row in zip(*columns, strict=True) for entry in row]
-
-
-def _minimum(values: Sequence[Scalar]) -> Scalar:
-    """The least value, at most 1."""
-    out: Scalar = 1.0
-    for value in values:
-        out = minimum(out, value)
-    return out
 
 
 def _body_regressor_row(u: Vector, r: Vector, w: Vector, e: Vector, a: Vector) -> Vector:

@@ -19,9 +19,10 @@ from crane.codegen.symbolic import (
     matvec,
     scale_vector,
     subtract_vectors,
+    sum_scalars,
 )  # fmt: skip
 from crane.dynamics.joint_force_formulas import JointForceFormulas
-from crane.dynamics.spatial_inertia import CompositeMassMatrix
+from crane.dynamics.spatial_inertia import composite_mass_matrix
 
 
 class InertialForceFormulas(JointForceFormulas):
@@ -73,27 +74,20 @@ class InertialForceFormulas(JointForceFormulas):
             for origin, (mass, lever, tensor) in zip(origins, self._body_inertias, strict=True)
         ]
 
-    def _centre_of_mass_jacobian(self, i: int) -> list[tuple[Vector, Vector]]:
-        """Columns of body i: linear at its COM, angular."""
-        _, centre, _ = self.body_inertias[i - 1]
-        return [
-            (add_vectors(v, cross(w, centre)), w)
-            for v, w in self._body_jacobians[i][: self._mobility]
-        ]
-
     @cached_property
     def mass_matrix(self) -> list[Vector]:
         """M_A = sum J_b^T I_b J_b + sum gamma_i^T I_r,i gamma_i."""
         if self.formula_structure.recursion_plan:
             clusters = [cluster for cluster, _ in self.formula_structure.recursion_plan]
             masses, rotors = self._body_inertias, self.rotor_inertias
-            return CompositeMassMatrix(
-                self.kinematics, self.loops, masses, rotors, clusters
-            ).mass_matrix
+            return composite_mass_matrix(self.kinematics, self.loops, masses, rotors, clusters)
         out: list[Vector] = [[0.0] * self._mobility for _ in range(self._mobility)]
         for i in range(1, self._body_count):
-            mass, _, tensor = self.body_inertias[i - 1]
-            columns = self._centre_of_mass_jacobian(i)
+            mass, centre, tensor = self.body_inertias[i - 1]
+            columns = [  # linear at the COM, angular
+                (add_vectors(v, cross(w, centre)), w)
+                for v, w in self._body_jacobians[i][: self._mobility]
+            ]
             for k, (v, w) in enumerate(columns):
                 momentum, spin = scale_vector(mass, v), matvec(tensor, w)
                 for j in range(k + 1):
@@ -169,13 +163,12 @@ class InertialForceFormulas(JointForceFormulas):
 
     def _inertial_joint_forces(self, joint_accelerations: Sequence[Scalar]) -> Vector:
         """Joint forces (nb + 1,) for joint accelerations (nb + 1,), weights included."""
-        rotor_inertias = [
+        rotor_forces = [
             inertia * rate
             for inertia, rate in zip(self.rotor_inertias, joint_accelerations, strict=True)
         ]
-        return add_vectors(
-            self._propagate_wrenches(self.body_wrenches(joint_accelerations)), rotor_inertias
-        )
+        bodies = self._propagate_wrenches(self.body_wrenches(joint_accelerations))
+        return add_vectors(bodies, rotor_forces)
 
     @cached_property
     def inertial_bias(self) -> Vector:
@@ -213,9 +206,8 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def rate_jacobian(self) -> list[Vector]:
         """d(rates)/dv_A (nb, n), zero for floating bases."""
-        flying = {i + k for i in self.kinematics.geometry.floating_bases for k in range(6)}
-        none: Vector = [0.0] * self._mobility
-        return [none if i in flying else self.gamma[i] for i in range(1, self._body_count)]
+        floating, none = self.kinematics.geometry.floating_bodies, [0.0] * self._mobility
+        return [none if i in floating else self.gamma[i] for i in range(1, self._body_count)]
 
     @cached_property
     def kinetic(self) -> Scalar:
@@ -234,9 +226,7 @@ class InertialForceFormulas(JointForceFormulas):
     @cached_property
     def potential(self) -> Scalar:
         """Weights, springs, constant forces, gas, end stops, ropes [J]."""
-        total: Scalar = 0.0
-        for found in self._law_values:
-            total = total + found.stored_energy
+        total = sum_scalars(found.stored_energy for found in self._law_values)
         for mass, centre, _ in self.body_inertias:
             total = total - mass * dot(
                 self._gravity, subtract_vectors(centre, self.kinematics.origin[0])

@@ -20,6 +20,7 @@ from crane.codegen.symbolic import (
     maximum,
     scale_vector,
     subtract_vectors,
+    sum_scalars,
     where_positive,
 )  # fmt: skip
 from crane.dynamics.formula_structure import BODY_SIZE, DISTANCE_SIZE, FormulaStructure
@@ -291,10 +292,7 @@ class JointForceFormulas:
     @property
     def dissipated_power(self) -> Scalar:
         """Power dissipated by friction, dampers, end stops and ropes [W]."""
-        total: Scalar = 0.0
-        for found in self._law_values:
-            total = total + found.dissipated_power
-        return total
+        return sum_scalars(found.dissipated_power for found in self._law_values)
 
     def project(self, joint_forces: Sequence[Scalar]) -> Vector:
         """gamma^T of forces along the joints (nb + 1,)."""

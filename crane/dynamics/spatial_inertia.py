@@ -50,14 +50,10 @@ def forward_substitute(
     rows = transpose(
         [
             factorization.forward_substitute(column)
-            for column in zip(*map(_flatten, vectors), strict=True)
+            for column in zip(*([*linear, *angular] for linear, angular in vectors), strict=True)
         ]
     )
     return [(row[:3], row[3:]) for row in rows]
-
-
-def _flatten(pair: SpatialVector) -> Vector:
-    return [*pair[0], *pair[1]]
 
 
 class SpatialInertia:
@@ -212,8 +208,14 @@ def propagate_wrench(
         body = kinematics.geometry.parents[body]
 
 
-class CompositeMassMatrix:
-    """M_A = gamma^T M gamma.
+def composite_mass_matrix(
+    kinematics: PositionKinematics,
+    loops: LoopFormulas,
+    body_inertias: Sequence[tuple[Scalar, Vector, list[Vector]]],
+    rotor_inertias: Vector,
+    clusters: Sequence[Cluster],
+) -> Matrix:
+    """M_A = gamma^T M gamma (n, n).
 
     Args:
         kinematics: Position kinematics.
@@ -222,46 +224,35 @@ class CompositeMassMatrix:
             COM.
         rotor_inertias: (nb + 1,) rotor inertias of the joints.
         clusters: Clusters of the joints.
-
-    Attributes:
-        mass_matrix: (n, n).
     """
-
-    def __init__(
-        self,
-        kinematics: PositionKinematics,
-        loops: LoopFormulas,
-        body_inertias: Sequence[tuple[Scalar, Vector, list[Vector]]],
-        rotor_inertias: Vector,
-        clusters: Sequence[Cluster],
-    ):
-        n, parents = len(loops.active_joints), kinematics.geometry.parents
-        inertias = {
-            i: SpatialInertia.rigid_body(*body) for i, body in enumerate(body_inertias, start=1)
-        }
-        for i in range(len(body_inertias), 0, -1):
-            if parents[i]:
-                inertias[parents[i]] = inertias[parents[i]] + inertias[i].shift_origin(
-                    kinematics.offsets[i]
-                )
-        self.mass_matrix: list[Vector] = [[0.0] * n for _ in range(n)]
-        coordinates_of_joint = {
-            i: cluster.own_coordinates(loops.active_joints)
-            for cluster in clusters
-            for i in cluster.joints
-        }
-        for cluster in clusters:
-            coordinates = coordinates_of_joint[cluster.joints[0]]
-            gamma = {i: [loops.gamma[i][k] for k in coordinates] for i in cluster.joints}
-            columns = ClusterMassColumns(kinematics, cluster, gamma, inertias, rotor_inertias)
-            for row, k in zip(columns.mass_block, coordinates, strict=True):
-                for entry, j in zip(row, coordinates, strict=True):
-                    self.mass_matrix[k][j] = entry
-            for k, wrench in zip(coordinates, columns.base_wrenches, strict=True):
-                for i, met, _ in propagate_wrench(kinematics, cluster.base, wrench, 0):
-                    for j in coordinates_of_joint[i]:
-                        entry = self.mass_matrix[j][k] + loops.gamma[i][j] * met
-                        self.mass_matrix[j][k] = self.mass_matrix[k][j] = entry
+    n, parents = len(loops.active_joints), kinematics.geometry.parents
+    inertias = {
+        i: SpatialInertia.rigid_body(*body) for i, body in enumerate(body_inertias, start=1)
+    }
+    for i in range(len(body_inertias), 0, -1):
+        if parents[i]:
+            inertias[parents[i]] = inertias[parents[i]] + inertias[i].shift_origin(
+                kinematics.offsets[i]
+            )
+    out: Matrix = [[0.0] * n for _ in range(n)]
+    coordinates_of_joint = {
+        i: cluster.own_coordinates(loops.active_joints)
+        for cluster in clusters
+        for i in cluster.joints
+    }
+    for cluster in clusters:
+        coordinates = coordinates_of_joint[cluster.joints[0]]
+        gamma = {i: [loops.gamma[i][k] for k in coordinates] for i in cluster.joints}
+        columns = ClusterMassColumns(kinematics, cluster, gamma, inertias, rotor_inertias)
+        for row, k in zip(columns.mass_block, coordinates, strict=True):
+            for entry, j in zip(row, coordinates, strict=True):
+                out[k][j] = entry
+        for k, wrench in zip(coordinates, columns.base_wrenches, strict=True):
+            for i, met, _ in propagate_wrench(kinematics, cluster.base, wrench, 0):
+                for j in coordinates_of_joint[i]:
+                    entry = out[j][k] + loops.gamma[i][j] * met
+                    out[j][k] = out[k][j] = entry
+    return out
 
 
 @dataclass(frozen=True)
