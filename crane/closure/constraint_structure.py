@@ -128,8 +128,7 @@ def analyse_constraints(
         MechanismError: The loops do not close from the guess, or close only there; the number of
             active joints is wrong; or the active joints do not determine the others.
     """
-    analysis = _ConstraintAnalysis(equations, active, passive, initial_guess, constraints)
-    return analysis.run() if equations.names else analysis.run_without_loops()
+    return _ConstraintAnalysis(equations, active, passive, initial_guess, constraints).run()
 
 
 class _ConstraintAnalysis:
@@ -150,7 +149,7 @@ class _ConstraintAnalysis:
         values = self._coordinates.format_values(active, initial_guess[active])
         self._active_text = f" ({values})" if values else ""
 
-    def run_without_loops(self) -> ConstraintStructure:
+    def _run_without_loops(self) -> ConstraintStructure:
         """The structure of a machine without loops, whose joints are all active."""
         nv, none = self._equations.model.nv, np.zeros(0, dtype=np.intp)
         jacobian = np.zeros((0, nv))
@@ -163,7 +162,9 @@ class _ConstraintAnalysis:
         return ConstraintStructure(self._guess.copy(), none, none, ())
 
     def run(self) -> ConstraintStructure:
-        """The structure of a machine with loops."""
+        """The structure of a machine."""
+        if not self._equations.names:
+            return self._run_without_loops()
         first = self._constraints.close_loops(self._guess, np.arange(self._equations.model.nv))
         self._check_closed(
             first, f"from the home guess{self._active_text}", "correct the frames or the guess"
@@ -248,7 +249,12 @@ class _ConstraintAnalysis:
     def _close_home(self) -> Array:
         """Home with the active joints as in the guess."""
         home = self._constraints.close_loops(self._guess, self._passive)
-        home = self._remove_revolutions(home)
+        # full revolutions of passive joints are removed, within limits or half a revolution
+        lower, upper = self._coordinates.lower, self._coordinates.upper
+        periodic = periodic_coordinates(self._equations)
+        periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
+        nearby = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
+        home = remove_revolutions(home, nearby, periodic, lower, upper)
         self._check_closed(
             home, f"at home{self._active_text}", "choose other values or guess more passive joints"
         )
@@ -292,15 +298,6 @@ class _ConstraintAnalysis:
             part = np.abs(self._equations.evaluate_scaled(q)[1][np.ix_(rows, self._passive)])
             incidence |= part > 1e-10 * part.max(initial=1.0)
         return incidence
-
-    def _remove_revolutions(self, home: Array) -> Array:
-        """Home without full revolutions of passive joints, within limits or half a revolution."""
-        lower, upper = self._coordinates.lower, self._coordinates.upper
-        periodic = periodic_coordinates(self._equations)
-        periodic[np.setdiff1d(np.arange(len(home)), self._passive)] = False
-        return remove_revolutions(
-            home, np.where(np.isinf(lower) | np.isinf(upper), 0.0, home), periodic, lower, upper
-        )
 
     def _propose(self, jacobian: Array, **choice: Sequence[int]) -> list[ActiveJointSelection]:
         return propose_active_joints(self._equations, jacobian, **choice)
