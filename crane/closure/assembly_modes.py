@@ -102,7 +102,12 @@ def _find_alternatives(search: "_AssemblyModeSearch", max_starts: int) -> list[A
             if (one := search.assess_block_solution(q, index)) is not None
         )
         found += itertools.islice(candidates, 1)
-    for columns in search.passive_groups() if closure.home_search is not None else ():
+    if closure.home_search is None:
+        return found
+    # passive joints that loops connect, directly or through others
+    group, group_of_row = closure.equations.coupled_groups(closure.passive)
+    for index in np.unique(group_of_row[group_of_row >= 0]):
+        columns = closure.passive[group == index]
         group_candidates = (
             one
             for q in search.find_group_solutions(columns, max_starts)
@@ -157,7 +162,11 @@ class _AssemblyModeSearch:
         rows, columns = self._block_indices(block)
         found = [self.home]
         sign = self._determinant_sign(self.home, rows, columns)
-        two_solutions = len(columns) <= 2 and self._is_dyad(block)
+        # circles or lines that intersect: translations of one loop only
+        one_loop = len(set(self.equations.loop_of_row[rows].tolist())) == 1
+        two_solutions = (
+            len(columns) <= 2 and one_loop and self.equations.is_translation[rows].all()
+        )
         starts = [
             *self._starts_across_home(rows, columns),
             *self._starting_points(columns, _STARTS_PER_UNKNOWN * len(columns)),
@@ -173,12 +182,6 @@ class _AssemblyModeSearch:
             if two_solutions and self._determinant_sign(q, rows, columns) != sign:
                 break  # mirror images: there are no others
         return found[1:]
-
-    def passive_groups(self) -> list[Indices]:
-        """Columns of passive joints that loops connect, directly or through others."""
-        passive = self.closure.passive
-        group, group_of_row = self.equations.coupled_groups(passive)
-        return [passive[group == i] for i in np.unique(group_of_row[group_of_row >= 0])]
 
     def independent_rows_of(self, columns: Indices) -> Indices:
         """Independent rows of the loops that contain some joints."""
@@ -218,13 +221,6 @@ class _AssemblyModeSearch:
     def _block_indices(self, block: int) -> tuple[Indices, Indices]:
         rows, columns = self.blocks[block]
         return self.closure.structure.independent_rows[rows], self.closure.passive[columns]
-
-    def _is_dyad(self, block: int) -> bool:
-        """Whether a block has translations of one loop only: circles or lines that intersect."""
-        rows, _ = self._block_indices(block)
-        return len(set(self.equations.loop_of_row[rows].tolist())) == 1 and bool(
-            self.equations.is_translation[rows].all()
-        )
 
     def _starts_across_home(self, rows: Indices, columns: Indices) -> Array:
         """(4, nq) configurations on both sides of home, along the least determined direction."""
@@ -297,27 +293,20 @@ class _AssemblyModeSearch:
     def _determinant_sign(self, q: Array, rows: Indices, columns: Indices) -> float:
         return float(np.linalg.slogdet(self.equations.evaluate(q)[1][np.ix_(rows, columns)])[0])
 
-    def _block_solutions_from_guesses(self, q: Array, block: int) -> list[Array]:
-        """Solutions of a block with all else fixed, started from the guess and from home."""
-        rows, columns = self._block_indices(block)
-        found = []
-        for start in (self.guess, self.home):
-            start_configuration = q.copy()
-            start_configuration[columns] = start[columns]
-            if (solution := self._solve_newton(start_configuration, rows, columns)) is not None:
-                found.append(solution)
-        return found
-
     def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
         """The assembly mode with another solution of a block, or None."""
         for later_block in range(block + 1, len(self.blocks)):
-            solutions, (_, columns) = (
-                self._block_solutions_from_guesses(q, later_block),
-                self._block_indices(later_block),
-            )
+            rows, columns = self._block_indices(later_block)
+            solutions = []
+            for start in (self.guess, self.home):
+                start_configuration = q.copy()
+                start_configuration[columns] = start[columns]
+                if (found := self._solve_newton(start_configuration, rows, columns)) is not None:
+                    solutions.append(found)
             if not solutions:
                 return None
-            q = min(solutions, key=lambda way: self.distance_from_guess(way, columns))
+            distances = [self.distance_from_guess(found, columns) for found in solutions]
+            q = solutions[int(np.argmin(distances))]
         return self.assess_assembly_mode(q, self._block_indices(block)[0])
 
     def assess_assembly_mode(self, q: Array, rows: Indices) -> AssemblyMode | None:

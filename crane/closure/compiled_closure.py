@@ -100,6 +100,8 @@ class CompiledClosure:
         self._active_columns, self._passive_columns = active, passive
         self._nq, self._n = equations.model.nv, len(active)
         self._gamma_entries = self._find_gamma_entries()
+        rows, columns = self._gamma_entries
+        self._gamma_entry_pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
         signs = self._determinant_signs(home)
         key = self._cache_key(signs)
         shared = _SHARED_CODE.get(key)
@@ -130,12 +132,6 @@ class CompiledClosure:
     def clusters(self) -> list[Cluster]:
         """Clusters of the joints, each after the one that carries it."""
         return find_clusters(self._equations)
-
-    @property
-    def _gamma_entry_pairs(self) -> list[tuple[int, int]]:
-        """The entries of gamma as pairs (row, column)."""
-        rows, columns = self._gamma_entries
-        return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
     def _cache_key(self, signs: Array) -> tuple:
         """Everything that the formulas depend on."""
@@ -298,7 +294,7 @@ class CompiledClosure:
         largest_gamma = self._largest_gamma_entry(rows, kinematics.inverse_characteristic_length)
         worst = maximum(
             largest_gamma - _LARGE_GAMMA,
-            loops.largest_redundant_residual - self._structure.redundancy.tolerance,
+            loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
         least_determinant: Scalar = 1.0
         for sign, determinant in zip(signs, loops.determinants, strict=True):
@@ -310,7 +306,7 @@ class CompiledClosure:
             "newton",
             2,
             {
-                "residual": [loops.largest_residual],
+                "residual": [loops.largest_residual()],
                 "step": [
                     largest_scaled_value(
                         list(steps.values()),

@@ -133,7 +133,9 @@ def find_home(
                 search.coordinate_differences(q, first.home).max() > _SAME_CONFIGURATION_TOLERANCE
                 for q in found
             )
-            found = _configurations_nearer_than_home(search, equations, passive, found, first.home)
+            if within_limits(equations, first.home)[passive].all():
+                distance = search.distance_from_guess(first.home)[:2]
+                found = [q for q in found if search.distance_from_guess(q)[:2] < distance]
         usable = _first_usable(equations, active, passive, found[:_MAX_CANDIDATES])
         if isinstance(usable, ConstraintStructure):
             count = len(found) if first is None else alternative_count + 1
@@ -189,23 +191,6 @@ def _home_problem(
         return f"{names[int(columns[0])]} closes outside of its limits"
     joint, deviation = search.largest_specified_deviation(home)
     return f"{names[joint]} closes far off" if deviation > FAR else ""
-
-
-def _configurations_nearer_than_home(
-    search: MultiStartSearch,
-    equations: LoopEquations,
-    passive: Indices,
-    found: list[Array],
-    home: Array,
-) -> list[Array]:
-    """Those of some configurations that are nearer to the guess than a home within limits."""
-    if not within_limits(equations, home)[passive].all():
-        return found
-    return [
-        q
-        for q in found
-        if search.distance_from_guess(q)[:2] < search.distance_from_guess(home)[:2]
-    ]
 
 
 def _search_result(

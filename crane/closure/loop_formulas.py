@@ -25,7 +25,6 @@ from crane.codegen.symbolic import (
     solve_linear_system,
     subtract_vectors,
 )  # fmt: skip
-from crane.common.samples import Array
 from crane.description.specification import LOOP_TYPES
 
 
@@ -69,14 +68,6 @@ class LoopEquationFormula:
         return (axis if self.is_translation else [0.0] * 3), add_vectors(
             cross(arm, self.axis), cross(self.arm, axis)
         )
-
-
-def _coupling_formula(factors: Array, offset: float, q: Sequence[Scalar]) -> LoopEquationFormula:
-    """The equation of a coupling, whose Jacobian is constant."""
-    zero: Vector = [0.0] * 3
-    jacobian: dict[int, Scalar] = {i + 1: float(x) for i, x in enumerate(factors) if x}
-    phi = dot([float(x) for x in factors], q) - float(offset)
-    return LoopEquationFormula((0, 0), False, False, zero, zero, (zero, zero), phi, jacobian)
 
 
 class LoopFormulas:
@@ -128,10 +119,12 @@ class LoopFormulas:
     ) -> LoopEquationFormula:
         coupling = int(equations.loop_of_row[row]) - len(equations.loops)
         if coupling >= 0:
-            return _coupling_formula(
-                equations.coupling_factors[coupling],
-                equations.coupling_offsets[coupling],
-                kinematics.q,
+            factors = [float(x) for x in equations.coupling_factors[coupling]]
+            derivatives: dict[int, Scalar] = {i: x for i, x in enumerate(factors, start=1) if x}
+            phi = dot(factors, kinematics.q) - float(equations.coupling_offsets[coupling])
+            zero: Vector = [0.0] * 3
+            return LoopEquationFormula(
+                (0, 0), False, False, zero, zero, (zero, zero), phi, derivatives
             )
         one = 2 * int(equations.loop_of_row[row])
         (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
@@ -221,22 +214,15 @@ class LoopFormulas:
         )
         return {joint: x[joint][0] for joint in self.passive_joints}
 
-    @property
-    def largest_residual(self) -> Scalar:
-        """The largest absolute scaled residual of the independent equations."""
-        return self._largest_scaled_residual(self.rows, self._structure.independent_rows)
-
-    @property
-    def largest_redundant_residual(self) -> Scalar:
-        """The largest absolute scaled residual of the redundant equations."""
-        return self._largest_scaled_residual(self._redundant_rows, self._structure.redundant_rows)
-
-    def _largest_scaled_residual(
-        self, rows: Sequence[LoopEquationFormula], indices: Indices
-    ) -> Scalar:
-        long = self._is_translation[indices].tolist()
+    def largest_residual(self, redundant: bool = False) -> Scalar:
+        """The largest absolute scaled residual of the independent or redundant equations."""
+        rows, indices = self.rows, self._structure.independent_rows
+        if redundant:
+            rows, indices = self._redundant_rows, self._structure.redundant_rows
         return largest_scaled_value(
-            [row.phi for row in rows], long, self._kinematics.inverse_characteristic_length
+            [row.phi for row in rows],
+            self._is_translation[indices].tolist(),
+            self._kinematics.inverse_characteristic_length,
         )
 
 
