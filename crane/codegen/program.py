@@ -73,9 +73,11 @@ class Program:
         if record is not None and record.max_formula_length > MAX_OPERATIONS:
             raise FormulaTooLongError(record.max_formula_length)
         code = None if record is None else MachineCode.from_cache(record.code_name)
-        if record is not None and code is not None:
-            return cls._from_record(record, code)
         program = cls()
+        if record is not None and code is not None:
+            program.max_formula_length, program._machine_code = record.max_formula_length, code
+            program._signatures = dict(record.signatures)
+            return program
         try:
             build(program)
         except FormulaTooLongError as error:
@@ -85,13 +87,6 @@ class Program:
         ProgramRecord(
             program._machine_code.cache_name, program.max_formula_length, program._signatures
         ).write_to_cache(entry_name)
-        return program
-
-    @classmethod
-    def _from_record(cls, record: ProgramRecord, code: MachineCode) -> "Program":
-        program = cls()
-        program.max_formula_length, program._machine_code = record.max_formula_length, code
-        program._signatures = dict(record.signatures)
         return program
 
     def add_formula(
