@@ -108,11 +108,11 @@ def _find_alternatives(search: "_AssemblyModeSearch", max_starts: int) -> list[A
     group, group_of_row = closure.equations.coupled_groups(closure.passive)
     for index in np.unique(group_of_row[group_of_row >= 0]):
         columns = closure.passive[group == index]
+        rows = search.independent_rows_of(columns)
         group_candidates = (
             one
-            for q in search.find_group_solutions(columns, max_starts)
-            if (one := search.assess_assembly_mode(q, search.independent_rows_of(columns)))
-            is not None
+            for q in search.find_group_solutions(rows, columns, max_starts)
+            if (one := search.assess_assembly_mode(q, rows)) is not None
             and not any(search.is_same_for_masses(q, other.q) for other in found)
         )
         found += itertools.islice(group_candidates, 1)
@@ -167,11 +167,10 @@ class _AssemblyModeSearch:
         two_solutions = (
             len(columns) <= 2 and one_loop and self.equations.is_translation[rows].all()
         )
-        starts = [
+        for start in [
             *self._starts_across_home(rows, columns),
             *self._starting_points(columns, _STARTS_PER_UNKNOWN * len(columns)),
-        ]
-        for start in starts[:max_starts]:
+        ][:max_starts]:
             q = self._solve_newton(start, rows, columns, found)
             if q is None or any(
                 self.coordinate_differences(q, x)[columns].max() < _SAME_CONFIGURATION_TOLERANCE
@@ -191,11 +190,12 @@ class _AssemblyModeSearch:
         rows = self.closure.structure.independent_rows
         return rows[involved[self.equations.loop_of_row[rows]]]
 
-    def find_group_solutions(self, columns: Indices, max_starts: int) -> list[Array]:
+    def find_group_solutions(
+        self, rows: Indices, columns: Indices, max_starts: int
+    ) -> list[Array]:
         """Closed configurations with all other joints as at home, nearest to the guess first."""
         initial_guess = self.home.copy()
         initial_guess[columns] = self.guess[columns]
-        rows = self.independent_rows_of(columns)
         search = MultiStartSearch(
             self._equations_of_rows(rows)[0], initial_guess, self.specified_columns, max_starts
         )

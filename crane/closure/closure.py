@@ -280,9 +280,12 @@ class Closure(BranchSolver, OneLineRepr):
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.ndim != 2 or not len(targets):
             raise InputError("q_a is no motion, give (N, n) samples")
-        first = self.solve(targets[0], initial_guess)
         return follow_motion(
-            self.equations, self.active, self.equations.motion_scales, targets, first
+            self.equations,
+            self.active,
+            self.equations.motion_scales,
+            targets,
+            self.solve(targets[0], initial_guess),
         )
 
     def gamma(self, q: ArrayLike) -> Array:

@@ -170,7 +170,12 @@ class _ConstraintAnalysis:
             first, f"from the home guess{self._active_text}", "correct the frames or the guess"
         )
         jacobians = [self._constraints.intended_jacobian(q) for q in self._neighbours(first)]
-        self._check_that_loops_lock(jacobians)
+        for index, name in enumerate(self._equations.names):
+            loop_rows = self._equations.loop_of_row == index
+            derivatives = [jacobian[loop_rows] * self._units for jacobian in jacobians]
+            if np.abs(derivatives).max() < _ZERO_TOLERANCE:
+                text = "locks nothing that the joints do not lock already: remove it"
+                raise MechanismError(f"loop '{name}' {text}", f"loop {name}")
         rank = max(_numerical_rank(jacobian * self._units) for jacobian in jacobians)
         self._check_active_joints(first, jacobians, rank)
         home = self._close_home()
@@ -192,18 +197,6 @@ class _ConstraintAnalysis:
             if self._constraints.is_closed(closed):
                 found.append(closed)
         return found
-
-    def _check_that_loops_lock(self, jacobians: Sequence[Array]) -> None:
-        for index, name in enumerate(self._equations.names):
-            rows = self._equations.loop_of_row == index
-            if (
-                max(np.abs(jacobian[rows] * self._units).max() for jacobian in jacobians)
-                < _ZERO_TOLERANCE
-            ):
-                raise MechanismError(
-                    f"loop '{name}' locks nothing that the joints do not lock already: remove it",
-                    f"loop {name}",
-                )
 
     def _check_active_joints(self, q: Array, jacobians: Sequence[Array], rank: int) -> None:
         """Raise unless the active joints are as many as the mobility, and drive the others."""

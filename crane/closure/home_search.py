@@ -138,8 +138,14 @@ def find_home(
                 found = [q for q in found if search.distance_from_guess(q)[:2] < distance]
         usable = _first_usable(equations, active, passive, found[:_MAX_CANDIDATES])
         if isinstance(usable, ConstraintStructure):
-            count = len(found) if first is None else alternative_count + 1
-            return usable, _search_result(search, equations, reason, count, passive, usable)
+            return usable, _search_result(
+                search,
+                equations,
+                reason,
+                len(found) if first is None else alternative_count + 1,
+                passive,
+                usable,
+            )
         if usable is not None and first is None:
             raise rejection if isinstance(rejection, ActiveJointError) else usable
     if first is None:

@@ -191,10 +191,13 @@ class LoopFormulas:
     @cached_property
     def _gamma_and_determinants(self) -> tuple[dict[int, Vector], list[Scalar]]:
         n = len(self.active_joints)
-        known: dict[int, Vector] = {
-            joint: [float(i == k) for k in range(n)] for i, joint in enumerate(self.active_joints)
-        }
-        return self.solve_passive(known, [[0.0] * n for _ in self.rows])
+        return self.solve_passive(
+            {
+                joint: [float(i == k) for k in range(n)]
+                for i, joint in enumerate(self.active_joints)
+            },
+            [[0.0] * n for _ in self.rows],
+        )
 
     @property
     def gamma(self) -> dict[int, Vector]:

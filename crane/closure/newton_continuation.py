@@ -80,10 +80,11 @@ class NewtonContinuation:
 
     def rounding_scale(self, q: Array) -> float:
         """Factor on rounding errors at a configuration (nq,): its largest scaled dimension."""
-        largest_stroke = float(
-            np.abs(q[self._is_translation]).max(initial=self._largest_dimension)
+        return max(
+            1.0,
+            float(np.abs(q[self._is_translation]).max(initial=self._largest_dimension))
+            / self._equations.characteristic_length,
         )
-        return max(1.0, largest_stroke / self._equations.characteristic_length)
 
     def solve_newton(
         self, q: Array, q_a: Array, max_iterations: int

@@ -103,6 +103,10 @@ class SymbolicExpression:
         return self.tape.record(name, *sorted((self.index, other.index)))
 
 
+def _operand(value: Scalar) -> int | float:
+    return value.index if isinstance(value, SymbolicExpression) else float(value)
+
+
 def required_operations(outputs: Sequence[Scalar]) -> list[int]:
     """Indices of the operations that the outputs depend on, in order."""
     found: set[int] = set()
@@ -130,9 +134,7 @@ def apply_function(function: str, x: Scalar) -> Scalar:
 def maximum(a: Scalar, b: Scalar) -> Scalar:
     """The larger of two; NaN if one is NaN."""
     if isinstance(a, SymbolicExpression):
-        return a.tape.record(
-            "maximum", a.index, b.index if isinstance(b, SymbolicExpression) else float(b)
-        )
+        return a.tape.record("maximum", a.index, _operand(b))
     if isinstance(b, SymbolicExpression):
         return maximum(b, a)
     return math.nan if a != a or b != b else max(a, b)
@@ -149,11 +151,7 @@ def where_positive(x: Scalar, if_positive: Scalar, otherwise: Scalar) -> Scalar:
     """`if_positive` where x > 0, else `otherwise`."""
     if not isinstance(x, SymbolicExpression):
         return if_positive if x > 0 else otherwise
-    words = (
-        y.index if isinstance(y, SymbolicExpression) else float(y)
-        for y in (if_positive, otherwise)
-    )
-    return x.tape.record("positive", x.index, *words)
+    return x.tape.record("positive", x.index, _operand(if_positive), _operand(otherwise))
 
 
 def max_abs(values: Iterable[Scalar]) -> Scalar:
@@ -168,8 +166,7 @@ def copysign(magnitude: Scalar, sign: Scalar) -> Scalar:
     """|magnitude| with the sign of `sign`."""
     if not isinstance(sign, SymbolicExpression):
         return math.copysign(1.0, sign) * apply_function("abs", magnitude)
-    first = magnitude.index if isinstance(magnitude, SymbolicExpression) else float(magnitude)
-    return sign.tape.record("copysign", first, sign.index)
+    return sign.tape.record("copysign", _operand(magnitude), sign.index)
 
 
 def sum_scalars(values: Iterable[Scalar]) -> Scalar:
@@ -245,10 +242,7 @@ def dot_products(vector: Sequence[Scalar], others: Sequence[Sequence[Scalar]]) -
         if not found or all(not isinstance(x, SymbolicExpression) and x == 0 for x in second):
             out.append(dot(first, second))
             continue
-        words = (
-            x.index if isinstance(x, SymbolicExpression) else float(x) for x in (*first, *second)
-        )
-        out.append(found[0].tape.record("dot", *words))
+        out.append(found[0].tape.record("dot", *map(_operand, (*first, *second))))
     return out
 
 

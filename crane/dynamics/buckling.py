@@ -195,8 +195,7 @@ class Buckling(OneLineRepr):
             raise InputError(
                 f"q_a and tau_a have the shapes {np.shape(q_a)} and {forces.shape}, give the same"
             )
-        active_indices = [active.index(joint) for joint in self.columns]
-        compressive_forces = forces[..., active_indices] * [
+        compressive_forces = forces[..., [active.index(joint) for joint in self.columns]] * [
             column.compression_sign for column in self.columns.values()
         ]
         out = np.full_like(loads, np.inf)

@@ -88,15 +88,6 @@ class RecursionInput:
             return inertia, wrench
         return inertia + articulated[i][0], add_spatial(wrench, articulated[i][1])
 
-    def body_acceleration(
-        self, i: int, parent_acceleration: SpatialVector, joint_acceleration: Scalar
-    ) -> SpatialVector:
-        """Acceleration of a body relative to the reference, from that of its parent."""
-        return add_spatial(
-            shift_motion(parent_acceleration, self.kinematics.offsets[i]),
-            scale_spatial(joint_acceleration, self.kinematics.body_motion_axes(i)),
-        )
-
 
 def add_articulated_inertia(
     articulated: ArticulatedInertias, body: int, inertia: SpatialInertia, bias: SpatialVector
@@ -345,32 +336,23 @@ def plan_recursion(machine: Machine) -> RecursionPlan:
     if len(machine.active) <= _MAX_MOBILITY_WITHOUT_RECURSION:
         return ()
     active = [int(column) + 1 for column in machine.closure.active]
-    light_joints = _light_joints(machine)
+    # joints with next to no articulated inertia of their own, by which their recursion divides
+    data = machine.closure.equations.data  # reused because creating data is expensive
+    mass = pin.crba(machine.model, data, machine.coordinates.configuration(machine.home))
+    pin.cholesky.decompose(machine.model, data)
+    is_light = ~(_LIGHT_INERTIA_RATIO * np.diag(mass) < data.D)
 
     def by_forces(cluster: Cluster) -> bool:
         own, size = len(cluster.own_coordinates(active)), len(cluster.joints)
         if size == 1:
             return True
         # cost grows with the square of the number of equations or coordinates
-        return max(size - own, _MAX_PROJECTED_COORDINATES) < own and not light_joints & set(
-            cluster.joints
-        )
+        is_long = max(size - own, _MAX_PROJECTED_COORDINATES) < own
+        return is_long and not any(is_light[joint - 1] for joint in cluster.joints)
 
     return tuple(
         (cluster, by_forces(cluster)) for cluster in find_clusters(machine.closure.equations)
     )
-
-
-def _light_joints(machine: Machine) -> set[int]:
-    """Joints with next to no articulated inertia of their own.
-
-    Recursion joint by joint divides by this inertia.
-    """
-    model = machine.model
-    data = machine.closure.equations.data  # reused because creating data is expensive
-    mass = pin.crba(model, data, machine.coordinates.configuration(machine.home))
-    pin.cholesky.decompose(model, data)
-    return set((np.flatnonzero(~(_LIGHT_INERTIA_RATIO * np.diag(mass) < data.D)) + 1).tolist())
 
 
 def joint_accelerations(recursion: RecursionInput, plan: RecursionPlan) -> Vector:
@@ -392,8 +374,13 @@ def joint_accelerations(recursion: RecursionInput, plan: RecursionPlan) -> Vecto
         )
     out = list(recursion.reference_accelerations)
     bodies = [ZERO_VECTOR] * len(out)
+    kinematics = recursion.kinematics
     for articulated_cluster in reversed(articulated_clusters):
         for i, rate in articulated_cluster.joint_accelerations(bodies):
-            parent = recursion.kinematics.geometry.parents[i]
-            out[i], bodies[i] = out[i] + rate, recursion.body_acceleration(i, bodies[parent], rate)
+            parent = bodies[kinematics.geometry.parents[i]]
+            out[i] = out[i] + rate
+            bodies[i] = add_spatial(
+                shift_motion(parent, kinematics.offsets[i]),
+                scale_spatial(rate, kinematics.body_motion_axes(i)),
+            )
     return out

@@ -168,7 +168,7 @@ class CompiledQuantity:
             (size,) or (N, size).
         """
         out = np.empty((*q.shape[:-1], self.size))
-        arrays = *self._constants, np.ascontiguousarray(q), inputs, out
+        arrays = *self._constants, *map(np.ascontiguousarray, (q, inputs)), out
         if q.ndim == 1:
             self._program.call("formula", *arrays)
         else:
@@ -289,8 +289,10 @@ class CompiledParameterDerivatives:
             q, kinematics, loops = fast.trace_kinematics(tape, 0, 2, folded_constants[0])
             constants = FormulaConstants(tape, 1, folded_constants[1])
             v_a = tape.load_vector(3, 0, n)
-            sweep = DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure)
-            values = QUANTITIES[quantity](sweep, tape.load_vector(3, n, n))
+            values = QUANTITIES[quantity](
+                DynamicsFormulas(kinematics, loops, constants, q, v_a, formula_structure),
+                tape.load_vector(3, n, n),
+            )
             seeds: dict[int, Scalar] = {}
             for i in np.flatnonzero(geometry_changes).tolist():
                 seeds[tape.load(0, i).index] = tape.load(4, i)

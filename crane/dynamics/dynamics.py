@@ -14,9 +14,7 @@ from crane.common.samples import (
     stack_length,
 )
 from crane.description.external_forces import WRENCH_COMPONENTS
-from crane.dynamics.compiled_dynamics import (
-    WITH_FRICTION,
-)
+from crane.dynamics.compiled_dynamics import DERIVATIVES_OF, WITH_FRICTION
 from crane.dynamics.frame_jacobians import FrameJacobians
 from crane.dynamics.quantity_evaluator import QuantityEvaluator
 
@@ -338,7 +336,8 @@ class Dynamics(QuantityEvaluator):
         key = quantity.replace("_", " ") + (WITH_FRICTION if friction else "")
         shape, found = self.result_shape(quantity), dict[str, Array]()
         if len(parameters) < len(by):
-            parts = self._argument_derivatives(key, q, inputs).reshape(count, 3, *shape, n)
+            formula = self._required_formula(DERIVATIVES_OF + key)
+            parts = formula.evaluate_closed(q, inputs).reshape(count, 3, *shape, n)
             found = {name: parts[:, i].copy() for i, name in enumerate(arguments) if name in by}
         if parameters:
             every = self._parameter_derivatives_at(key, parameters, q, inputs)

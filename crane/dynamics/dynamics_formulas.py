@@ -263,10 +263,9 @@ class DynamicsFormulas(InertialForceFormulas):
             s * v * p for s, v, p in zip(slip_signs, velocities, inverse_velocities, strict=True)
         ]
         if not with_joints_at_rest:
-            none: Vector = [0.0] * len(laws)
             return StickSlipAccelerations(
                 self.forward_dynamics(tau, True),
-                none,
+                [0.0] * len(laws),
                 self.friction_force,
                 minimum(1.0, *slip_velocities),
             )
@@ -389,8 +388,13 @@ class DynamicsFormulas(InertialForceFormulas):
             w, e, at = matvec(local, w), matvec(local, e), matvec(local, at)
             for k in range(self._mobility):
                 linear, angular = self._body_jacobians[i][k]
-                u = matvec(local, add_vectors(linear, cross(angular, origin)))
-                out[k] += _body_regressor_row(u, matvec(local, angular), w, e, at)
+                out[k] += _body_regressor_row(
+                    matvec(local, add_vectors(linear, cross(angular, origin))),
+                    matvec(local, angular),
+                    w,
+                    e,
+                    at,
+                )
         for i, row in sorted(self.gamma.items()):
             if self.rotor_inertias[i] != 0.0:
                 rate = dot(row, a_a) + self.drift[i]

@@ -169,11 +169,10 @@ def trace_external_forces(
         first += count
         state_rates += force.state_rates(here)
         if not force.is_traceable:
-            axes_ = [x for row in here.rotation for x in row]
             callback_inputs += [
                 here.reference[0],
                 *here.position,
-                *axes_,
+                *[x for row in here.rotation for x in row],
                 *here.velocity,
                 *here.angular_velocity,
             ]

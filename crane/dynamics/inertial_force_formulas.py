@@ -178,10 +178,14 @@ class InertialForceFormulas(JointForceFormulas):
     @cached_property
     def gravity_force(self) -> Vector:
         """gamma^T g(q)."""
-        wrenches: list[SpatialVector] = [
-            (scale_vector(-mass, self._gravity), [0.0] * 3) for mass, _, _ in self._body_inertias
-        ]
-        return self.project(self._propagate_wrenches(wrenches))
+        return self.project(
+            self._propagate_wrenches(
+                [
+                    (scale_vector(-mass, self._gravity), [0.0] * 3)
+                    for mass, _, _ in self._body_inertias
+                ]
+            )
+        )
 
     @property
     def coordinate_derivatives(self) -> Vector:
@@ -264,8 +268,9 @@ def hybrid_dynamics(
     columns = [
         subtract_vectors(inverse([float(k == i) for k in range(n)], False), bias) for i in free
     ]
-    mass = [[column[i] for column in columns] for i in free]
-    a_f = LdltFactorization(mass).solve([-forces_without_free_motion[i] for i in free])
+    a_f = LdltFactorization([[column[i] for column in columns] for i in free]).solve(
+        [-forces_without_free_motion[i] for i in free]
+    )
     tau = add_vectors(
         forces_without_free_motion,
         *(scale_vector(a, column) for a, column in zip(a_f, columns, strict=True)),

@@ -192,8 +192,9 @@ class JointForces:
         Returns:
             (nv,) [N], [N m].
         """
-        law = self.table[: self._joint_count].T
-        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = law[:7]
+        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = (
+            self.table[: self._joint_count].T[:7]
+        )
         sign = np.tanh(v * sharpness)
         if use_modes:
             stick_slip = list(self.sticking)
@@ -332,8 +333,13 @@ def find_stick_slip_columns(machine: Machine) -> tuple[int, ...]:
     """
     laws = machine.friction.items()
     found = {machine.column(joint) for joint, law in laws if law.has_stick_slip}
-    smoothed = {machine.column(joint) for joint, law in laws if law.smoothing}
-    return tuple(sorted(found | set(find_circuit_friction_columns(machine)) - smoothed))
+    return tuple(
+        sorted(
+            found
+            | set(find_circuit_friction_columns(machine))
+            - {machine.column(joint) for joint, law in laws if law.smoothing}
+        )
+    )
 
 
 def find_circuit_friction_columns(machine: Machine) -> tuple[int, ...]:

@@ -126,8 +126,9 @@ class PinocchioDynamics:
             case "inverse" | "inverse with friction":
                 a = gamma @ x + state.drift
                 friction = quantity.endswith("friction")
-                start = self._joint_forces.breakaway_forces(v, a) if friction else np.zeros_like(v)
-                return self._inverse_dynamics(state, a, friction) + gamma.T @ start
+                return self._inverse_dynamics(state, a, friction) + gamma.T @ (
+                    self._joint_forces.breakaway_forces(v, a) if friction else np.zeros_like(v)
+                )
             case "forward" | "forward with friction":
                 friction = quantity.endswith("friction")
                 bias = self._inverse_dynamics(state, state.drift, friction)
@@ -257,8 +258,13 @@ class PinocchioDynamics:
         for part in subtrees:
             at, v = configuration[part.configuration_indices], state.v[part.velocity_columns]
             kinetic += pin.computeKineticEnergy(part.model, part.data, at, v)
-        weight = pin.computePotentialEnergy(self._model, data, configuration)
-        return np.array([kinetic, weight + self._joint_forces.potential_energy(state.q)])
+        return np.array(
+            [
+                kinetic,
+                pin.computePotentialEnergy(self._model, data, configuration)
+                + self._joint_forces.potential_energy(state.q),
+            ]
+        )
 
     def _dissipated_power(self, state: ClosedState) -> float:
         """Power dissipated by friction, dampers and end stops."""

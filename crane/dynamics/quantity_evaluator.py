@@ -13,7 +13,6 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, apply_per_sample, as_samples, stack_length
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.dynamics.compiled_dynamics import (
-    DERIVATIVES_OF,
     CompiledParameterDerivatives,
     CompiledQuantity,
 )
@@ -146,6 +145,7 @@ class QuantityEvaluator(OneLineRepr):
                 "without masses there is kinematics, and no dynamics"
             )
         self.machine, self.formulation = machine, formulation
+        self._mobility = len(machine.active)
         self.forces = JointForces(machine)
         self.formula_structure = FormulaStructure.from_machine(machine, formulation, self.forces)
         self.backend = backend if machine.closure.is_compiled else "pinocchio"
@@ -171,10 +171,6 @@ class QuantityEvaluator(OneLineRepr):
         if self.backend == "compiled":
             self.constant_pattern[self._mode_indices] = np.nan
             self.constant_pattern[self._circuit_friction_indices] = np.nan
-
-    @property
-    def _mobility(self) -> int:
-        return len(self.machine.active)
 
     def backend_of(self, quantity: str = "forward") -> str:
         """The backend that computes a quantity of `compiled_dynamics.QUANTITIES`."""
@@ -275,21 +271,10 @@ class QuantityEvaluator(OneLineRepr):
             )
         return formula
 
-    def _argument_derivatives(self, quantity: str, q: Array, inputs: Array) -> Array:
-        """Derivatives (N, 3 size) by the arguments at closed configurations (N, nq)."""
-        return self._required_formula(DERIVATIVES_OF + quantity).evaluate_closed(q, inputs)
-
     def _parameter_derivatives_at(
         self, quantity: str, names: Sequence[str], q: Array, inputs: Array
     ) -> Array:
         """Derivatives (N, size, k) by parameters at closed configurations (N, nq)."""
-        code = self._parameter_derivative_code(quantity, names)
-        return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
-
-    def _parameter_derivative_code(
-        self, quantity: str, names: Sequence[str]
-    ) -> CompiledParameterDerivatives:
-        """Machine code of derivatives by parameters of the machine."""
         self._required_formula(quantity)
         key = quantity, tuple(names)
         if key not in self._parameter_derivatives:
@@ -308,7 +293,8 @@ class QuantityEvaluator(OneLineRepr):
                 geometry,
                 numbers,
             )
-        return self._parameter_derivatives[key]
+        code = self._parameter_derivatives[key]
+        return np.array([code.evaluate_closed(*row) for row in zip(q, inputs, strict=True)])
 
     def _evaluate(
         self,

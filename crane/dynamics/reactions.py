@@ -175,8 +175,10 @@ class Reactions(OneLineRepr):
         kinematics = self._evaluate_kinematics(rows)
         point = self._point_in_world(kinematics, body, placement.translation)
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
-        load = np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)
-        carried = -self._is_carried_by[body][None, :, None, None] * load[:, None]
+        carried = (
+            -self._is_carried_by[body][None, :, None, None]
+            * np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)[:, None]
+        )
         out = self._solve_loop_forces(
             kinematics, rows, carried, np.zeros((len(rows), self._model.nv, 3))
         )[0]

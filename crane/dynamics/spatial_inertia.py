@@ -83,8 +83,11 @@ class SpatialInertia:
                 tensor[r][c] - moment[r] * lever[c] + (dot(moment, lever) if r == c else 0.0)
             )
         )
-        straight: Matrix = [[mass if r == c else 0.0 for c in range(3)] for r in range(3)]
-        return cls(straight, [scale_vector(-1.0, row) for row in _skew(moment)], out)
+        return cls(
+            [[mass if r == c else 0.0 for c in range(3)] for r in range(3)],
+            [scale_vector(-1.0, row) for row in _skew(moment)],
+            out,
+        )
 
     def __add__(self, other: "SpatialInertia") -> "SpatialInertia":
         return SpatialInertia(
@@ -121,10 +124,13 @@ class SpatialInertia:
             for rows in zip(self.mixed, matmul(self.mass, skew), strict=True)
         ]
         old, new, across = transpose(self.mixed), transpose(coupling), transpose(skew)
-        rotational = _symmetric_matrix(
-            lambda r, c: self.turning[r][c] - dot(old[r], across[c]) + dot(skew[r], new[c])
+        return SpatialInertia(
+            self.mass,
+            coupling,
+            _symmetric_matrix(
+                lambda r, c: self.turning[r][c] - dot(old[r], across[c]) + dot(skew[r], new[c])
+            ),
         )
-        return SpatialInertia(self.mass, coupling, rotational)
 
 
 def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:

@@ -138,16 +138,18 @@ class TippingStability:
         )
         moments = self.tipping_margins(q, self.ground_wrench(q)).moments
         hanging = self._frame_jacobians.frame_origins(q, [link])[:, 0]
-        unit_load_wrenches = np.hstack(
-            [-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)]
+        levers = self._moments_about_lines(
+            self.support_positions(q),
+            np.hstack([-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)]),
         )
-        levers = self._moments_about_lines(self.support_positions(q), unit_load_wrenches)
         with np.errstate(divide="ignore"):
             loads_by_line = np.where(levers < 0, moments / -levers, np.inf)
         first = loads_by_line.argmin(axis=1)
         loads = loads_by_line[np.arange(len(q)), first]
-        named = [" to ".join(self.line_names[k]) for k in first.tolist()]
-        return loads, [x if np.isfinite(y) else "" for x, y in zip(named, loads, strict=True)]
+        return loads, [
+            " to ".join(self.line_names[k]) if np.isfinite(load) else ""
+            for k, load in zip(first.tolist(), loads, strict=True)
+        ]
 
     def ground_wrench(
         self,

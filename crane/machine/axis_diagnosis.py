@@ -71,7 +71,8 @@ def find_wrong_axis(
             if column is None:
                 changed_loops[index] = dataclasses.replace(loop, axis=corrected_axis)
             else:
-                changed = _replace_joint_axis(spec, names[column], corrected_axis)
+                joint = dataclasses.replace(spec.tree.joints[names[column]], axis=corrected_axis)
+                changed = dataclasses.replace(spec, tree=spec.tree.with_parts(joint))
             try:
                 close_loops(changed, changed_loops)
             except CraneError:
@@ -141,14 +142,6 @@ def _corrected_axis(axis: Array, normal: Array, is_rotation: bool) -> tuple[floa
         corrected = -corrected
     x, y, z = (float(value) + 0.0 for value in corrected)
     return x, y, z
-
-
-def _replace_joint_axis(
-    spec: MachineSpec, name: str, axis: tuple[float, float, float]
-) -> MachineSpec:
-    return dataclasses.replace(
-        spec, tree=spec.tree.with_parts(dataclasses.replace(spec.tree.joints[name], axis=axis))
-    )
 
 
 def _wrong_axis_error(

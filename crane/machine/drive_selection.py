@@ -1,6 +1,5 @@
 """Selection of active and free joints, and of redundant drives, from a description."""
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +14,6 @@ from crane.closure.active_joint_selection import (
 )
 from crane.closure.coordinates import Coordinates
 from crane.closure.loop_equations import LoopEquations
-from crane.common.errors import CraneWarning
 from crane.common.one_line_repr import format_count
 from crane.common.samples import Array
 from crane.description.floating_bases import floating_series
@@ -155,9 +153,3 @@ def _independent_columns(basis: Array, columns: Sequence[int]) -> list[int]:
         if len(independent) < basis.shape[1] and values.min() > DEAD_CENTRE_TOLERANCE:
             independent.append(column)
     return independent
-
-
-def warn_about_completion(spec: MachineSpec, text: str) -> None:
-    """Warn of the completed active joints."""
-    where = spec.source_locations.get("active", spec.path.name)
-    warnings.warn(f"{where}: {text}; name them as active and free", CraneWarning, stacklevel=4)

@@ -92,8 +92,11 @@ def _warn_about_inertia(link: Link, problem: InertiaProblem, is_replaced: bool) 
         remark = f"computed with as it stands, the nearest possible is {nearest}"
     if not link.inertial.inertia_matrix.any():
         remark = "taken as a point mass"
-    text = f"{link.inertial.finding_location}: link '{link.name}' has {problem.problem}; {remark}"
-    warnings.warn(text, CraneWarning, stacklevel=4)
+    warnings.warn(
+        f"{link.inertial.finding_location}: link '{link.name}' has {problem.problem}; {remark}",
+        CraneWarning,
+        stacklevel=4,
+    )
 
 
 def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
