@@ -351,10 +351,14 @@ class NewtonContinuation:
             phi, jacobian = self._equations.evaluate_scaled(q)
             return phi, jacobian[:, self._passive_columns]
 
+        def residual(passive: Array) -> Array:
+            return evaluate(passive)[0]
+
+        def jacobian(passive: Array) -> Array:
+            return evaluate(passive)[1]
+
         start = q[self._passive_columns] / units
-        nearest = least_squares(
-            lambda x: evaluate(x)[0], start, lambda x: evaluate(x)[1], xtol=1e-12
-        )
+        nearest = least_squares(residual, start, jacobian, xtol=1e-12)
         phi = evaluate(nearest.x)[0]
         worst = int(np.abs(phi).argmax())
         place, last = self._format_values(target), self._format_values(last_reached.q_a)

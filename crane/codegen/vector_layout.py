@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from crane.codegen.symbolic import Scalar
 
-ArgumentKind = Literal["count", "function", "array"]
+ArgumentKind = Literal["count", "array"]  # a number, or the address of an array or function
 
 
 class Layout:

@@ -210,7 +210,8 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def rate_jacobian(self) -> list[Vector]:
         """d(rates)/dv_A (nb, n), zero for floating bases."""
-        floating, none = self.kinematics.geometry.floating_bodies, [0.0] * self._mobility
+        floating = self.kinematics.geometry.floating_bodies
+        none: Vector = [0.0] * self._mobility
         return [none if i in floating else self.gamma[i] for i in range(1, self._body_count)]
 
     @cached_property

@@ -165,10 +165,9 @@ class Routine:
             **{function: ArrayPointer(function) for function in functions},
             **{array: ArrayPointer(array, layout=layout) for array, layout in arrays.items()},
         }
-        self.argument_kinds: tuple[ArgumentKind, ...] = (
-            *("count" for _ in counts), *("function" for _ in functions),
-            *("array" for _ in arrays),
-        )  # fmt: skip
+        self.argument_kinds: tuple[ArgumentKind, ...] = tuple(
+            "count" if isinstance(x, RoutineValue) else "array" for x in self._arguments.values()
+        )
         self._local_arrays: dict[str, int] = {}
         self._variables: list[RoutineValue] = []
         self._lines: list[str] = []
