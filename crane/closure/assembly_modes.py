@@ -296,17 +296,17 @@ class _AssemblyModeSearch:
     def assess_block_solution(self, q: Array, block: int) -> AssemblyMode | None:
         """The assembly mode with another solution of a block, or None."""
         for later_block in range(block + 1, len(self.blocks)):
-            rows, columns = self._block_indices(later_block)
+            later_rows, columns = self._block_indices(later_block)
             solutions = []
             for start in (self.guess, self.home):
                 start_configuration = q.copy()
                 start_configuration[columns] = start[columns]
-                if (found := self._solve_newton(start_configuration, rows, columns)) is not None:
-                    solutions.append(found)
-            if not solutions:
+                solutions.append(self._solve_newton(start_configuration, later_rows, columns))
+            closed = [found for found in solutions if found is not None]
+            if not closed:
                 return None
-            distances = [self.distance_from_guess(found, columns) for found in solutions]
-            q = solutions[int(np.argmin(distances))]
+            distances = [self.distance_from_guess(found, columns) for found in closed]
+            q = closed[int(np.argmin(distances))]
         return self.assess_assembly_mode(q, self._block_indices(block)[0])
 
     def assess_assembly_mode(self, q: Array, rows: Indices) -> AssemblyMode | None:

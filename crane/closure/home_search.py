@@ -133,9 +133,9 @@ def find_home(
                 search.coordinate_differences(q, first.home).max() > _SAME_CONFIGURATION_TOLERANCE
                 for q in found
             )
-            if within_limits(equations, first.home)[passive].all():
-                distance = search.distance_from_guess(first.home)[:2]
-                found = [q for q in found if search.distance_from_guess(q)[:2] < distance]
+        if first is not None and within_limits(equations, first.home)[passive].all():
+            distance = search.distance_from_guess(first.home)[:2]
+            found = [q for q in found if search.distance_from_guess(q)[:2] < distance]
         usable = _first_usable(equations, active, passive, found[:_MAX_CANDIDATES])
         if isinstance(usable, ConstraintStructure):
             return usable, _search_result(

@@ -371,12 +371,8 @@ class Machine(OneLineRepr):
         Raises:
             MechanismError: See `with_active_joints`.
         """
-        return self._with_closure(
-            names,
-            q,
-            self.closure.with_home_configuration(q) if names == self.active else None,
-            keep_revolutions=True,
-        )
+        known = self.closure.with_home_configuration(q) if names == self.active else None
+        return self._with_closure(names, q, known, keep_revolutions=True)
 
     def _with_closure(
         self,
@@ -436,12 +432,8 @@ class Machine(OneLineRepr):
         if clock is None:
             hint = "simulate it with the task of levers that has them"
             raise InputError(f"the load '{phased[0].name}' counts phases, {hint}")
-        return dataclasses.replace(
-            self,
-            external_forces=tuple(
-                x.with_clock(clock) if x in phased else x for x in self.external_forces
-            ),
-        )
+        every = (x.with_clock(clock) if x in phased else x for x in self.external_forces)
+        return dataclasses.replace(self, external_forces=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":
         """A copy that carries a payload.

@@ -317,10 +317,11 @@ def _check_body_inertias(spec: MachineSpec, model: pin.Model) -> None:
         is_accepted = index in joints_with_findings and (
             _has_inertia_finding(link) or not is_strict()
         )
-        if problem is not None and not (is_accepted and problem.is_formal):
+        if problem is None or (is_accepted and problem.is_formal):
+            continue
+        with error_recovery(harmless=True):
             text = f"link '{link.name}' with what is fixed to it has {problem}"
-            with error_recovery(harmless=True):
-                raise DescriptionError(f"{link.source_location}: {text}")
+            raise DescriptionError(f"{link.source_location}: {text}")
 
 
 def _has_inertia_finding(link: Link) -> bool:
