@@ -15,7 +15,7 @@ from crane.cli.options import (
     TimeOptions,
 )
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
-from crane.common.errors import CraneError, CraneWarning, InputError, suggest_names
+from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
@@ -69,8 +69,7 @@ def _output_format(out: Path, to: str | None) -> str:
     """
     suffix = out.suffix.lower()
     kind = to or _SUFFIXES.get(suffix, "machine")
-    if kind not in _FORMATS:
-        raise InputError(f"--to is '{kind}', {suggest_names(_FORMATS, kind)}")
+    check_name(kind, _FORMATS, f"--to is '{kind}'")
     if kind == "machine" and suffix in {*_SUFFIXES, ".yaml", ".yml"}:
         raise InputError(f"{out}: a machine file comes with its URDFs, give the name of a folder")
     if to is None and suffix and suffix not in _SUFFIXES:
@@ -108,8 +107,11 @@ def import_log(
     try:
         machine = load_from_expression(name) if name else None
     except CraneError as error:
-        text = f"{columns}: names of columns are not checked, its machine cannot be read: {error}"
-        warnings.warn(text, CraneWarning, stacklevel=2)
+        warnings.warn(
+            f"{columns}: names of columns are not checked, its machine cannot be read: {error}",
+            CraneWarning,
+            stacklevel=2,
+        )
     table = select_time_span(read_sensor_readings(log, machine, columns), window.span, log)
     timeseries.write_table(output.out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {output.out}")

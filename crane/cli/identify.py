@@ -37,7 +37,7 @@ from crane.cli.parsing import (
     parse_window,
 )
 from crane.cli.terminal import progress_bar, status
-from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
+from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
 
 if TYPE_CHECKING:
     from crane.common.result import Result
@@ -137,10 +137,9 @@ def excite(
     else:
         motion.refuse("does not go with --fit, leave it out")
     fits = None if fit is None else parse_fits(fit)
-    deviations = parse_values("--noise", noise)
     common: dict[str, Any] = {
         "criterion": criterion,
-        "noise": deviations,
+        "noise": parse_values("--noise", noise),
         "step": step,
         "seed": seed,
     }
@@ -245,8 +244,11 @@ def identify(
     inside, outside = _split(_read(recording, loaded, reading), window)
     judges: list[Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
-        text = f"nothing of use lies outside of --train {train}, so nothing judges"
-        warnings.warn(text, CraneWarning, stacklevel=1)
+        warnings.warn(
+            f"nothing of use lies outside of --train {train}, so nothing judges",
+            CraneWarning,
+            stacklevel=1,
+        )
     names = _recording_names(recording, validation, train, bool(judges))
     judges += _read(validation or [], loaded, RecordingOptions(columns=reading.columns))
     if bandwidth is not None:
@@ -298,14 +300,12 @@ def _split(
     recordings: "list[Recording]", window: tuple[float, float]
 ) -> "tuple[list[Recording], list[Recording]]":
     """The parts of recordings inside a window [s], and those outside with enough samples."""
-    inside = [recording.between(*window) for recording in recordings]
-    outside = [
+    return [recording.between(*window) for recording in recordings], [
         recording.at(part)
         for recording in recordings
         for part in (recording.time < window[0], recording.time > window[1])
         if part.sum() >= _MIN_HELD_OUT_SAMPLES
     ]
-    return inside, outside
 
 
 def _usable_motions(
@@ -319,8 +319,11 @@ def _usable_motions(
             yield smoothed_motion(machine, recording, trust=trust)
         except RecordingError as error:
             where = "{:.4g} to {:.4g} s".format(*recording.time[[0, -1]])
-            text = f"what lies outside of --train, {where}, judges nothing: {error}"
-            warnings.warn(text, CraneWarning, stacklevel=1)
+            warnings.warn(
+                f"what lies outside of --train, {where}, judges nothing: {error}",
+                CraneWarning,
+                stacklevel=1,
+            )
 
 
 @command()
@@ -384,18 +387,16 @@ def circuit(
     from crane.identification.hydraulics.orifice_coefficients import identify_orifices
     from crane.identification.hydraulics.valve_curve import identify_valve
 
-    if model not in _CIRCUIT_MODELS:
-        raise InputError(f"model '{model}' is unknown, {suggest_names(_CIRCUIT_MODELS, model)}")
+    check_name(model, _CIRCUIT_MODELS, f"model '{model}' is unknown")
     if model != "orifices":
-        given = {"--method": method, "--period": period, "--validation": validation or None}
-        refuse_options(given, "is for --model orifices, leave it out")
+        refuse_options(
+            {"--method": method, "--period": period, "--validation": validation or None},
+            "is for --model orifices, leave it out",
+        )
         if len(recording) > 1:
             raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     loaded = options.load(machine)
-    if joint not in loaded.active:
-        raise InputError(
-            f"'{joint}' is not an active joint, {suggest_names(loaded.active, joint)}"
-        )
+    check_name(joint, loaded.active, f"'{joint}' is not an active joint")
     needs = required_channels(joint) if model == "orifices" else []
     if model == "valve":
         needs.append((f"voltage_{joint}",))

@@ -177,8 +177,9 @@ class ParameterOptions(ChangeOptions):
         """Load a machine by its name or path."""
         from crane.formats.machine_loading import load
 
-        held = parse_values("--lock", self.lock)
-        return load(name, self.changed_values(), held, **self.assembly())
+        return load(
+            name, self.changed_values(), parse_values("--lock", self.lock), **self.assembly()
+        )
 
     def assembly(self) -> dict[str, Any]:
         """Arguments of `crane.load` about how a description is read and assembled."""
@@ -307,8 +308,10 @@ class ParallelOptions(OptionBlock):
         """Arguments of `crane.study` and `crane.design` by name."""
         import os
 
-        processes = (os.cpu_count() or 1) if self.processes is None else self.processes
-        return {"processes": processes, "scheduler": self.scheduler}
+        return {
+            "processes": (os.cpu_count() or 1) if self.processes is None else self.processes,
+            "scheduler": self.scheduler,
+        }
 
 
 def _as_path(text: str | Path) -> Path:
@@ -321,40 +324,6 @@ def _default_folder(context: typer.Context, folder: Path) -> Path:
     source = context.get_parameter_source("out")
     is_given = source is not None and source.name != "DEFAULT"
     return folder if is_given else Path(str(context.info_name).replace("-", "_"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class OutputFolder(OptionBlock):
-    """The folder that a result is written to; one named like the command by default."""
-
-    panel = "Output options"
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FOLDER",
-            parser=_as_path,
-            callback=_default_folder,
-            show_default=False,
-            help="Folder of the results; named like the command by default.",
-        ),
-    ] = Path()
-    force: Force = False
-
-    def check(self) -> None:
-        """Raise an error if the folder cannot be written."""
-        check_folder_is_writable(self.out, self.force)
-
-    def write(self, result: "Result", note: str = "", **options: Any) -> None:
-        """Write a result into the folder, and print its summary.
-
-        Args:
-            result: The result.
-            note: Text after the name of the folder.
-            options: Options of `Result.write`.
-        """
-        with status("writing the results"):
-            text = result.write(self.out, self.force, **options)
-        print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -376,13 +345,37 @@ class OptionalOutputFolder(OptionBlock):
             check_folder_is_writable(self.out, self.force)
 
     def write(self, result: "Result", note: str = "", **options: Any) -> None:
-        """Print the summary of a result, and write it if there is a folder; as `OutputFolder`."""
-        if self.out is not None:
-            OutputFolder(out=self.out, force=self.force).write(result, note, **options)
-            return
+        """Print the summary of a result, and write it if there is a folder.
+
+        Args:
+            result: The result.
+            note: Text after the name of the folder.
+            options: Options of `Result.write`.
+        """
         from crane.view.result_files import result_summary
 
-        print(result_summary(result, **options).rstrip())
+        if self.out is None:
+            print(result_summary(result, **options).rstrip())
+            return
+        with status("writing the results"):
+            text = result.write(self.out, self.force, **options)
+        print(f"{text.rstrip()}\n\nwritten to {self.out}{note}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputFolder(OptionalOutputFolder):
+    """The folder that a result is written to; one named like the command by default."""
+
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FOLDER",
+            parser=_as_path,
+            callback=_default_folder,
+            show_default=False,
+            help="Folder of the results; named like the command by default.",
+        ),
+    ] = Path()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -113,8 +113,10 @@ def breakout(
         else:
             vector: str | list[float] = direction
             if "," in direction:
-                message = f"--direction {direction} is no X,Y,Z, give three numbers"
-                vector = parse_numbers(direction.split(","), message)
+                vector = parse_numbers(
+                    direction.split(","),
+                    f"--direction {direction} is no X,Y,Z, give three numbers",
+                )
             result = tool_force(loaded, vector, frame, joint=bucket, weights=weights, step=step)
     output.write(result)
 
@@ -166,17 +168,6 @@ class RatingOptions(OptionBlock):
         from math import radians
 
         from crane.common.samples import as_number
-
-        slope = radians(as_number(self.slope, "--slope", "degrees", max_magnitude=45.0))
-        slews = None if self.slew is None else [radians(x) for x in parse_slew_angles(self.slew)]
-        return {
-            "rule": self._applied_rule(), "raising": self.raising or None, "slope": slope,
-            "slews": slews, "friction": self.friction,
-        }  # fmt: skip
-
-    def _applied_rule(self) -> "ratings.Rule":
-        """The rule, with the shares that are given instead of its own."""
-        from crane.common.samples import as_number
         from crane.ratings.rating_rules import find_rule
 
         rule, words = find_rule(self.rule), []
@@ -187,7 +178,12 @@ class RatingOptions(OptionBlock):
                 words.append(f"{100 * share:g} % of the {what} load")
         if words:
             rule = replace(rule, description=f"{rule.description}; here {' and '.join(words)}")
-        return rule
+        slope = radians(as_number(self.slope, "--slope", "degrees", max_magnitude=45.0))
+        slews = None if self.slew is None else [radians(x) for x in parse_slew_angles(self.slew)]
+        return {
+            "rule": rule, "raising": self.raising or None, "slope": slope, "slews": slews,
+            "friction": self.friction,
+        }  # fmt: skip
 
 
 @command()
@@ -215,12 +211,13 @@ def capacity(
     conditions = rating.arguments()
     loaded, tipping_share = options.load(machine), conditions["rule"].tipping
     if tipping_share < 1 and not has_supports(loaded):
-        text = (
+        warnings.warn(
             f"'{loaded.name}' has no supports, so that nothing tips and the rule's "
             f"{100 * tipping_share:.3g} % of the tipping load are left out: name what it stands "
-            "on under 'supports' of the machine file"
+            "on under 'supports' of the machine file",
+            CraneWarning,
+            stacklevel=2,
         )
-        warnings.warn(text, CraneWarning, stacklevel=2)
     with status("rating"):
         chart, lifting = compute(loaded, frame, step=step, **conditions), None
         if torque is not None:

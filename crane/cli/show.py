@@ -16,7 +16,7 @@ from crane.cli.options import (
 )
 from crane.cli.parsing import parse_configuration
 from crane.cli.terminal import hide_activity_line
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
@@ -127,11 +127,14 @@ def sketch(
     from crane.view.sketches.sketch_figure import sketch as draw
 
     if circuit:
-        text = "is for the mechanism, leave it out with --circuit"
-        refuse_options({"--at": at, "--plane": plane, "--com": com}, text)
+        refuse_options(
+            {"--at": at, "--plane": plane, "--com": com},
+            "is for the mechanism, leave it out with --circuit",
+        )
     loaded = options.load(machine)
-    suffix = "_circuit.png" if circuit else "_sketch.png"
-    figure = output.path(Path(portable_file_name(loaded.name) + suffix))
+    figure = output.path(
+        Path(portable_file_name(loaded.name) + ("_circuit.png" if circuit else "_sketch.png"))
+    )
     if circuit:
         sketch_circuit(loaded, figure)
     else:
@@ -199,10 +202,7 @@ def active_coordinates(machine: "Machine", at: str | None) -> "Array":
     """
     q_a = machine.home[machine.closure.active].copy()
     for joint, value in parse_configuration("--at", at).items():
-        if joint not in machine.active:
-            raise InputError(
-                f"--at: '{joint}' is no active joint, {suggest_names(machine.active, joint)}"
-            )
+        check_name(joint, machine.active, f"--at: '{joint}' is no active joint")
         q_a[machine.active.index(joint)] = value
     return q_a
 

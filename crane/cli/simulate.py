@@ -27,12 +27,12 @@ from crane.cli.options import (
 from crane.cli.parsing import (
     parse_configuration,
     parse_grids,
-    parse_loads,
+    parse_load,
     parse_names,
     parse_numbers,
 )
 from crane.cli.terminal import INTERRUPTED, print_message, progress_bar, status
-from crane.common.errors import CraneError, InputError, SimulationError, suggest_names
+from crane.common.errors import CraneError, InputError, SimulationError, check_name
 
 if TYPE_CHECKING:
     from crane.common.result import Result
@@ -209,7 +209,7 @@ def simulate(
     from crane.simulation.simulation_run import simulate as run
 
     loaded = add_task_loads(options.load(machine), motion.task)
-    loaded = loaded.with_external_forces(*parse_loads(load))
+    loaded = loaded.with_external_forces(*map(parse_load, load or ()))
     result: Result
     if inputs is not None:
         for block in (motion, integration):
@@ -270,14 +270,10 @@ def task_control(
             return None
         home = machine.home[machine.closure.active]
         return make_controller(controller, machine, point_to_point(home, home, 1.0))
-    if task not in machine.tasks:
-        raise InputError(
-            f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
-        )
+    check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     if machine.tasks[task].space == "joystick":
-        for option, value in {"--controller": controller, "--sway": sway}.items():
-            if value is not None:
-                raise InputError(f"task '{task}' moves levers, leave {option} out")
+        text = f"does not go with task '{task}', which moves levers, leave it out"
+        refuse_options({"--controller": controller, "--sway": sway}, text)
         return joystick(machine, task)
     return tracking_control(machine, task_trajectory(machine, task), controller, sway)
 
@@ -310,8 +306,10 @@ def task_duration(machine: "Machine", task: str | None, duration: float | None) 
     if duration is not None:
         return duration
     if task is None:
-        tasks = ", ".join(machine.tasks) or "none"
-        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
+        raise InputError(
+            f"no task: name a --task ({', '.join(machine.tasks) or 'none'}), or a --duration to "
+            "let it go"
+        )
     return None if machine.tasks[task].phases else machine.tasks[task].duration
 
 

@@ -78,7 +78,10 @@ def use_load_options(
         strict: Whether elements that are only formally wrong are errors, here and in nested
             contexts.
     """
-    values = {str(name): _format_argument(value) for name, value in (arguments or {}).items()}
+    values = {
+        str(name): str(value).lower() if isinstance(value, bool) else str(value)
+        for name, value in (arguments or {}).items()
+    }
     options = LoadOptions(tuple(packages), values, floating, strict or load_options().strict)
     token = _load_options.set(options)
     try:
@@ -97,10 +100,6 @@ def asked(name: str) -> bool:
     if value not in ("true", "false"):
         raise InputError(f"the argument {name} is '{value}', give true or false")
     return value == "true"
-
-
-def _format_argument(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def check_package_folders(packages: object) -> list[str]:
@@ -162,7 +161,7 @@ def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool
     if in_package:
         ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
     places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
-    return next((place for place in places if place.is_file()), None)
+    return next(filter(Path.is_file, places), None)
 
 
 def find_package(name: str, folder: Path) -> Path | None:

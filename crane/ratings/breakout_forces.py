@@ -208,9 +208,12 @@ def breakout(
         start = machine.home
         if np.isfinite(bucket_force.isolated_force):
             held_coordinates[bucket_stroke], start = bucket_force.stroke, lever
-        others = [i for i in strokes.moving if i != bucket_stroke]
         arm_force, _ = _largest_breakout_force(
-            strokes, arm_stroke, (held_coordinates, start), others, weights
+            strokes,
+            arm_stroke,
+            (held_coordinates, start),
+            [i for i in strokes.moving if i != bucket_stroke],
+            weights,
         )
     return Breakout(
         machine, strokes.statics.frame, strokes.section, weights, bucket_force, arm_force
@@ -237,8 +240,9 @@ def _largest_breakout_force(
     machine, frame, active = strokes.machine, strokes.statics.frame, strokes.machine.closure.active
     joint, action = machine.active[stroke_index], tangent_action(strokes, stroke_index)
     rule, drives = find_rule("none"), drive_force_limits(machine, [joint])
-    own_drive = [x for x in drives if x.joint == joint]
-    own_limits = LoadLimits(strokes.statics, own_drive, rule, action, with_weight=False)
+    own_limits = LoadLimits(
+        strokes.statics, [x for x in drives if x.joint == joint], rule, action, with_weight=False
+    )
     grid = _start_configurations(strokes, stroke_index, held, moved)
     isolated_force, lever, tried = _maximize_over_starts(strokes, own_limits, grid, moved)
     for q in tried:
@@ -252,7 +256,7 @@ def _largest_breakout_force(
     forces = limits.max_magnitudes(strokes.statics.evaluate(best[None]))[0]
     smallest = int(np.nan_to_num(forces, nan=np.inf).argmin())
     home = own_limits.max_magnitudes(strokes.statics.evaluate(machine.home[None]))[0].min()
-    breakout_force = BreakoutForce(
+    return BreakoutForce(
         joint=joint,
         pivot=find_pivot(machine, frame, stroke_index),
         turn=instantaneous_rotation(machine, frame, stroke_index, best),
@@ -264,8 +268,7 @@ def _largest_breakout_force(
         limiting_factor=limits.factors[smallest] if np.isfinite(force) else None,
         forces_by_factor=dict(zip(limits.factors, forces.tolist(), strict=True)),
         q_a=best[active].copy(),
-    )
-    return breakout_force, lever
+    ), lever
 
 
 def _maximize_over_starts(
@@ -339,8 +342,7 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
     Returns:
         (nq,) closed configuration; the start if no larger force is found.
     """
-    start = strokes.statics.evaluate(q[None])
-    force = float(limits.max_magnitudes(start)[0].min())
+    force = float(limits.max_magnitudes(strokes.statics.evaluate(q[None]))[0].min())
     if not 0 < force < np.inf:
         return q
     problem = _ForceProblem(strokes, limits, q, moved, force)
@@ -365,11 +367,16 @@ class _ForceProblem:
         self._strokes, self._limits, self._q, self._moved = strokes, limits, q, moved
         self._force, self._lower = force, strokes.low[moved]
         self._lengths = (strokes.high - strokes.low)[moved]
-        q_a = q[strokes.machine.closure.active]
-        self.start = np.r_[(q_a[moved] - self._lower) / self._lengths, 1.0]
+        self.start = np.r_[
+            (q[strokes.machine.closure.active][moved] - self._lower) / self._lengths, 1.0
+        ]
         self._cache: dict[bytes, tuple[Array, StaticQuantities, StaticQuantities]] = {}
-        coefficients = self._coefficients(strokes.statics.evaluate(q[None]))
-        self._scales = np.array([abs(a[0]) + abs(b[0]) * force for a, b, *_ in coefficients])
+        self._scales = np.array(
+            [
+                abs(a[0]) + abs(b[0]) * force
+                for a, b, *_ in self._coefficients(strokes.statics.evaluate(q[None]))
+            ]
+        )
 
     def evaluate(self, y: Array) -> tuple[Array, StaticQuantities, StaticQuantities]:
         """Return the configuration (nq,), its statics, and their derivatives by coordinates."""
@@ -380,8 +387,11 @@ class _ForceProblem:
             target = self._q[machine.closure.active].copy()
             target[self._moved] = self._lower + np.clip(y[:-1], 0, 1) * self._lengths
             q = last_closed_configuration(machine, self._q, target)[0]
-            derivatives = statics.coordinate_derivatives(q[None])
-            self._cache[key] = q, statics.evaluate(q[None]), derivatives
+            self._cache[key] = (
+                q,
+                statics.evaluate(q[None]),
+                statics.coordinate_derivatives(q[None]),
+            )
         return self._cache[key]
 
     def cost(self, y: Any) -> tuple[float, Any]:
@@ -390,10 +400,12 @@ class _ForceProblem:
 
     def constraint_values(self, y: Any) -> Any:
         """Return the slack of each bound over its scale."""
-        coefficients = self._coefficients(self.evaluate(y)[1])
-        return -np.array([a[0] + b[0] * self._force * y[-1] for a, b, *_ in coefficients]) / (
-            self._scales
-        )
+        return -np.array(
+            [
+                a[0] + b[0] * self._force * y[-1]
+                for a, b, *_ in self._coefficients(self.evaluate(y)[1])
+            ]
+        ) / (self._scales)
 
     def constraint_jacobian(self, y: Any) -> Any:
         """Return the derivatives of `constraint_values` by y."""

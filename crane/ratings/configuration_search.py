@@ -140,10 +140,9 @@ class ConfigurationSearch(Strokes):
         start_sets, position_sets = [], []
         for patch in self._patches:
             node_positions = np.full((*patch.is_closed.shape, 2), np.nan)
-            tip_positions = self.statics.evaluate(
-                patch.configurations[patch.is_closed]
-            ).tip_positions
-            node_positions[patch.is_closed] = self.section.coordinates(tip_positions)
+            node_positions[patch.is_closed] = self.section.coordinates(
+                self.statics.evaluate(patch.configurations[patch.is_closed]).tip_positions
+            )
             position_index, q = grid_points_in_patch(patch, node_positions, axes)
             position_sets.append(position_index)
             start_sets.append(q)
@@ -192,8 +191,9 @@ class ConfigurationSearch(Strokes):
             values = evaluate(configurations.q, configurations.statics)
         indices = self._separated_maxima(configurations, values)
         configurations, values = configurations.select(indices), values[indices]
-        targets = _grid_positions(axes, configurations.position_index)
-        configurations, values = self._improve(configurations, values, targets, evaluate)
+        configurations, values = self._improve(
+            configurations, values, _grid_positions(axes, configurations.position_index), evaluate
+        )
         indices = _largest_per_position(configurations.position_index, values)
         return self._improve_from_neighbours(
             configurations.select(indices), values[indices], axes, evaluate
@@ -222,8 +222,7 @@ class ConfigurationSearch(Strokes):
         improved: NDArray[np.intp] = np.arange(len(values))
         while len(improved):
             index = configurations.position_index[improved]
-            cells = np.column_stack([index % shape[0], index // shape[0]])
-            neighbours = cells + offsets[:, None]
+            neighbours = np.column_stack([index % shape[0], index // shape[0]]) + offsets[:, None]
             offset, source = np.nonzero(((neighbours >= 0) & (neighbours < shape)).all(axis=2))
             first, second = neighbours[offset, source].T
             position = second * shape[0] + first
@@ -260,8 +259,9 @@ class ConfigurationSearch(Strokes):
             q = configurations.q.copy()
             q[:, self.machine.closure.active[i]] += change * self.span[i]
             moved, statics, is_valid = self.move_to_targets(q, targets, self.position_strokes)
-            found = ConfigurationSet(configurations.position_index, moved, statics)
-            sets.append(found.select(is_valid))
+            sets.append(
+                ConfigurationSet(configurations.position_index, moved, statics).select(is_valid)
+            )
         refined = ConfigurationSet.concatenate(sets)
         return refined.select(self._unique_indices(refined))
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +19,7 @@ from crane.ratings.limiting_factors import (
     tipping_lines,
 )
 from crane.ratings.rating_rules import slew_angles
+from crane.ratings.strokes import Strokes
 
 SIMULTANEOUS_TOLERANCE = 1e-6  # share of a load within which factors limit it simultaneously
 _LIMIT_TOLERANCE = 1e-6  # share of a stroke
@@ -102,8 +102,9 @@ def rating_derivatives(
     )  # fmt: skip
     jacobian, by_position = _position_derivatives(conditions, at_rest, by_parameters, angles)
     for i, magnitude in enumerate(rated.magnitudes):
-        is_active = bounds.magnitudes[i] <= magnitude * (1 + SIMULTANEOUS_TOLERANCE)
-        active = np.flatnonzero(is_active).tolist()
+        active = np.flatnonzero(
+            bounds.magnitudes[i] <= magnitude * (1 + SIMULTANEOUS_TOLERANCE)
+        ).tolist()
         if not all(j in bounds.by_coordinates for j in active):
             continue
         strokes = conditions.places.moving
@@ -114,7 +115,7 @@ def rating_derivatives(
             position_multipliers = -np.linalg.solve(jacobian[i].T, factor_multipliers @ gradients)
         else:
             factor_multipliers, position_multipliers = _lagrange_multipliers(
-                gradients, jacobian[i], *_stroke_limits(conditions, rated.q_a[i])
+                gradients, jacobian[i], conditions.places, rated.q_a[i]
             )
         out[i] = factor_multipliers @ np.array([bounds.by_parameters[j][i] for j in active])
         out[i] += position_multipliers @ by_position[i]
@@ -180,33 +181,21 @@ def _position_derivatives(
     )
 
 
-def _stroke_limits(
-    conditions: RatingConditions, q_a: Array
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
-    """Return which moving strokes (s,) are at the lower and upper limit, and their lengths."""
-    search, strokes = conditions.places, conditions.places.moving
-    span = search.high - search.low
-    at_low = q_a[strokes] <= (search.low + _LIMIT_TOLERANCE * span)[strokes]
-    at_high = q_a[strokes] >= (search.high - _LIMIT_TOLERANCE * span)[strokes]
-    return at_low, at_high, span[strokes]
-
-
 def _lagrange_multipliers(
-    gradients: Array,
-    jacobian: Array,
-    at_low: NDArray[np.bool_],
-    at_high: NDArray[np.bool_],
-    stroke_lengths: Array,
+    gradients: Array, jacobian: Array, strokes: Strokes, q_a: Array
 ) -> tuple[Array, Array]:
     """Return the multipliers mu (c,) and lambda (2,) of a configuration of the largest load.
 
     Args:
         gradients: (c, s) derivatives of the loads of the limiting factors by the strokes.
         jacobian: (2, s) derivatives of the position by the strokes.
-        at_low: (s,) which strokes are at their lower limit.
-        at_high: (s,) which strokes are at their upper limit.
-        stroke_lengths: (s,) lengths of the strokes.
+        strokes: The strokes with their limits.
+        q_a: (n,) active coordinates.
     """
+    moving, span = strokes.moving, strokes.high - strokes.low
+    stroke_lengths = span[moving]
+    at_low = q_a[moving] <= (strokes.low + _LIMIT_TOLERANCE * span)[moving]
+    at_high = q_a[moving] >= (strokes.high - _LIMIT_TOLERANCE * span)[moving]
     gradient_scale = np.abs(gradients * stroke_lengths).max() or 1.0
     position_scale = np.abs(jacobian * stroke_lengths).max()
     limits = np.vstack([np.diag(stroke_lengths)[at_low], -np.diag(stroke_lengths)[at_high]])
@@ -219,8 +208,7 @@ def _lagrange_multipliers(
         ]
     )
     count = len(gradients)
-    normalization = np.zeros((len(rows), 1))
-    normalization[:count] = 1.0
+    normalization = (np.arange(len(rows)) < count).astype(float)[:, None]
     solution = nnls(np.hstack([rows, normalization]).T, np.r_[np.zeros(rows.shape[1]), 1.0])[0]
     position_multipliers = (
         (solution[count : count + 2] - solution[count + 2 : count + 4])
@@ -267,7 +255,7 @@ def _magnitude_derivatives(
 def _drive_force_values(machine: Machine, conditions: RatingConditions) -> Array:
     """Return the force limits (2 d,) of all drives."""
     limits = conditions.drive_limits(machine)
-    return np.array([x for drive in limits for x in (drive.max_force, drive.min_force)])
+    return np.array([[drive.max_force, drive.min_force] for drive in limits]).ravel()
 
 
 def _tipping_line_values(machine: Machine) -> Array:

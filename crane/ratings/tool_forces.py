@@ -14,11 +14,11 @@ from crane.machine.machine import Machine
 from crane.motion.workspaces.workspace_section import up_direction
 from crane.ratings.configuration_search import ConfigurationSearch
 from crane.ratings.drive_force_limits import drive_force_limits
+from crane.ratings.limiting_factors import RatingConditions
 from crane.ratings.rating_chart import (
     RatingChart,
     compute_chart,
     configuration_search,
-    rating_conditions,
 )
 from crane.ratings.rating_rules import (
     FixedUnitAction,
@@ -33,7 +33,7 @@ from crane.ratings.strokes import Strokes, bucket_and_arm_strokes, frame_angular
 TOOL_DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-normal")
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ToolForce(RatingChart):
     """Tool forces over radius and height [N], see `RatingChart`.
 
@@ -87,11 +87,11 @@ class ToolForce(RatingChart):
             )
         lines += ["", "| limited by | of all positions |", "| --- | --- |"]
         reached_count = np.isfinite(self.q_a[..., 0]).sum()
-        for k in self.active_factors:
-            lines.append(
-                f"| {self.limiting_factors[k]} | "
-                f"{100 * (self.limiting_factor_index == k).sum() / reached_count:.3g} % |"
-            )
+        lines += [
+            f"| {self.limiting_factors[k]} | "
+            f"{100 * (self.limiting_factor_index == k).sum() / reached_count:.3g} % |"
+            for k in self.active_factors
+        ]
         return "\n".join([*lines, ""])
 
     def section_directions(self) -> Array:
@@ -174,19 +174,18 @@ def tool_force(
     action, single_joint = _direction_action(search, direction, joint)
     if working is None:
         working = machine.driven_joints if single_joint is None else [single_joint]
-    conditions = rating_conditions(search, action, find_rule("none"), working, with_weight=weights)
+    conditions = RatingConditions(
+        machine=machine, places=search, action=action, rule=find_rule("none"),
+        working_joints=tuple(working), with_weight=weights,
+    )  # fmt: skip
+    if not isinstance(direction, str):
+        direction = "({:g}, {:g}, {:g})".format(*direction)
+    elif isinstance(action, PathUnitAction):
+        direction += f" of {machine.active[action.stroke]}"
     return compute_chart(
         ToolForce, conditions, slews=slews, step=step, radii=radii, heights=heights,
-        direction=_direction_text(direction, action, machine),
+        direction=direction,
     )  # fmt: skip
-
-
-def _direction_text(direction: str | Sequence[float], action: UnitAction, machine: Machine) -> str:
-    if not isinstance(direction, str):
-        return "({:g}, {:g}, {:g})".format(*direction)
-    return direction + (
-        f" of {machine.active[action.stroke]}" if isinstance(action, PathUnitAction) else ""
-    )
 
 
 def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
@@ -197,10 +196,10 @@ def tangent_action(strokes: Strokes, stroke_index: int) -> PathUnitAction:
     """
     machine = strokes.machine
     joint = machine.active[stroke_index]
-    limits_by_joint = {x.joint: x for x in drive_force_limits(machine, [joint])}
-    if joint not in limits_by_joint:
+    limits = next((x for x in drive_force_limits(machine, [joint]) if x.joint == joint), None)
+    if limits is None:
         raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
-    pushes_harder = limits_by_joint[joint].max_force >= -limits_by_joint[joint].min_force
+    pushes_harder = limits.max_force >= -limits.min_force
     return PathUnitAction(stroke_index, -1.0 if pushes_harder else 1.0, up_direction(machine))
 
 
@@ -231,8 +230,7 @@ def _direction_action(
     if direction in ("in", "out"):
         return _fixed_action(-sign * section.first_direction, up, joint)
     i = bucket_and_arm_strokes(search, joint)[0]
-    path_action = tangent_action(search, i)
-    path_action = PathUnitAction(i, sign * path_action.sign, up)
+    path_action = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
     if direction.endswith("tangent"):
         return path_action, machine.active[i]
     return _normal_action(search, path_action, sign), None

@@ -178,8 +178,9 @@ class DimensionFinder:
         self._positions = self._lip.coordinates(self._optimizer.q)
         self._pivot = None
         if bucket_pivot is not None:
-            link = self._machine.tree.joints[bucket_pivot].child
-            self._pivot = FrameSectionCoordinates(workspace, link)
+            self._pivot = FrameSectionCoordinates(
+                workspace, self._machine.tree.joints[bucket_pivot].child
+            )
 
     def find_all(self, level_length: float) -> Iterator[Dimension]:
         """Yield the dimensions that exist, in the order of brochures.
@@ -208,10 +209,11 @@ class DimensionFinder:
             if pivot is not None:
                 dimensions.append(self._level_bottom_depth(level_length))
                 dimensions.append(self._vertical_wall_depth(pivot))
-        height = self._maximize_lip(1, 1.0, self._ground)
         dimensions.append(
             self._dimension(
-                "cutting height" if pivot else "height", height, "highest above the ground"
+                "cutting height" if pivot else "height",
+                self._maximize_lip(1, 1.0, self._ground),
+                "highest above the ground",
             )
         )
         if pivot is not None:
@@ -227,9 +229,10 @@ class DimensionFinder:
         fixed: Mapping[int, float] | None = None,
     ) -> Optimum:
         """Maximize sign (x - offset) of coordinate x of the lip, with other coordinates fixed."""
-        values = sign * self._positions[:, axis]
         return self._maximize_fixed(
-            self._lip.coordinate_objective(axis, sign, offset), values, fixed or {}
+            self._lip.coordinate_objective(axis, sign, offset),
+            sign * self._positions[:, axis],
+            fixed or {},
         )
 
     def _maximize_fixed(
@@ -277,8 +280,10 @@ class DimensionFinder:
             return None
         radius = float(brentq(height_difference, radii[k], radii[k + 1], xtol=_POSITION_TOLERANCE))
         bottom = self._lowest_height(radius)
-        inner_radii = np.linspace(radius, radius + level_length, _CHECKED_POINTS)[1:-1]
-        inner = [self._lowest_height(x) for x in inner_radii.tolist()]
+        inner = [
+            self._lowest_height(x)
+            for x in np.linspace(radius, radius + level_length, _CHECKED_POINTS)[1:-1].tolist()
+        ]
         if bottom is None or any(x is None or x[0] < bottom[0] - 1e-6 for x in inner):
             return None
         return self._dimension(

@@ -61,10 +61,10 @@ def sustained_oscillation(
     found: LimitCycle | None = None
     width = _MIN_PERIOD_SAMPLES
     while width * _MIN_PERIODS <= 2.5 * len(values):
-        deviation = values - _moving_mean(values, width)
-        for first, last, period in _oscillation_spans(deviation, width, 0.5 * least):
-            swings = _peak_to_peak(values, first, last, period)
-            amplitude = 0.5 * float(np.median(swings))
+        for first, last, period in _oscillation_spans(
+            values - _moving_mean(values, width), width, 0.5 * least
+        ):
+            amplitude = 0.5 * float(np.median(_peak_to_peak(values, first, last, period)))
             if amplitude < max(least, 0.0 if found is None else found.amplitude):
                 continue
             cycles = (last - first) / period

@@ -114,10 +114,9 @@ def assemble_table(
                 f"samples, others have {count}, choose a column of a table by its number, as in "
                 "a[0]"
             )
-    columns_by_heading = {
-        name: np.broadcast_to(values, (count,)) for name, values in found.items()
-    }
-    table = table_reader.table_from_columns(columns, columns_by_heading, notes)
+    table = table_reader.table_from_columns(
+        columns, {name: np.broadcast_to(values, (count,)) for name, values in found.items()}, notes
+    )
     for name, values in zip(table.units, table.values.T, strict=True):
         bad = ~np.isfinite(values)
         if name == TIME:

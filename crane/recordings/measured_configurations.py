@@ -49,8 +49,10 @@ def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...
     it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
     requested = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
     alternatives = f", or a joint that moves with {it} ({', '.join(others)})" if others else ""
-    text = f"{', '.join(map(repr, missing))} {are} not determined, give {requested}{alternatives}"
-    raise MissingMeasurementError(text, missing)
+    raise MissingMeasurementError(
+        f"{', '.join(map(repr, missing))} {are} not determined, give {requested}{alternatives}",
+        missing,
+    )
 
 
 def independent_joints(
@@ -105,10 +107,9 @@ class MeasuredConfigurations:
     @cached_property
     def machine(self) -> Machine:
         """The machine with the determining joints as active joints."""
-        same = set(self.drives) == set(self._recorded_machine.active)
         return (
             self._recorded_machine
-            if same
+            if (set(self.drives) == set(self._recorded_machine.active))
             else self._recorded_machine.with_active_joints(self.drives)
         )
 
@@ -283,8 +284,11 @@ def add_inclination_angles(machine: Machine, table: Table) -> Table:
         listed = ", ".join(name for _, name in unknown_angles)
         hint = f"see that zero and sign of {listed} are the machine's"
         raise RecordingError(f"{error}; {hint}") from None
-    units = table.units | {joint: "rad" for joint, _ in unknown_angles}
-    return Table(units, np.column_stack([table.values, angles]), table.notes)
+    return Table(
+        table.units | {joint: "rad" for joint, _ in unknown_angles},
+        np.column_stack([table.values, angles]),
+        table.notes,
+    )
 
 
 def _find_unknown_angles(machine: Machine, table: Table) -> tuple[tuple[str, ...], UnknownAngles]:

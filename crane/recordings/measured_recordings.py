@@ -178,8 +178,11 @@ def _complete_table(machine: Machine, table: Table, missing: MissingMeasurements
     for name, unit in table.units.items():
         if name not in units:
             units[name], columns[name] = unit, table_column(table, name)
-    notes = table.notes | {"machine": machine.load_expression}
-    return Table(units, np.column_stack([columns[name] for name in units]), notes)
+    return Table(
+        units,
+        np.column_stack([columns[name] for name in units]),
+        table.notes | {"machine": machine.load_expression},
+    )
 
 
 def check_pressures(machine: Machine, table: Table) -> None:
@@ -310,8 +313,7 @@ def dead_length(machine: Machine, joint: str) -> float | None:
     slide = machine.tree.joints[joint]
     model = machine.model
     data = model.createData()
-    place = machine.coordinates.configuration(machine.home)
-    pin.framesForwardKinematics(model, data, place)
+    pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
     axis = data.oMf[machine.frame(slide.child)].rotation @ np.array(slide.axis)
     bodies = machine.tree.bodies_by_link()
     smallest_deviation, length = _MAX_AXIS_DEVIATION, None
@@ -334,7 +336,10 @@ def _pin_positions(machine: Machine, data: pin.Data, body: str, slide: str) -> l
         and joint.kind == "revolute"
         and body in (joint.child, bodies[joint.parent])
     ]
-    loops = machine.closure.equations.loops
-    ends = [end for loop in loops for end in (loop.predecessor, loop.successor)]
+    ends = [
+        end
+        for loop in machine.closure.equations.loops
+        for end in (loop.predecessor, loop.successor)
+    ]
     frames += [end for end in ends if bodies[end] == body]
     return [data.oMf[machine.frame(frame)].translation.copy() for frame in frames]

@@ -151,8 +151,7 @@ class Recording(Result):
                 f"channels {quoted_list(self.channels)} hold an active joint, "
                 f"rename those that end in {VELOCITY_SUFFIX} and {FORCE_SUFFIX}"
             )
-        units = self._column_units()
-        for name, unit in units.items():
+        for name, unit in self._column_units().items():
             timeseries.check_column_name(name, unit)
         for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
@@ -165,8 +164,7 @@ class Recording(Result):
         for i, joint in enumerate(self.joints):
             if joint in self.free and self.tau[:, i].any():
                 raise RecordingError(free_force_message(joint, self.tau[:, i]))
-        arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
-        for values in arrays:
+        for values in (self.time, self.q, self.v, self.tau, *self.channels.values()):
             scratch_arrays.release_pages()
             if not np.isfinite(values).all():
                 check_finite(self.columns())
@@ -307,8 +305,14 @@ class Recording(Result):
             for name in self.channels
             if name in deviations or not name.endswith((VELOCITY_SUFFIX, _ACCELERATION_SUFFIX))
         }
-        units = {name: self.channel_units[name] for name in channels}
-        return replace(self, q=q, v=v, tau=tau, channels=channels, channel_units=units)
+        return replace(
+            self,
+            q=q,
+            v=v,
+            tau=tau,
+            channels=channels,
+            channel_units={name: self.channel_units[name] for name in channels},
+        )
 
     def error(self, joint: str) -> Array:
         """Tracking error (N,) of a joint [rad], [m]: reference minus coordinate.

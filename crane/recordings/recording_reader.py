@@ -162,13 +162,15 @@ def _read_machine_log(
         else:
             missing_sensors.append(f"'{quantity}' (no '{missing[0]}')")
     if missing_sensors:
-        text = (
+        warnings.warn(
             f"{path}: the log does not have all of the machine's sensors: "
-            f"{', '.join(missing_sensors)}"
+            f"{', '.join(missing_sensors)}",
+            CraneWarning,
+            stacklevel=4,
         )
-        warnings.warn(text, CraneWarning, stacklevel=4)
-    notes = {"machine": machine.load_expression}
-    return logs.assemble_table(path, machine.path, arrays, lines, notes)
+    return logs.assemble_table(
+        path, machine.path, arrays, lines, {"machine": machine.load_expression}
+    )
 
 
 def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sensor]:
@@ -217,8 +219,11 @@ def _warn_conflicting_notes(table: Table, machine: Machine) -> None:
         not in (value, getattr(Sensor(), parse_sensor_parameter(name)[1]))
     ]
     if messages:
-        text = f"notes of the recording count, not the machine's sensors: {', '.join(messages)}"
-        warnings.warn(text, CraneWarning, stacklevel=4)
+        warnings.warn(
+            f"notes of the recording count, not the machine's sensors: {', '.join(messages)}",
+            CraneWarning,
+            stacklevel=4,
+        )
 
 
 def correct_readings(table: Table, sensors: Mapping[str, Sensor]) -> Table:

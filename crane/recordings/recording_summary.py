@@ -356,10 +356,12 @@ def joint_differences(recording: Recording, other: Recording) -> list[JointDiffe
             np.interp(time, shifted_time, other.q[:, other.joints.index(joint)]) - one
         )
         largest_index = int(distance.argmax())
-        unit = recording.units[joint]
         found.append(
             JointDifference(
-                joint, unit, float(distance[largest_index]), float(time[largest_index])
+                joint,
+                recording.units[joint],
+                float(distance[largest_index]),
+                float(time[largest_index]),
             )
         )
     return found

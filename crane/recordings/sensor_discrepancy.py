@@ -181,10 +181,9 @@ class _RedundantSensor:
         """Determining joints that the reading depends on."""
         configurations = self._configurations
         q = configurations.q[configurations.derivative_slice]
-        gamma = configurations.machine.closure.gamma(q)
         derivatives = [
             configurations.directional_derivative(self.quantity, q, g)
-            for g in np.moveaxis(gamma, 2, 0)
+            for g in np.moveaxis(configurations.machine.closure.gamma(q), 2, 0)
         ]
         pairs = zip(configurations.machine.active, derivatives, strict=True)
         return [joint for joint, slope in pairs if np.abs(slope).max() > _ZERO_DERIVATIVE]
@@ -293,8 +292,7 @@ class _RedundantSensor:
     def _drive_zero_causes(self, measured_columns: Sequence[str]) -> list[_DiscrepancyCause]:
         """Causes: zeros of the determining joints, one at a time, by the Gauss-Newton method."""
         found = []
-        drives = self._configurations.machine.active
-        for i, joint in enumerate(drives if not self.is_rate else ()):
+        for i, joint in enumerate(self._configurations.machine.active if not self.is_rate else ()):
             if joint not in measured_columns:
                 continue
             zero, residual_rms = 0.0, np.inf

@@ -49,8 +49,7 @@ def check_column_name(name: str, unit: str) -> None:
     Raises:
         RecordingError: They contain invalid characters.
     """
-    words = {"name": name, "unit": unit} if unit else {"name": name}
-    for what, text in words.items():
+    for what, text in ({"name": name, "unit": unit} if unit else {"name": name}).items():
         if not _NAME_PATTERN.fullmatch(text) or not text.isprintable():
             raise RecordingError(
                 f"column '{name}': {text!r} cannot be the {what} of a column, "

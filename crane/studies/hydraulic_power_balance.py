@@ -66,11 +66,16 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
     v = np.column_stack([recorded[joint + VELOCITY_SUFFIX] for joint in circuit.joints])
     state_columns = [columns.state_column(name) for name in circuit.state_units]
     boundary_pressures = columns.boundary_pressures() if is_measured else []
-    rows = np.column_stack([x, v, *state_columns, *columns.signal_columns(), *boundary_pressures])
-    names, values = _evaluate_powers(circuit, rows)
+    names, values = _evaluate_powers(
+        circuit,
+        np.column_stack([x, v, *state_columns, *columns.signal_columns(), *boundary_pressures]),
+    )
     powers = dict(zip(names, values.T, strict=True))
-    friction_forces = {joint: powers.pop(f"{joint}.{_FRICTION_FORCE}") for joint in circuit.joints}
-    friction = _joint_friction(machine, recording, friction_forces)
+    friction = _joint_friction(
+        machine,
+        recording,
+        {joint: powers.pop(f"{joint}.{_FRICTION_FORCE}") for joint in circuit.joints},
+    )
     for i, joint in enumerate(circuit.joints):
         rod_power = powers.pop(f"{joint}.{ROD_POWER}")
         friction_power = friction[joint] * v[:, i]
@@ -137,8 +142,9 @@ def _joint_friction(
         return {joint: recording.channels[name] for joint, name in names.items()}
     order = [recording.joints.index(joint) for joint in machine.active]
     v = recording.v[:, order]
-    law_friction = Dynamics(machine).friction(recording.q[:, order], v)
-    friction = dict(zip(machine.active, law_friction.T, strict=True))
+    friction = dict(
+        zip(machine.active, Dynamics(machine).friction(recording.q[:, order], v).T, strict=True)
+    )
     for joint, friction_force in friction_forces.items():
         law, velocity = machine.friction.get(joint, Friction()), v[:, machine.active.index(joint)]
         sign = np.tanh(velocity / law.smoothing) if law.smoothing else np.sign(velocity)

@@ -76,8 +76,7 @@ def measure_task(
         0.0, trajectory.duration, int(np.ceil(_SAMPLES_PER_SECOND * trajectory.duration)) + 1
     )
     if machine.free:
-        step = float(time[1] - time[0])
-        run = simulate(machine, ComputedTorque(machine, trajectory), step=step)
+        run = simulate(machine, ComputedTorque(machine, trajectory), step=float(time[1] - time[0]))
         v_a, tau = run.v, run.tau
     else:
         q_a, v_a, a_a = trajectory(time)
@@ -288,9 +287,10 @@ def _stroke_end(
     def objective(q: Array) -> tuple[float, Array]:
         return sign * float(q[column]), gradient
 
-    q_a = configurations[:, machine.closure.active]
     starts = configurations[
-        _separated_indices(values, _relative_strokes(q_a, limits))[:_STROKE_START_COUNT]
+        _separated_indices(
+            values, _relative_strokes(configurations[:, machine.closure.active], limits)
+        )[:_STROKE_START_COUNT]
     ]
     return sign * max(
         maximize_on_branch(machine, q, strokes.tolist(), limits, objective)[0] for q in starts

@@ -62,8 +62,12 @@ def compute_on_cluster(
                 stacklevel=2,
             )
         run = uuid.uuid4().hex
-        keys = [f"crane-study-{run}-{index}" for index in range(len(jobs))]
-        futures = client.map(function, jobs, key=keys, pure=False)
+        futures = client.map(
+            function,
+            jobs,
+            key=[f"crane-study-{run}-{index}" for index in range(len(jobs))],
+            pure=False,
+        )
         indices = {future.key: index for index, future in enumerate(futures)}
         for future in dask.as_completed(futures, loop=client.loop):
             yield indices[future.key], _job_result(future, indices[future.key], scheduler)
@@ -134,8 +138,9 @@ def check_process_count(count: int) -> int:
     Raises:
         InputError: The number is not valid.
     """
-    max_processes = _PROCESSES_PER_CORE * (os.cpu_count() or 1)
-    return as_count(count, "the number of processes", 1, max_processes)
+    return as_count(
+        count, "the number of processes", 1, _PROCESSES_PER_CORE * (os.cpu_count() or 1)
+    )
 
 
 def compute_jobs(
@@ -181,8 +186,9 @@ def _compute_in_processes(
             "measures that are lambdas or local functions stay in one process: give a Python "
             f"file, functions of a module, or processes=1 ({error})"
         ) from None
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=_exit_with_parent)
+    pool = ProcessPoolExecutor(
+        processes, multiprocessing.get_context("spawn"), initializer=_exit_with_parent
+    )
     try:
         futures = {pool.submit(function, job): index for index, job in enumerate(jobs)}
         for future in as_completed(futures):

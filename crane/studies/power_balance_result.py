@@ -173,9 +173,12 @@ class PowerBalance(Result):
             x for x in self.powers if self.integrate_energy(np.abs(self.powers[x])) > min_energy
         ]
         rows += [self._table_row(f"{part_owner(x)}: {part_kind(x)}", [x]) for x in listed_parts]
-        total_labels = {SHAFT_POWER: "all shafts", "lost": "all losses", LOAD: "all loads",
-                 "stored": "all that is stored"}  # fmt: skip
-        for total_kind, label in total_labels.items():
+        for total_kind, label in {
+            SHAFT_POWER: "all shafts",
+            "lost": "all losses",
+            LOAD: "all loads",
+            "stored": "all that is stored",
+        }.items():
             rows.append(
                 self._table_row(
                     f"**{label}**", [x for x in self.powers if part_total(x) == total_kind]

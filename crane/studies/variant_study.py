@@ -14,6 +14,7 @@ from crane.common.errors import (
     CraneError,
     CraneWarning,
     InputError,
+    check_name,
     prefix_location,
     suggest_names,
 )
@@ -254,9 +255,9 @@ def _is_expression(
     """
     if text in available:
         return False
-    if text.isidentifier() and text not in functions and text not in PLAIN_MEASURES:
+    if text.isidentifier():
         names = [*available, *PLAIN_MEASURES, *functions]
-        raise InputError(f"measure '{text}' is unknown, {suggest_names(names, text)}")
+        check_name(text, names, f"measure '{text}' is unknown")
     load_positions([MeasureExpression(text)])
     return True
 

@@ -135,12 +135,17 @@ class DesignProblem:
                 np.full(len(self.requirements), -np.inf), False, str(error),
             )  # fmt: skip
         slacks = np.array([x.value for x in duals[count:]])
-        is_equality = np.array(self.job.is_equality, dtype=bool)
-        slacks = np.where(is_equality, -np.abs(slacks), slacks)
+        slacks = np.where(np.array(self.job.is_equality, dtype=bool), -np.abs(slacks), slacks)
         tolerances = _REQUIREMENT_TOLERANCE * np.array(self.scales(duals[count:], 0.0))
         objectives = np.array([x.value for x in duals[:count]])
-        is_feasible = bool((slacks >= -tolerances).all())
-        return DesignSolution(initial_values, values, objectives, slacks, is_feasible, message)
+        return DesignSolution(
+            initial_values,
+            values,
+            objectives,
+            slacks,
+            bool((slacks >= -tolerances).all()),
+            message,
+        )
 
     def with_all_objectives(self, solution: DesignSolution) -> DesignSolution:
         """Return a solution with the values of all objectives."""

@@ -64,16 +64,14 @@ class Design(Result):
     options: MeasureOptions
 
     def _one_line(self) -> str:
-        best_solution = self.solutions[0]
-        values = ", ".join(f"{x:.6g}" for x in best_solution.objectives)
+        values = ", ".join(f"{x:.6g}" for x in self.solutions[0].objectives)
         return f"Design of {self.machine.name} for {'; '.join(self.objectives)}: {values}"
 
     def parameter_changes(self, k: int = 0) -> dict[str, float]:
         """Return the parameters of a solution by name, as `crane.load` takes them."""
-        values = self.solutions[k].values.tolist()
         return {
             **self.machine.parameter_changes,
-            **dict(zip(self.parameter_names, values, strict=True)),
+            **dict(zip(self.parameter_names, self.solutions[k].values.tolist(), strict=True)),
         }
 
     def variant(self, k: int = 0) -> Machine:

@@ -48,8 +48,10 @@ class DualNumber:
 
     def __mul__(self, other: "DualNumber | float") -> "DualNumber":
         second = self._as_dual(other)
-        derivatives = self.value * second.derivatives + second.value * self.derivatives
-        return DualNumber(self.value * second.value, derivatives)
+        return DualNumber(
+            self.value * second.value,
+            self.value * second.derivatives + second.value * self.derivatives,
+        )
 
     __rmul__ = __mul__
 
