@@ -5,7 +5,8 @@ by closing the loops, velocities by v_A = gamma_A v_B with the measured joints q
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 
 import numpy as np
@@ -15,10 +16,8 @@ from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
 from crane.machine.machine import Machine
-from crane.recordings.missing_measurements import MissingMeasurementError
-from crane.recordings.recording_columns import time_derivative
 from crane.recordings.sensor_kinematics import ideal_readings, pin_derivatives
-from crane.recordings.timeseries import TIME, Table, table_column
+from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
 
 _MIN_INDEPENDENT_SHARE = 1e-6  # least part of the motion of a joint that others do not determine
 _CONFIGURATION_TOLERANCE = 1e-6  # [rad], [characteristic length]
@@ -29,7 +28,22 @@ _SAMPLE_PATTERN = re.compile(r"\(sample (\d+)\)")  # in an error message of the 
 _LIMIT_TOLERANCE = 0.1  # of a range, for errors of sensors
 _MAX_ITERATIONS, _STEP_TOLERANCE = 12, 1e-11  # Newton iterations, and the last step [rad]
 _MIN_DERIVATIVE = 0.1  # least derivative of an inclination by the joint of its link
+AGREEMENT_TOLERANCE = {"rad": 5e-3, "m": 5e-4}  # between sensors of one quantity
+HELD_JOINT_TOLERANCE = {"rad": 0.02, "m": 2e-3}  # of a joint that is held
 UnknownAngles = list[tuple[str, str]]  # joint, inclination
+
+
+class MissingMeasurementError(RecordingError):
+    """Coordinates or forces of joints are not determined by a recording.
+
+    Args:
+        message: Message with the required columns.
+        joints: Joints that may have been held.
+    """
+
+    def __init__(self, message: str, joints: Iterable[str]):
+        super().__init__(message)
+        self.joints = tuple(joints)
 
 
 def determining_joints(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
@@ -367,3 +381,63 @@ def _inclination_jacobian(
     gamma, rates = driven.closure.gamma(q), [name + VELOCITY_SUFFIX for name in names]
     columns = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
     return np.stack([np.column_stack([x[rate] for rate in rates]) for x in columns], axis=2)
+
+
+class MissingMeasurements:
+    """Collector of errors about missing measurements, raised as one error.
+
+    Args:
+        machine: The recorded machine.
+        table: Table of quantities.
+    """
+
+    def __init__(self, machine: Machine, table: Table):
+        self._machine, self._table = machine, table
+        self._errors: list[RecordingError] = []
+
+    @contextmanager
+    def collect_errors(self) -> Iterator[None]:
+        """Collect a recording error of the block, to be raised later."""
+        try:
+            yield
+        except RecordingError as error:
+            self._errors.append(error)
+
+    def raise_collected(self) -> None:
+        """Raise all collected errors as one.
+
+        Raises:
+            RecordingError: There are collected errors.
+        """
+        if not self._errors:
+            return
+        joints = dict.fromkeys(
+            joint for error in self._errors if isinstance(error, MissingMeasurementError)
+            for joint in error.joints
+        )  # fmt: skip
+        message = "; ".join(map(str, self._errors))
+        lock_options = [
+            f"--lock {joint}={place}" for joint in joints if (place := self._held_position(joint))
+        ]
+        if lock_options:
+            message += f"; or lock what was held, where it was: {' '.join(lock_options)}"
+        raise RecordingError(message)
+
+    def _held_position(self, joint: str) -> str:
+        """Text of the coordinate at which a joint may have been held; "" if it moved."""
+        machine, unit = self._machine, self._machine.unit(joint)
+        if self._table.units.get(joint) != unit:
+            return f"{machine.home[machine.column(joint)]:.4g} (home)"
+        low, place, high = np.quantile(table_column(self._table, joint), [0.005, 0.5, 0.995])
+        return (
+            f"{place:.4g}"
+            if high - low <= 2 * tolerance(HELD_JOINT_TOLERANCE, machine, unit)
+            else ""
+        )
+
+
+def tolerance(tolerances: Mapping[str, float], machine: Machine, unit: str) -> float:
+    """Tolerance in a unit, scaled by the characteristic length for machines below 1 m."""
+    return tolerances[unit] * (
+        min(machine.closure.characteristic_length, 1.0) if unit == "m" else 1.0
+    )

@@ -19,7 +19,7 @@ from crane.common.errors import (
     CraneWarning,
     InputError,
     RecordingError,
-    prefix_location,
+    check_name,
     suggest_names,
 )
 from crane.description.sensors import (
@@ -37,7 +37,7 @@ from crane.description.sensors import quantity_names as quantity_names
 from crane.machine.machine import Machine
 from crane.recordings import logs, table_reader
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
-from crane.recordings.timeseries import Table, table_column
+from crane.recordings.timeseries import Table, located_errors, table_column
 
 _ALIKE = 0.7  # similarity from which a name counts as a misspelling
 
@@ -74,13 +74,11 @@ def quantities_from_readings(
     table: Table, path: str | Path, machine: Machine | None, span: TimeSpan
 ) -> Table:
     """Correct readings of a file, and select a time span."""
-    try:
+    with located_errors(path):
         known = known_sensors(table, machine)
         if known and machine is not None:
             _warn_conflicting_notes(table, machine)
         table = correct_readings(table, known)
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
     return select_time_span(table, span, path)
 
 
@@ -197,10 +195,8 @@ def _sensor_notes(table: Table) -> dict[str, float]:
         try:
             quantity, _ = parse_sensor_parameter(name)
             parameters[name] = float(text)
-            if quantity not in table.units:
-                raise RecordingError(
-                    f"the note '{name}' is of no column, {suggest_names(table.units, quantity)}"
-                )
+            problem = f"the note '{name}' is of no column"
+            check_name(quantity, table.units, problem, RecordingError)
         except InputError as error:
             raise RecordingError(f"the note {error}") from None
         except ValueError:

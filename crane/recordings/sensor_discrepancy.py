@@ -22,8 +22,12 @@ from crane.description.sensors import (
     quantity_unit,
 )
 from crane.machine.machine import Machine
-from crane.recordings.measured_configurations import MeasuredConfigurations, add_inclination_angles
-from crane.recordings.missing_measurements import AGREEMENT_TOLERANCE, tolerance
+from crane.recordings.measured_configurations import (
+    AGREEMENT_TOLERANCE,
+    MeasuredConfigurations,
+    add_inclination_angles,
+    tolerance,
+)
 from crane.recordings.recording_reader import known_sensors
 from crane.recordings.timeseries import TIME, Table, table_column
 

@@ -70,7 +70,16 @@ def measure_task(
         CraneError: The machine cannot perform the task.
     """
     if machine.tasks[task].space == "joystick":
-        return _measure_lever_task(machine, task)
+        levers = machine.tasks[task]
+        run = simulate(
+            machine.with_external_forces(*levers.loads),
+            joystick(machine, task),
+            duration=None if levers.phases else levers.duration,
+            step=_LEVER_TASK_STEP,
+        )
+        measures = _force_measures(machine, run.time, run.v, run.tau)
+        measures["pump_work"] = float(run.channels["pump_work"][-1])
+        return float(run.time[-1]), measures
     trajectory = task_trajectory(machine, task)
     time = np.linspace(
         0.0, trajectory.duration, int(np.ceil(_SAMPLES_PER_SECOND * trajectory.duration)) + 1
@@ -82,20 +91,6 @@ def measure_task(
         q_a, v_a, a_a = trajectory(time)
         tau = dynamics.inverse(q_a, v_a, a_a, friction=True)
     return trajectory.duration, _force_measures(machine, time, v_a, tau)
-
-
-def _measure_lever_task(machine: Machine, name: str) -> tuple[float, dict[str, float]]:
-    """Compute duration and measures of a task of levers, with its circuit and loads."""
-    task = machine.tasks[name]
-    run = simulate(
-        machine.with_external_forces(*task.loads),
-        joystick(machine, name),
-        duration=None if task.phases else task.duration,
-        step=_LEVER_TASK_STEP,
-    )
-    measures = _force_measures(machine, run.time, run.v, run.tau)
-    measures["pump_work"] = float(run.channels["pump_work"][-1])
-    return float(run.time[-1]), measures
 
 
 def _force_measures(machine: Machine, time: Array, v_a: Array, tau: Array) -> dict[str, float]:

@@ -144,23 +144,32 @@ def check_process_count(count: int) -> int:
 
 
 def compute_jobs(
-    function: Callable[[J], R], jobs: Sequence[J], processes: int, scheduler: str | None
-) -> Iterator[tuple[int, R]]:
-    """Yield indices and results of jobs as they finish.
+    function: Callable[[J], R],
+    jobs: Sequence[J],
+    processes: int,
+    scheduler: str | None,
+    report: Callable[[int], object],
+) -> list[R]:
+    """Return the results of jobs.
 
     Args:
         function: Function of a job; other processes import it from this package.
         jobs: Arguments of the function.
         processes: Number of processes.
         scheduler: Address of a Dask scheduler whose workers compute instead.
+        report: Called with the number of finished jobs after each.
     """
     if scheduler is not None:
-        yield from compute_on_cluster(function, jobs, scheduler)
+        finished = compute_on_cluster(function, jobs, scheduler)
     elif processes <= 1 or len(jobs) == 1:
-        for index, job in enumerate(jobs):
-            yield index, function(job)
+        finished = ((index, function(job)) for index, job in enumerate(jobs))
     else:
-        yield from _compute_in_processes(function, jobs, min(processes, len(jobs)))
+        finished = _compute_in_processes(function, jobs, min(processes, len(jobs)))
+    results: dict[int, R] = {}
+    for index, result in finished:
+        results[index] = result
+        report(len(results))
+    return [results[index] for index in range(len(jobs))]
 
 
 def _exit_with_parent() -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from crane.common.errors import CraneWarning, InputError, suggest_names
+from crane.common.errors import CraneWarning, InputError, check_name
 from crane.control.control_law import ComputedTorque
 from crane.control.levers import joystick
 from crane.dynamics.tipping_stability import TippingStability
@@ -51,10 +51,7 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
         InputError: The machine has no such task, no payload or no supports, or it tips without
             payload.
     """
-    if task not in machine.tasks:
-        raise InputError(
-            f"machine '{machine.name}' has no task '{task}', {suggest_names(machine.tasks, task)}"
-        )
+    check_name(task, machine.tasks, f"machine '{machine.name}' has no task '{task}'")
     TippingStability(machine)  # raises without supports
     variants = MachineVariants(machine)
     if PAYLOAD_MASS not in variants.values:

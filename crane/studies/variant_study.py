@@ -16,7 +16,6 @@ from crane.common.errors import (
     InputError,
     check_name,
     prefix_location,
-    suggest_names,
 )
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_samples, as_seed
@@ -176,19 +175,18 @@ def study(
         )
         for row in values
     ]
-    rows: dict[int, tuple[dict[str, float], str]] = {}
-    for index, row in compute_jobs(measure_variant, jobs, processes, scheduler):
-        rows[index] = row
-        if progress is not None:
-            progress(len(rows) / len(jobs))
-    reasons = tuple(rows[i][1] for i in range(len(jobs)))
+    rows = compute_jobs(
+        measure_variant, jobs, processes, scheduler,
+        lambda done: progress and progress(done / len(jobs)),
+    )  # fmt: skip
+    reasons = tuple(reason for _, reason in rows)
     if all(reasons):
         raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
     measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
     available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
     column_measures = _column_measures(measures, task_measure_units, tasks)
     columns = dict(zip(vary, values.T, strict=True)) | {
-        column: np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
+        column: np.array([row.get(column, np.nan) for row, _ in rows])
         for column in column_measures
     }
     units |= {column: available[measure] for column, measure in column_measures.items()}
@@ -273,15 +271,13 @@ def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, fl
         *(parse_requirement(x)[0] for x in study_job.requirements),
     ]
     options = MeasureOptions(
-        study_job.frame,
-        study_job.rule,
-        study_job.expression_tasks,
+        study_job.frame, study_job.rule, study_job.expression_tasks,
         load_user_measures(study_job.user_measures),
-    )
-    no_values = np.zeros(0)
+    )  # fmt: skip
     evaluation = VariantEvaluation(
-        MachineVariants(machine), (), no_values, no_values, options, load_positions(expressions)
-    )
+        MachineVariants(machine), (), np.zeros(0), np.zeros(0), options,
+        load_positions(expressions),
+    )  # fmt: skip
     values = [evaluation.evaluate(x) for x in expressions]
     for text, value in zip(
         study_job.requirements, values[len(study_job.expressions) :], strict=True
@@ -320,8 +316,7 @@ def _unique_names(
 ) -> tuple[str, ...]:
     """Return the requested names without repetitions; all by default."""
     for name in requested or ():
-        if name not in available:
-            raise InputError(f"{label} '{name}' is unknown, {suggest_names(available, name)}")
+        check_name(name, available, f"{label} '{name}' is unknown")
     return tuple(dict.fromkeys(available if requested is None else requested))
 
 
@@ -336,10 +331,7 @@ def _parameter_units(machine: Machine, vary: Mapping[str, object], with_circuit:
     names = MachineVariants(machine).values
     units = {}
     for parameter in vary:
-        if parameter not in names:
-            raise InputError(
-                f"parameter '{parameter}' is unknown, {suggest_names(names, parameter)}"
-            )
+        check_name(parameter, names, f"parameter '{parameter}' is unknown")
         prefix, *remaining_names = parameter.split(".")
         if (
             not with_circuit

@@ -1,13 +1,14 @@
 """Design optimization: parameters of a machine that are best for measures of it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_count, as_seed
 from crane.formats.machine_loading import MachineVariants
@@ -93,10 +94,7 @@ def design(
     names, lower, upper = ranges = _parameter_ranges(base_machine, vary)
     chosen_tasks = tuple(base_machine.tasks if tasks is None else tasks)
     for task in chosen_tasks:
-        if task not in base_machine.tasks:
-            raise InputError(
-                f"task '{task}' is unknown, {suggest_names(base_machine.tasks, task)}"
-            )
+        check_name(task, base_machine.tasks, f"task '{task}' is unknown")
     options = MeasureOptions(frame, find_rule(rule), chosen_tasks, load_user_measures(measures))
     base_job = _base_job(base_machine, name, ranges, objectives, require, options, measures)
     initial_values = np.array([MachineVariants(base_machine).values[x] for x in names])
@@ -107,10 +105,10 @@ def design(
     total = starts * len(objectives) + (points if is_multi_objective else 0)
 
     def solve_jobs(jobs: Sequence[DesignJob], finished: int) -> list[DesignSolution]:
-        results = compute_jobs(solve_design_job, jobs, processes, scheduler)
-        return _collect_results(
-            results, lambda done: progress and progress((finished + done) / total)
-        )
+        return compute_jobs(
+            solve_design_job, jobs, processes, scheduler,
+            lambda done: progress and progress((finished + done) / total),
+        )  # fmt: skip
 
     solutions = solve_jobs(
         [
@@ -140,8 +138,8 @@ def design(
         upper,
         tuple(f"{sense} {text}" for sense, text in objectives),
         tuple(x.strip() for x in require),
-        _restore_signs(initial_solution, signs),
-        tuple(_restore_signs(x, signs) for x in solutions),
+        replace(initial_solution, objectives=signs * initial_solution.objectives),
+        tuple(replace(x, objectives=signs * x.objectives) for x in solutions),
         options,
     )
 
@@ -197,14 +195,14 @@ def _check_names(
     known_measures = available_measures(machine, options.user_measures)
     values = MachineVariants(machine).values
 
-    def check_name(name: str) -> float:
-        if name not in known_measures and name not in values:
-            raise InputError(f"measure '{name}' is unknown, {suggest_names(known_measures, name)}")
+    def check(name: str) -> float:
+        if name not in values:
+            check_name(name, known_measures, f"measure '{name}' is unknown")
         return 1.0
 
     load_positions(expressions)
     for expression in expressions:
-        expression(check_name, lambda name, arguments: 1.0)
+        expression(check, lambda name, arguments: 1.0)
 
 
 def _parameter_ranges(
@@ -215,8 +213,7 @@ def _parameter_ranges(
         raise InputError("nothing varies, name parameters and their ranges")
     values = MachineVariants(machine).values
     for name, interval in vary.items():
-        if name not in values:
-            raise InputError(f"parameter '{name}' is unknown, {suggest_names(values, name)}")
+        check_name(name, values, f"parameter '{name}' is unknown")
         try:
             bounds = np.array(interval, dtype=float).ravel()
         except (TypeError, ValueError):
@@ -225,15 +222,6 @@ def _parameter_ranges(
             raise InputError(f"'{name}' has no range, give its lower and upper end")
     lower, upper = np.array([np.ravel(ends) for ends in vary.values()], dtype=float).T
     return tuple(vary), lower, upper
-
-
-def _collect_results(results: Iterable[tuple[int, Any]], report: Any) -> list[DesignSolution]:
-    """Return results in the order of their jobs; report how many are finished."""
-    solutions: dict[int, DesignSolution] = {}
-    for index, solution in results:
-        solutions[index] = solution
-        report(len(solutions))
-    return [solutions[i] for i in sorted(solutions)]
 
 
 def _pareto_front_jobs(
@@ -292,10 +280,3 @@ def _nondominated(solutions: Sequence[DesignSolution]) -> list[DesignSolution]:
         if not is_dominated:
             kept_indices.append(i)
     return [solutions[i] for i in kept_indices]
-
-
-def _restore_signs(x: DesignSolution, signs: Array) -> DesignSolution:
-    """Return a solution with the signs of the original objectives."""
-    return DesignSolution(
-        x.initial_values, x.values, signs * x.objectives, x.slacks, x.is_feasible, x.message
-    )

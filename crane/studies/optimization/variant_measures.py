@@ -1,6 +1,6 @@
 """Measures of a variant of a machine, and their derivatives by the parameters that vary."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from crane.common.errors import CraneError, InputError, suggest_names
+from crane.common.errors import CraneError, InputError, check_name
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.statics import StaticsEvaluator
@@ -98,32 +98,11 @@ class VariantEvaluation:
 
     def evaluate(self, expression: MeasureExpression) -> float:
         """Return the value of an expression."""
-        return float(expression(self._evaluate_name, self._evaluate_call))
+        return _evaluate(expression, lambda *call: constant(self._measure(*call), 0), 0).value
 
     def evaluate_dual(self, expression: MeasureExpression) -> DualNumber:
         """Return the value of an expression with its derivatives."""
-        count = len(self._parameter_names)
-
-        def dual_of_name(name: str) -> DualNumber:
-            return self._dual_measure(name, ())
-
-        def dual_of_call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
-            if name in DUAL_FUNCTIONS:
-                return DUAL_FUNCTIONS[name](*arguments)
-            plain_arguments = [x.value if isinstance(x, DualNumber) else x for x in arguments]
-            return self._dual_measure(name, tuple(plain_arguments))
-
-        result = expression(dual_of_name, dual_of_call, lambda x: constant(x, count))
-        return result if isinstance(result, DualNumber) else constant(float(result), count)
-
-    def _evaluate_name(self, name: str) -> float:
-        return self._measure(name, ())
-
-    def _evaluate_call(self, name: str, arguments: tuple[Any, ...]) -> float:
-        if name in DUAL_FUNCTIONS:
-            dual_arguments = [constant(x, 0) for x in arguments]
-            return DUAL_FUNCTIONS[name](*dual_arguments).value
-        return self._measure(name, arguments)
+        return _evaluate(expression, self._dual_measure, len(self._parameter_names))
 
     def _dual_measure(self, name: str, arguments: tuple[Any, ...]) -> DualNumber:
         if name == "load":
@@ -215,14 +194,13 @@ class VariantEvaluation:
         return self._parameter_value(name)
 
     def _parameter_value(self, name: str) -> float:
-        if name in self._parameter_names:
-            return float(self._values[self._parameter_names.index(name)])
-        if name in self._variants.values:
-            return float(self._variants.values[name])
-        raise InputError(
-            f"measure '{name}' is unknown, "
-            f"{suggest_names(available_measures(self.machine, self._options.user_measures), name)}"
+        values = self._variants.values | dict(
+            zip(self._parameter_names, self._values, strict=True)
         )
+        if name not in values:
+            known = available_measures(self.machine, self._options.user_measures)
+            check_name(name, known, f"measure '{name}' is unknown")
+        return float(values[name])
 
     @cached_property
     def _statics(self) -> StaticsEvaluator:
@@ -366,6 +344,24 @@ class VariantEvaluation:
         return np.asarray(sign * gradient[0] @ tip_derivatives)
 
 
+def _evaluate(
+    expression: MeasureExpression,
+    measure: Callable[[str, tuple[Any, ...]], DualNumber],
+    derivative_count: int,
+) -> DualNumber:
+    """Return an expression of measures, each a function of its name and arguments."""
+
+    def call(name: str, arguments: tuple[Any, ...]) -> DualNumber:
+        if name in DUAL_FUNCTIONS:
+            return DUAL_FUNCTIONS[name](*arguments)
+        return measure(name, tuple(getattr(x, "value", x) for x in arguments))
+
+    result: DualNumber = expression(
+        lambda name: measure(name, ()), call, lambda x: constant(x, derivative_count)
+    )
+    return result
+
+
 def available_measures(
     machine: Machine, user_measures: Mapping[str, MeasureFunction]
 ) -> dict[str, str]:
@@ -411,11 +407,7 @@ def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float
 
 def _check_call(name: str, arguments: tuple[Any, ...]) -> None:
     """Check that a function exists and takes these arguments."""
-    if name not in DUAL_FUNCTIONS and name not in _ARGUMENT_COUNTS:
-        raise InputError(
-            f"function '{name}' is unknown, "
-            f"{suggest_names([*_ARGUMENT_COUNTS, *DUAL_FUNCTIONS], name)}"
-        )
+    check_name(name, [*_ARGUMENT_COUNTS, *DUAL_FUNCTIONS], f"function '{name}' is unknown")
     text_arguments = [x for x in arguments if isinstance(x, str)]
     if text_arguments and name != "number":
         raise InputError(f"'{name}' takes numbers, not '{text_arguments[0]}'")
