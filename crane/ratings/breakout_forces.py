@@ -1,6 +1,7 @@
 """Break-out forces of bucket and arm (ISO 6015, SAE J1179)."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -342,83 +343,51 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
     Returns:
         (nq,) closed configuration; the start if no larger force is found.
     """
-    force = float(limits.max_magnitudes(strokes.statics.evaluate(q[None]))[0].min())
+    statics, active = strokes.statics, strokes.machine.closure.active
+    force = float(limits.max_magnitudes(statics.evaluate(q[None]))[0].min())
     if not 0 < force < np.inf:
         return q
-    problem = _ForceProblem(strokes, limits, q, moved, force)
-    constraints: Any = {
-        "type": "ineq", "fun": problem.constraint_values, "jac": problem.constraint_jacobian,
-    }  # fmt: skip
+    lower, lengths = strokes.low[moved], (strokes.high - strokes.low)[moved]
+
+    # the variables y are shares of the moved strokes, and the force over that of the start
+    @lru_cache(maxsize=1)
+    def evaluate(shares: tuple[float, ...]) -> tuple[Array, StaticQuantities, StaticQuantities]:
+        """Return the configuration (nq,), its statics, and their derivatives by coordinates."""
+        target = q[active].copy()
+        target[moved] = lower + np.clip(shares, 0, 1) * lengths
+        found = last_closed_configuration(strokes.machine, q, target)[0]
+        return found, statics.evaluate(found[None]), statics.coordinate_derivatives(found[None])
+
+    def coefficients(at_rest: StaticQuantities) -> list[tuple[Array, ...]]:
+        unit = limits.action.unit_vectors(at_rest, np.zeros(1))
+        return [limits.bound_coefficients(x, at_rest, unit) for x in limits.bounds]
+
+    def slacks(y: Any) -> Any:
+        """Return the slack of each bound over its scale."""
+        found = coefficients(evaluate(tuple(y[:-1]))[1])
+        return -np.array([a[0] + b[0] * force * y[-1] for a, b, *_ in found]) / scales
+
+    def jacobian(y: Any) -> Any:
+        """Return the derivatives of the slacks by y."""
+        _, at_rest, derivatives = evaluate(tuple(y[:-1]))
+        out = np.empty((len(limits.bounds), len(y)))
+        for k, i in enumerate(moved):
+            by_stroke = StaticQuantities(*(part[..., i] for part in derivatives))
+            for row, bound in zip(out, limits.bounds, strict=True):
+                a, b, *_ = limits.coefficient_derivatives(bound, at_rest, by_stroke)
+                row[k] = (a[0] + b[0] * force * y[-1]) * lengths[k]
+        out[:, -1] = [b[0] * force for _, b, *_ in coefficients(at_rest)]
+        return -out / scales[:, None]
+
+    at_start = coefficients(statics.evaluate(q[None]))
+    scales = np.array([abs(a[0]) + abs(b[0]) * force for a, b, *_ in at_start])
+    constraints: Any = {"type": "ineq", "fun": slacks, "jac": jacobian}
     bounds: Any = [*[(0.0, 1.0)] * len(moved), (0.0, None)]
     result = minimize(
-        problem.cost, problem.start, jac=True, bounds=bounds,
-        constraints=[constraints], method="SLSQP", options={"ftol": 1e-14, "maxiter": 200},
+        lambda y: (-float(y[-1]), -np.eye(len(y))[-1]),
+        np.r_[(q[active][moved] - lower) / lengths, 1.0],
+        jac=True, bounds=bounds, constraints=[constraints], method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 200},
     )  # fmt: skip
-    configuration, statics, _ = problem.evaluate(np.asarray(result.x))
-    return configuration if float(limits.max_magnitudes(statics)[0].min()) > force else q
-
-
-class _ForceProblem:
-    """Constraints of `maximize_force` in y: shares of the moved strokes, and the scaled force."""
-
-    def __init__(
-        self, strokes: Strokes, limits: LoadLimits, q: Array, moved: list[int], force: float
-    ):
-        self._strokes, self._limits, self._q, self._moved = strokes, limits, q, moved
-        self._force, self._lower = force, strokes.low[moved]
-        self._lengths = (strokes.high - strokes.low)[moved]
-        self.start = np.r_[
-            (q[strokes.machine.closure.active][moved] - self._lower) / self._lengths, 1.0
-        ]
-        self._cache: dict[bytes, tuple[Array, StaticQuantities, StaticQuantities]] = {}
-        self._scales = np.array(
-            [
-                abs(a[0]) + abs(b[0]) * force
-                for a, b, *_ in self._coefficients(strokes.statics.evaluate(q[None]))
-            ]
-        )
-
-    def evaluate(self, y: Array) -> tuple[Array, StaticQuantities, StaticQuantities]:
-        """Return the configuration (nq,), its statics, and their derivatives by coordinates."""
-        key = y[:-1].tobytes()
-        if key not in self._cache:
-            self._cache.clear()
-            machine, statics = self._strokes.machine, self._strokes.statics
-            target = self._q[machine.closure.active].copy()
-            target[self._moved] = self._lower + np.clip(y[:-1], 0, 1) * self._lengths
-            q = last_closed_configuration(machine, self._q, target)[0]
-            self._cache[key] = (
-                q,
-                statics.evaluate(q[None]),
-                statics.coordinate_derivatives(q[None]),
-            )
-        return self._cache[key]
-
-    def cost(self, y: Any) -> tuple[float, Any]:
-        """Return the negative force and its gradient."""
-        return -float(y[-1]), -np.eye(len(y))[-1]
-
-    def constraint_values(self, y: Any) -> Any:
-        """Return the slack of each bound over its scale."""
-        return -np.array(
-            [
-                a[0] + b[0] * self._force * y[-1]
-                for a, b, *_ in self._coefficients(self.evaluate(y)[1])
-            ]
-        ) / (self._scales)
-
-    def constraint_jacobian(self, y: Any) -> Any:
-        """Return the derivatives of `constraint_values` by y."""
-        _, statics, derivatives = self.evaluate(y)
-        jacobian = np.empty((len(self._limits.bounds), len(y)))
-        for k, i in enumerate(self._moved):
-            by_stroke = StaticQuantities(*(part[..., i] for part in derivatives))
-            for row, bound in zip(jacobian, self._limits.bounds, strict=True):
-                a, b, *_ = self._limits.coefficient_derivatives(bound, statics, by_stroke)
-                row[k] = (a[0] + b[0] * self._force * y[-1]) * self._lengths[k]
-        jacobian[:, -1] = [b[0] * self._force for _, b, *_ in self._coefficients(statics)]
-        return -jacobian / self._scales[:, None]
-
-    def _coefficients(self, statics: StaticQuantities) -> list[tuple[Array, ...]]:
-        unit = self._limits.action.unit_vectors(statics, np.zeros(1))
-        return [self._limits.bound_coefficients(x, statics, unit) for x in self._limits.bounds]
+    configuration, at_rest, _ = evaluate(tuple(result.x[:-1]))
+    return configuration if float(limits.max_magnitudes(at_rest)[0].min()) > force else q

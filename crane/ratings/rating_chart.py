@@ -23,7 +23,6 @@ from crane.ratings.limiting_factors import (
 )
 from crane.ratings.rating_derivatives import (
     SIMULTANEOUS_TOLERANCE,
-    RatedConfigurations,
     rating_derivatives,
 )
 from crane.ratings.rating_rules import slew_angles
@@ -94,8 +93,9 @@ class RatingChart(RatingConditions):
         """
         out = np.full((*self.values.shape, len(parameter_names)), np.nan)
         s, b, a = np.nonzero(np.isfinite(self.values) & (self.values > 0))
-        rated = RatedConfigurations(self.q_a[s, b, a], self.slews[s], self.values[s, b, a])
-        out[s, b, a] = rating_derivatives(self, rated, parameter_names)
+        out[s, b, a] = rating_derivatives(
+            self, self.q_a[s, b, a], self.slews[s], self.values[s, b, a], parameter_names
+        )
         return out
 
     def at_positions(self, radii: Sequence[float], heights: Sequence[float]) -> Self:

@@ -209,41 +209,36 @@ def _direction_action(
     """Return the unit action on the frame, and the joint for a tangent of a path."""
     machine, section = search.machine, search.section
     up = up_direction(machine)
-    if not isinstance(direction, str):
-        direction_vector = as_sample(direction, 3, "the direction", ("x", "y", "z"))
-        if not direction_vector.any():
+    if isinstance(direction, str):
+        if direction not in TOOL_DIRECTIONS:
+            raise InputError(
+                f"direction '{direction}' is unknown, "
+                f"{suggest_names(TOOL_DIRECTIONS, direction)}, or a vector"
+            )
+        if section.is_radial and direction not in ("up", "down", "tangent", "-tangent"):
+            raise InputError(
+                f"'{search.statics.frame}' stays in no plane through the slewing axis, "
+                f"'{direction}' is no direction there: give up, down, tangent or a vector"
+            )
+        if direction.endswith(("tangent", "normal")):
+            i = bucket_and_arm_strokes(search, joint)[0]
+            sign = -1.0 if direction.startswith("-") else 1.0
+            action = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
+            if direction.endswith("tangent"):
+                return action, machine.active[i]
+            return _normal_action(search, action, sign), None
+        outward = section.first_direction
+        pushed = {"up": up, "down": -up, "in": -outward, "out": outward}[direction]
+    else:
+        pushed = as_sample(direction, 3, "the direction", ("x", "y", "z"))
+        if not pushed.any():
             raise InputError("the direction is zero, give a vector of any length")
-        return _fixed_action(-direction_vector / np.linalg.norm(direction_vector), up, joint)
-    if direction not in TOOL_DIRECTIONS:
-        raise InputError(
-            f"direction '{direction}' is unknown, {suggest_names(TOOL_DIRECTIONS, direction)}, "
-            f"or a vector"
-        )
-    sign = -1.0 if direction in ("down", "in") or direction.startswith("-") else 1.0
-    if direction in ("up", "down"):
-        return _fixed_action(-sign * up, up, joint)
-    if section.is_radial and direction.removeprefix("-") != "tangent":
-        raise InputError(
-            f"'{search.statics.frame}' stays in no plane through the slewing axis, "
-            f"'{direction}' is no direction there: give up, down, tangent or a vector"
-        )
-    if direction in ("in", "out"):
-        return _fixed_action(-sign * section.first_direction, up, joint)
-    i = bucket_and_arm_strokes(search, joint)[0]
-    path_action = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
-    if direction.endswith("tangent"):
-        return path_action, machine.active[i]
-    return _normal_action(search, path_action, sign), None
-
-
-def _fixed_action(
-    direction: Array, up_direction: Array, joint: str | None
-) -> tuple[UnitAction, None]:
+        pushed = pushed / np.linalg.norm(pushed)
     if joint is not None:
         raise InputError(
             f"'{joint}' is named, but only tangent and normal are of a joint's path: leave it out"
         )
-    return FixedUnitAction(direction, up_direction), None
+    return FixedUnitAction(-pushed, up), None
 
 
 def _normal_action(
@@ -252,8 +247,9 @@ def _normal_action(
     """Return the reaction to a force away from the pivot, or with sign -1 towards it."""
     machine, frame, section = search.machine, search.statics.frame, search.section
     normal = np.cross(section.first_direction, section.second_direction)
-    statics = search.statics.evaluate(machine.home[None])
-    tip_tangent = statics.tip_jacobian[0, :, path_action.stroke]
+    tip_tangent = search.statics.evaluate(machine.home[None]).tip_jacobian[
+        0, :, path_action.stroke
+    ]
     angular_rate = frame_angular_jacobian(machine, frame, machine.home)[:, path_action.stroke]
     outward = np.cross(tip_tangent, angular_rate)  # r w^2, from the centre of rotation
     orientation = np.sign(np.cross(normal, tip_tangent) @ outward)

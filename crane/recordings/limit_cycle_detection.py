@@ -92,18 +92,16 @@ def limit_cycles(recording: Recording) -> list[LimitCycle]:
     ]
     prefixes = _COMMAND_PREFIXES[:1] if references else _COMMAND_PREFIXES
     references += [x for x in channels if x.startswith(prefixes)]
+    commands = [channels[x] for x in references]
     found = []
     for name in names:
         release_pages()
-        cycle = sustained_oscillation(
-            recording.time,
-            channels[name],
-            _MIN_PRESSURE_AMPLITUDE,
-            [channels[x] for x in references],
-            name,
+        found.append(
+            sustained_oscillation(
+                recording.time, channels[name], _MIN_PRESSURE_AMPLITUDE, commands, name
+            )
         )
-        found += [cycle] if cycle is not None else []
-    return sorted(found, key=lambda one: -one.amplitude)
+    return sorted((x for x in found if x is not None), key=lambda one: -one.amplitude)
 
 
 def limit_cycle_message(recording: Recording) -> str:

@@ -158,11 +158,6 @@ class MeasuredConfigurations:
         return slice(None, None, max(1, len(self.time) // _DERIVATIVE_SAMPLES))
 
     @cached_property
-    def link_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Positions of links on the links that carry them [m]."""
-        return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
-
-    @cached_property
     def pin_derivatives(self) -> dict[str, Array]:
         """Derivatives of some configurations by positions of pins, see `pin_derivatives`."""
         return pin_derivatives(self.machine, self.q[self.derivative_slice])

@@ -74,16 +74,10 @@ class RecordingSummary:
 
     def to_markdown(self) -> str:
         """Table with one row per joint, in degrees and millimetres, and remarks below it."""
-        head = (
-            "joint",
-            "range",
-            "peak speed",
-            "peak force",
-            "RMS force",
-            "peak error",
-            "RMS error",
-        )
-        rows = [head, ("---",) + ("---:",) * (len(head) - 1)]
+        rows: list[tuple[str, ...]] = [
+            ("joint", "range", "peak speed", "peak force", "RMS force", "peak error", "RMS error"),
+            ("---", *["---:"] * 6),
+        ]
         for joint in self.joints:
             unit, scale = DISPLAY_UNITS[joint.unit]
             force = FORCE_UNITS[joint.unit]
@@ -144,12 +138,8 @@ def _lift_time(time: Array, force: Array) -> float | None:
     """Time [s] at which a support with contact force (N,) lifts, None if it does not."""
     is_lifted = (force <= 0) & np.maximum.accumulate(force > 0)
     edges = np.flatnonzero(np.diff(is_lifted.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    lift_starts = [
-        first
-        for first, behind in edges.tolist()
-        if time[behind - 1] - time[first] > _MIN_LIFT_DURATION
-    ]
-    return float(time[lift_starts[0]]) if lift_starts else None
+    starts = (a for a, b in edges.tolist() if time[b - 1] - time[a] > _MIN_LIFT_DURATION)
+    return next((float(time[first]) for first in starts), None)
 
 
 def _stability_text(recording: Recording) -> str:
@@ -161,8 +151,7 @@ def _stability_text(recording: Recording) -> str:
         f"stability: at least {100 * shares[least]:.1f} % of the weight hold it down, at t = "
         f"{recording.time[least]:.4g} s (at rest {100 * static_shares.min():.1f} %)"
     )
-    tipping_text = tipping_message(recording)
-    return f"{text}; {tipping_text}" if tipping_text else text
+    return "; ".join(filter(None, (text, tipping_message(recording))))
 
 
 def result_title(machine: str, what: str = "") -> str:
