@@ -1,6 +1,6 @@
 """Arguments and options that several commands share, each declared once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -390,15 +390,6 @@ _OUT_FILE = typer.Option(metavar="FILE", parser=_as_path, help="The file to writ
 
 
 @dataclass(frozen=True, kw_only=True)
-class RequiredOutputFile(OptionBlock):
-    """The file that a command writes, without a default."""
-
-    panel = "Output options"
-    out: Annotated[Path, _OUT_FILE]
-    force: Force = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class OutputFile(OptionBlock):
     """The file that a command writes."""
 
@@ -415,3 +406,10 @@ class OutputFile(OptionBlock):
         file = self.out or default
         check_file_is_writable(file, self.force)
         return file
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequiredOutputFile(OutputFile):
+    """The file that a command writes, without a default."""
+
+    out: Annotated[Path, _OUT_FILE] = field()

@@ -29,11 +29,10 @@ class LoadTable(NamedTuple):
     Attributes:
         heights: (h,) heights, descending [m].
         radii: (r,) radii [m].
-        loads: (s, h, r) loads [kg]; NaN out of reach, infinite where there is no limit.
-        limited_by_drives: (s, h, r) whether a drive limits the load.
+        loads: (s, h, r + 1) loads at these radii and at the largest one [kg]; NaN out of reach,
+            infinite where there is no limit.
+        limited_by_drives: (s, h, r + 1) whether a drive limits the load.
         max_radii: (h,) largest radius, rounded down to a 25th of the chart's step [m].
-        max_radius_loads: (s, h) loads at the largest radius [kg].
-        max_radius_limited_by_drives: (s, h) whether a drive limits that load.
         can_tip: Whether tipping is among the limiting factors.
     """
 
@@ -42,8 +41,6 @@ class LoadTable(NamedTuple):
     loads: Array
     limited_by_drives: NDArray[np.bool_]
     max_radii: Array
-    max_radius_loads: Array
-    max_radius_limited_by_drives: NDArray[np.bool_]
     can_tip: bool
 
     def format_load(self, load: float, limited_by_drive: bool) -> str:
@@ -55,7 +52,8 @@ class LoadTable(NamedTuple):
             return ""
         if math.isinf(load):
             return "∞"
-        largest_load = max(self.loads[np.isfinite(self.loads)].max(initial=0.0), 1e-9)
+        finite_loads = self.loads[..., :-1][np.isfinite(self.loads[..., :-1])]
+        largest_load = max(finite_loads.max(initial=0.0), 1e-9)
         digits = max(_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest_load)), 0)
         rounded_down = math.floor(load * 10**digits * (1 + 1e-12)) / 10**digits
         return f"{rounded_down:.{digits}f}{'*' if limited_by_drive and self.can_tip else ''}"
@@ -65,18 +63,14 @@ class LoadTable(NamedTuple):
 
         The loads at the largest radius precede that radius.
         """
-        loads = np.concatenate([self.loads, self.max_radius_loads[:, :, None]], axis=2)
-        limited = np.concatenate(
-            [self.limited_by_drives, self.max_radius_limited_by_drives[:, :, None]], axis=2
-        )
         largest_radius = max(np.abs(self.max_radii).max(), 1e-9)  # small machines need more places
         decimals = max(2 - math.floor(math.log10(largest_radius)), 2)
         return [
             [
                 *(
-                    self.format_load(loads[k, i, j], limited[k, i, j])
-                    for j in range(loads.shape[2])
-                    for k in range(len(loads))
+                    self.format_load(self.loads[k, i, j], self.limited_by_drives[k, i, j])
+                    for j in range(self.loads.shape[2])
+                    for k in range(len(self.loads))
                 ),
                 f"{self.max_radii[i]:.{decimals}f}",
             ]
@@ -97,19 +91,14 @@ def load_table(chart: RatingChart) -> LoadTable:
     step = _round_step(chart.radii[a], chart.heights[b], columns)
     a = a[_select_indices(chart.radii[a], step, columns)]
     b = b[_select_indices(chart.heights[b], step, _MAX_ROWS)][::-1]
-    limited_by_drives = _is_drive_limited(chart)
     largest = [_at_largest_radius(chart, int(i), np.flatnonzero(is_reached[i])) for i in b]
-    max_radii, loads, limited = (list(column) for column in zip(*largest, strict=True))
-    return LoadTable(
-        chart.heights[b],
-        chart.radii[a],
-        chart.values[:, b][:, :, a],
-        limited_by_drives[:, b][:, :, a],
-        np.array(max_radii),
-        np.array(loads).T,
-        np.array(limited).T,
-        any(factor.reason == TIPPING for factor in chart.limiting_factors),
+    max_radii, *farthest = (np.array(column).T for column in zip(*largest, strict=True))
+    loads, is_limited = (
+        np.dstack([values[:, b][:, :, a], last])
+        for values, last in zip((chart.values, _is_drive_limited(chart)), farthest, strict=True)
     )
+    can_tip = any(factor.reason == TIPPING for factor in chart.limiting_factors)
+    return LoadTable(chart.heights[b], chart.radii[a], loads, is_limited, max_radii, can_tip)
 
 
 def _is_drive_limited(chart: RatingChart) -> NDArray[np.bool_]:

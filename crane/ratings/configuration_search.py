@@ -98,7 +98,20 @@ class ConfigurationSearch(Strokes):
                 f"{lock_hint}"
             )
         self.position_strokes, self.free_strokes = (moving[0], moving[1]), moving[2:]
-        self._patches = list(self._fill_patches())
+        home = machine.home[machine.closure.active]
+        count = _LEVELS_BY_COUNT[len(self.free_strokes)]
+        levels = [np.linspace(self.low[i], self.high[i], count) for i in self.free_strokes]
+        axes = tuple(
+            np.linspace(self.low[i], self.high[i], _PATCH_VALUES) for i in self.position_strokes
+        )
+        self._patches: list[WorkspacePatch] = []  # at levels of the free strokes
+        for values in itertools.product(*levels):
+            held_coordinates = home.copy()
+            held_coordinates[self.free_strokes] = values
+            patch = fill_patch(
+                machine, held_coordinates, self.position_strokes, (axes[0], axes[1])
+            )
+            self._patches += [] if patch is None else [patch]
         if not self._patches:
             raise InputError(f"no posture of '{machine.name}' closes on the way from home")
         self.configurations = np.concatenate(
@@ -107,25 +120,6 @@ class ConfigurationSearch(Strokes):
         self.section_positions = self.section.coordinates(
             statics.evaluate(self.configurations).tip_positions
         )
-
-    def _fill_patches(self) -> list[WorkspacePatch]:
-        """Return patches over the two strokes, at levels of the free strokes."""
-        home = self.machine.home[self.machine.closure.active]
-        count = _LEVELS_BY_COUNT[len(self.free_strokes)]
-        levels = [np.linspace(self.low[i], self.high[i], count) for i in self.free_strokes]
-        axes = tuple(
-            np.linspace(self.low[i], self.high[i], _PATCH_VALUES) for i in self.position_strokes
-        )
-        out = []
-        for values in itertools.product(*levels):
-            held_coordinates = home.copy()
-            held_coordinates[self.free_strokes] = values
-            patch = fill_patch(
-                self.machine, held_coordinates, self.position_strokes, (axes[0], axes[1])
-            )
-            if patch is not None:
-                out.append(patch)
-        return out
 
     def find_all(self, axes: tuple[Array, Array]) -> ConfigurationSet:
         """Find configurations at all positions of a grid, at levels of the free strokes.

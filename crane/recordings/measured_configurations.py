@@ -11,7 +11,6 @@ from functools import cached_property
 
 import numpy as np
 
-from crane.closure.closure import Closure
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION_PREFIX, VELOCITY_SUFFIX, VELOCITY_UNITS
@@ -201,9 +200,11 @@ def motion_from_joints(
     for start in range(0, len(time), _BLOCK_SAMPLES):
         block = slice(start, start + _BLOCK_SAMPLES)
         try:
-            q_a[block], v_a[block], distance = _active_joint_motion(
-                machine, closure, q_b[block], v_b[block]
-            )
+            q = closure.solve(q_b[block])
+            gamma = closure.gamma(q)[:, machine.closure.active]
+            q_a[block] = q[:, machine.closure.active]
+            v_a[block] = np.einsum("nij,nj->ni", gamma, v_b[block])
+            distance = np.abs(machine.closure.solve(q_a[block]) - q).max(axis=1)
         except ClosureError as error:
             raise RecordingError(f"{_renumber_samples(start, error)}; {hint}") from None
         if (distance > _CONFIGURATION_TOLERANCE).any():
@@ -226,27 +227,6 @@ def motion_from_joints(
         if (recorded := recorded_velocity(machine, joint, table)) is not None:
             v[:] = recorded
     return q_a, v_a
-
-
-def _active_joint_motion(
-    machine: Machine, closure: Closure, q_b: Array, v_b: Array
-) -> tuple[Array, Array, Array]:
-    """q_A, v_A = gamma_A v_B, and distances (N,) to the configurations that q_A gives.
-
-    Args:
-        machine: The machine with the active joints q_A.
-        closure: Closure of the machine with the active joints q_B.
-        q_b: (N, n).
-        v_b: (N, n).
-
-    Raises:
-        ClosureError: No configuration has these coordinates.
-    """
-    q = closure.solve(q_b)
-    gamma = closure.gamma(q)[:, machine.closure.active]
-    q_a = q[:, machine.closure.active]
-    distance = np.abs(machine.closure.solve(q_a) - q).max(axis=1)
-    return q_a, np.einsum("nij,nj->ni", gamma, v_b), distance
 
 
 def _renumber_samples(start: int, error: ClosureError) -> str:
@@ -351,6 +331,7 @@ def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) 
     count, joints = len(table.values), [joint for joint, _ in unknown_angles]
     indices = [driven.active.index(joint) for joint in joints]
     names = [name for _, name in unknown_angles]
+    rates = [name + VELOCITY_SUFFIX for name in names]
     q_b = np.tile(driven.home[driven.closure.active], (count, 1))
     for i, joint in enumerate(driven.active):
         if joint not in joints:
@@ -360,22 +341,16 @@ def _solve_angles(driven: Machine, table: Table, unknown_angles: UnknownAngles) 
         q = driven.closure.solve(q_b)
         computed = ideal_readings(driven, q, np.zeros_like(q), names)
         residual = measured - np.column_stack([computed[name] for name in names])
-        step = np.linalg.solve(
-            _inclination_jacobian(driven, q, names, indices), residual[:, :, None]
-        )[:, :, 0]
+        gamma = driven.closure.gamma(q)
+        by_joint = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
+        jacobian = np.stack(
+            [np.column_stack([x[rate] for rate in rates]) for x in by_joint], axis=2
+        )
+        step = np.linalg.solve(jacobian, residual[:, :, None])[:, :, 0]
         q_b[:, indices] += step
         if np.abs(step).max() < _STEP_TOLERANCE:
             return q_b[:, indices]
     raise ClosureError(f"no configuration has the inclinations of {', '.join(names)}")
-
-
-def _inclination_jacobian(
-    driven: Machine, q: Array, names: list[str], indices: list[int]
-) -> Array:
-    """Derivatives (N, k, k) of inclinations by some of the active coordinates."""
-    gamma, rates = driven.closure.gamma(q), [name + VELOCITY_SUFFIX for name in names]
-    columns = [ideal_readings(driven, q, gamma[:, :, i], rates) for i in indices]
-    return np.stack([np.column_stack([x[rate] for rate in rates]) for x in columns], axis=2)
 
 
 class MissingMeasurements:

@@ -200,13 +200,16 @@ def summarize(recording: Recording) -> RecordingSummary:
             )
         )
     distance = tip_error(recording)
+    gaps = ("", energy_imbalance(recording)), ("of the oil ", oil_energy_imbalance(recording))
     return RecordingSummary(
         duration=float(time[-1] - time[0]),
         joints=tuple(joints),
         tip_peak_error=None if distance is None else _peak(distance),
         tip_rms_error=None if distance is None else rms(time, distance),
         stability_text=_stability_text(recording),
-        balance_text=_balance_text(recording),
+        balance_text=", ".join(
+            f"{what}off by at most {_peak(gap):.2g} J" for what, gap in gaps if gap is not None
+        ),
         ringing=limit_cycle_message(recording),
         stopped=recording.stopped,
         start=recording.start,
@@ -246,16 +249,6 @@ def _energy_difference(
         ],
         len(recording.time),
     )[:, 0]
-
-
-def _balance_text(recording: Recording) -> str:
-    balances = (
-        ("", energy_imbalance(recording)),
-        ("of the oil ", oil_energy_imbalance(recording)),
-    )
-    return ", ".join(
-        f"{what}off by at most {_peak(gap):.2g} J" for what, gap in balances if gap is not None
-    )
 
 
 def point_channel(recording: Recording, name: str) -> Array | None:

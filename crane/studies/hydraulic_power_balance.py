@@ -55,7 +55,14 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
         machine, ValveSignals(machine, [0.0], {}, np.zeros(1) if is_measured else None)
     )
     circuit, hydraulics = drive.circuit, drive.circuit.hydraulics
-    _check_joints(machine, recording)
+    missing = [joint for joint in machine.active if joint not in recording.joints]
+    if missing:
+        raise RecordingError(
+            f"{', '.join(map(repr, missing))} of '{machine.name}' not recorded, "
+            f"{suggest_names(recording.joints)}"
+        )
+    for joint in machine.active:
+        check_unit(joint, recording.units[joint], [machine.unit(joint)])
     m = len(circuit.joints)
     lower_limits = drive.settings[len(circuit.constants) :][:m]
     columns = _CircuitColumns(recording, circuit)
@@ -120,17 +127,6 @@ def _engine_power(engine: Engine, speed: Array) -> Array:
         (engine.speed + engine.speed_droop - speed) / engine.speed_droop, 0.0, 1.0
     )
     return np.asarray(engine.torque * torque_share * speed)
-
-
-def _check_joints(machine: Machine, recording: Recording) -> None:
-    missing = [joint for joint in machine.active if joint not in recording.joints]
-    if missing:
-        listed = ", ".join(f"'{joint}'" for joint in missing)
-        raise RecordingError(
-            f"{listed} of '{machine.name}' not recorded, {suggest_names(recording.joints)}"
-        )
-    for joint in machine.active:
-        check_unit(joint, recording.units[joint], [machine.unit(joint)])
 
 
 def _joint_friction(

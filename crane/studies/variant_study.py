@@ -184,7 +184,13 @@ def study(
         raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
     measures = tuple(dict.fromkeys((*(measures or ()), *selected_measures)))
     available |= {x: PLAIN_MEASURES.get(x, "") for x in expressions}
-    column_measures = _column_measures(measures, task_measure_units, tasks)
+    column_measures = {
+        column: x
+        for x in measures
+        for column in (
+            x, *(f"{x} {task}" for task in tasks if len(tasks) > 1 and x in task_measure_units)
+        )
+    }  # fmt: skip
     columns = dict(zip(vary, values.T, strict=True)) | {
         column: np.array([row.get(column, np.nan) for row, _ in rows])
         for column in column_measures
@@ -194,18 +200,6 @@ def study(
         name, tuple(vary), measures, tasks,
         units, columns, reasons, grid_shape, resolution_notes(base_machine, measures),
     )  # fmt: skip
-
-
-def _column_measures(
-    measures: Sequence[str], task_measures: Mapping[str, str], tasks: Sequence[str]
-) -> dict[str, str]:
-    """Return the measure of each column; with several tasks there is a column for each task."""
-    task_columns = tasks if len(tasks) > 1 else ()
-    return {
-        column: x
-        for x in measures
-        for column in (x, *(f"{x} {task}" for task in task_columns if x in task_measures))
-    }
 
 
 def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:

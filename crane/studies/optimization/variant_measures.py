@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -91,10 +91,9 @@ class VariantEvaluation:
         self._values = values
         self._ranges, self._options, self._load_positions = ranges, options, list(load_positions)
         self.machine = variants.machine(dict(zip(parameter_names, values.tolist(), strict=True)))
-        self._measure_cache: dict[tuple[Any, ...], float] = {}
         self._loads: dict[tuple[bool, tuple[float, ...]], DualNumber] = {}
-        self._neighbours: dict[tuple[int, float], VariantEvaluation] = {}
-        self._extremes: dict[tuple[Any, ...], tuple[float, Array]] = {}
+        self._measure, self._extreme = cache(self._compute_measure), cache(self._find_extreme)
+        self._perturbed = cache(self._create_neighbour)
 
     def evaluate(self, expression: MeasureExpression) -> float:
         """Return the value of an expression."""
@@ -144,26 +143,13 @@ class VariantEvaluation:
             out[i] = (upper_value - lower_value) / ((upper_sign - lower_sign) * step)
         return out
 
-    def _perturbed(self, parameter_index: int, step: float) -> "VariantEvaluation":
-        key = parameter_index, step
-        if key not in self._neighbours:
-            values = self._values.copy()
-            values[parameter_index] += step
-            self._neighbours[key] = VariantEvaluation(
-                self._variants,
-                self._parameter_names,
-                values,
-                self._ranges,
-                self._options,
-                self._load_positions,
-            )
-        return self._neighbours[key]
-
-    def _measure(self, name: str, arguments: tuple[Any, ...]) -> float:
-        key = name, *arguments
-        if key not in self._measure_cache:
-            self._measure_cache[key] = float(self._compute_measure(name, arguments))
-        return self._measure_cache[key]
+    def _create_neighbour(self, parameter_index: int, step: float) -> "VariantEvaluation":
+        values = self._values.copy()
+        values[parameter_index] += step
+        return VariantEvaluation(
+            self._variants, self._parameter_names, values, self._ranges, self._options,
+            self._load_positions,
+        )  # fmt: skip
 
     def _compute_measure(self, name: str, arguments: tuple[Any, ...]) -> float:
         machine = self.machine
@@ -268,13 +254,6 @@ class VariantEvaluation:
                     load_derivatives = self._differences("load", position)
             self._loads[with_derivatives, position] = DualNumber(float(loads[s]), load_derivatives)
 
-    def _extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Return the extreme reach, height or distance of the tip, and its configuration."""
-        key = name, *arguments
-        if key not in self._extremes:
-            self._extremes[key] = self._find_extreme(name, arguments)
-        return self._extremes[key]
-
     def _extreme_objective(
         self, name: str, arguments: tuple[Any, ...], tip: Array
     ) -> tuple[Array, Array]:
@@ -293,7 +272,10 @@ class VariantEvaluation:
         return -length, -horizontal / np.maximum(length, 1e-300)[:, None]
 
     def _find_extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
-        """Search from the best configurations over all strokes, with exact derivatives."""
+        """Return the extreme reach, height or distance of the tip, and its configuration.
+
+        It is searched from the best configurations over all strokes, with exact derivatives.
+        """
         search, closure = self._configuration_search, self.machine.closure
         strokes = search.moving
         columns = closure.active[strokes]
