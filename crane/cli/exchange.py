@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import crane
 from crane.cli.command import command
 from crane.cli.options import (
     MachineName,
@@ -14,7 +15,11 @@ from crane.cli.options import (
     RequiredOutputFile,
     TimeOptions,
 )
-from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
+from crane.common.atomic_output import (
+    check_file_is_writable,
+    check_folder_is_writable,
+    replace_file,
+)
 from crane.common.errors import CraneError, CraneWarning, InputError, check_name
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
@@ -42,22 +47,18 @@ def convert(
     ] = None,
 ) -> None:
     """Convert a machine to URDF, MJCF or a machine file."""
-    from crane.common.atomic_output import replace_file
-    from crane.formats.machine_file.machine_writer import write_machine
-    from crane.formats.mjcf.mjcf_writer import write_mjcf
-    from crane.formats.urdf.urdf_writer import robot_description, write_urdf_plus
-
     kind = _output_format(out, to)
     check = check_folder_is_writable if kind == "machine" else check_file_is_writable
     check(out, output.force)
     loaded, written = options.load(machine), out
     if kind == "machine":
-        written = write_machine(loaded, out, overwrite=output.force)
+        written = crane.write_machine(loaded, out, overwrite=output.force)
     elif kind == "urdf":
         with replace_file(out) as temporary_file:
-            temporary_file.write_text(robot_description(loaded), encoding="utf-8")
+            temporary_file.write_text(crane.formats.robot_description(loaded), encoding="utf-8")
     else:
-        (write_urdf_plus if kind == "urdf+" else write_mjcf)(loaded, out)
+        write = crane.formats.write_urdf_plus if kind == "urdf+" else crane.formats.write_mjcf
+        write(loaded, out)
     print(f"written to {written}")
 
 
@@ -95,7 +96,6 @@ def import_log(
     output: RequiredOutputFile,
 ) -> None:
     """Convert a log of another program to a recording."""
-    from crane.formats.machine_loading import load_from_expression
     from crane.recordings import timeseries
     from crane.recordings.logs import read_log_columns
     from crane.recordings.recording_reader import read_sensor_readings, select_time_span
@@ -105,7 +105,7 @@ def import_log(
     check_file_is_writable(output.out, output.force)
     machine, name = None, read_log_columns(columns)[0].get("machine", "")
     try:
-        machine = load_from_expression(name) if name else None
+        machine = crane.formats.load_from_expression(name) if name else None
     except CraneError as error:
         warnings.warn(
             f"{columns}: names of columns are not checked, its machine cannot be read: {error}",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import crane
 from crane.cli.command import OptionBlock, command, refuse_options
 from crane.cli.options import (
     ComparedColumns,
@@ -38,12 +39,10 @@ from crane.cli.parsing import (
 )
 from crane.cli.terminal import progress_bar, status
 from crane.common.errors import CraneWarning, InputError, RecordingError, check_name
+from crane.common.result import Result
 
 if TYPE_CHECKING:
-    from crane.common.result import Result
     from crane.identification.signals.signal_processing import Motion
-    from crane.machine.machine import Machine
-    from crane.recordings.recording import Recording
 
 _MIN_HELD_OUT_SAMPLES = 50
 _CIRCUIT_MODELS = ("orifices", "valve", "friction")
@@ -129,8 +128,6 @@ def excite(
     calibrate fits.
     """
     from crane.description.machine_lookup import command_line_arguments
-    from crane.identification.excitation.periodic_excitation import excite as design_motion
-    from crane.identification.excitation.signal_excitation import excite_valves
 
     if fit is None:
         signals.refuse("only goes with --fit, name parameters to fit or leave it out")
@@ -147,10 +144,10 @@ def excite(
     result: Result
     with progress_bar("optimising") as progress:
         if fits is None:
-            result = design_motion(loaded, **motion.arguments(), **common, progress=progress)
+            result = crane.excite(loaded, **motion.arguments(), **common, progress=progress)
             note = f"see it with: crane view {output.out}/reference.csv"
         else:
-            result = excite_valves(
+            result = crane.identification.excite_valves(
                 loaded, fits, **signals.arguments(), **common, progress=progress
             )
             same = command_line_arguments(
@@ -226,12 +223,7 @@ def identify(
     The recordings have coordinates and forces. Held-out data validate the estimate.
     """
     from crane.common.samples import as_number
-    from crane.identification.mechanics.cross_validation import (
-        cross_validate,
-        format_trials,
-        identify_options,
-    )
-    from crane.identification.mechanics.identify import identify as estimate
+    from crane.identification.mechanics.cross_validation import format_trials, identify_options
     from crane.identification.mechanics.write_identified import check_rewritable
 
     window, terms, priors = parse_window(train), parse_terms(model.term), parse_priors(model.prior)
@@ -242,7 +234,7 @@ def identify(
     if model.feasible:
         check_rewritable(loaded)
     inside, outside = _split(_read(recording, loaded, reading), window)
-    judges: list[Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
+    judges: list[crane.Recording | Motion] = [*_usable_motions(loaded, outside, trust)]
     if train is not None and not outside:
         warnings.warn(
             f"nothing of use lies outside of --train {train}, so nothing judges",
@@ -260,11 +252,13 @@ def identify(
     }  # fmt: skip
     if trials:
         with progress_bar("cross-validating") as progress:
-            tried_settings = cross_validate(loaded, inside, trials, progress, **settings)
+            tried_settings = crane.identification.cross_validate(
+                loaded, inside, trials, progress, **settings
+            )
         print(f"{format_trials(tried_settings)}\n")
         settings = identify_options(tried_settings[0], settings)
     with progress_bar("identifying") as progress:
-        result = estimate(loaded, inside, judges or None, progress=progress, **settings)
+        result = crane.identify(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:
         names["validation"] = ""
     output.write(result, f"; see {output.out}/report.html", **names)
@@ -273,7 +267,6 @@ def identify(
 def _recording_names(
     recordings: Sequence[Path], validation: Sequence[Path] | None, train: str | None, rest: bool
 ) -> dict[str, str]:
-    """Names of training and held-out data, for the report; `rest`: that outside of --train."""
     trained, held_out = (
         ", ".join(x.name for x in paths or ()) for paths in (recordings, validation)
     )
@@ -285,10 +278,10 @@ def _recording_names(
 
 def _read(
     paths: Sequence[Path],
-    machine: "Machine",
+    machine: "crane.Machine",
     reading: RecordingOptions,
     needs: Sequence[Sequence[str]] = (),
-) -> "list[Recording]":
+) -> "list[crane.Recording]":
     recordings = []
     for path in paths:
         with status(f"reading {path.name}"):
@@ -297,8 +290,8 @@ def _read(
 
 
 def _split(
-    recordings: "list[Recording]", window: tuple[float, float]
-) -> "tuple[list[Recording], list[Recording]]":
+    recordings: "list[crane.Recording]", window: tuple[float, float]
+) -> "tuple[list[crane.Recording], list[crane.Recording]]":
     """The parts of recordings inside a window [s], and those outside with enough samples."""
     return [recording.between(*window) for recording in recordings], [
         recording.at(part)
@@ -309,7 +302,7 @@ def _split(
 
 
 def _usable_motions(
-    machine: "Machine", recordings: "list[Recording]", trust: bool
+    machine: "crane.Machine", recordings: "list[crane.Recording]", trust: bool
 ) -> "Iterator[Motion]":
     """Motions of recordings; with a warning about each that cannot be used."""
     from crane.identification.mechanics.smoothed_motion import smoothed_motion
@@ -337,12 +330,12 @@ def payload(
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of the payload."""
-    from crane.identification.mechanics.identify_payload import identify_payload
-
     loaded = options.load(machine)
     (carried,) = _read([recording], loaded, reading)
     with progress_bar("estimating") as progress:
-        estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
+        estimate = crane.identification.identify_payload(
+            loaded, carried, frame, method, trust=trust, progress=progress
+        )
     print(estimate.to_text(), end="")
 
 
@@ -382,10 +375,7 @@ def circuit(
 
     The recordings have valve signals and pressures. Bulk modulus is estimated with the orifices.
     """
-    from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.cylinder_signals import required_channels
-    from crane.identification.hydraulics.orifice_coefficients import identify_orifices
-    from crane.identification.hydraulics.valve_curve import identify_valve
 
     check_name(model, _CIRCUIT_MODELS, f"model '{model}' is unknown")
     if model != "orifices":
@@ -406,11 +396,13 @@ def circuit(
     options_of_write: dict[str, Any] = {"unit": loaded.unit(joint)}
     with status("identifying"):
         if model == "valve":
-            result = identify_valve(loaded, runs[0], joint)
+            result = crane.identification.identify_valve(loaded, runs[0], joint)
         elif model == "friction":
-            result = identify_cylinder_friction(loaded, runs[0], joint)
+            result = crane.identification.identify_cylinder_friction(loaded, runs[0], joint)
         else:
-            result = identify_orifices(loaded, runs, joint, method or "weak", period=period)
+            result = crane.identification.identify_orifices(
+                loaded, runs, joint, method or "weak", period=period
+            )
             options_of_write["validation"] = [result.predict(x, period) for x in held_out]
     output.write(result, **options_of_write)
 
@@ -428,7 +420,6 @@ def calibrate(
     sensors: ComparedColumns = None,
 ) -> None:
     """Fit parameters through simulations of valve signals."""
-    from crane.identification.calibration.calibrate import calibrate as run
     from crane.recordings.run_folder import recording_file
 
     fits, window = parse_fits(fit), parse_window(train)
@@ -437,7 +428,7 @@ def calibrate(
         [recording_file(x) for x in given or ()] for given in (recording, validation)
     )
     with progress_bar("simulating") as progress:
-        result = run(
+        result = crane.calibrate(
             loaded, paths, fits, train=window, validation=held_out,
             columns=reading.columns, span=reading.span, sensors=parse_names(sensors),
             progress=progress,

@@ -1,22 +1,20 @@
 """Arguments and options that several commands share, each declared once."""
 
+import os
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+import crane
 from crane.cli.command import OptionBlock
 from crane.cli.parsing import parse_arguments, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
 from crane.common.errors import InputError, OutputError
-
-if TYPE_CHECKING:
-    from crane.common.result import Result
-    from crane.machine.machine import Machine
-    from crane.recordings.recording import Recording
+from crane.common.result import Result
 
 # Arguments and options of several commands that are not part of a block.
 MachineName = Annotated[
@@ -173,11 +171,9 @@ class ParameterOptions(ChangeOptions):
         ),
     ] = None
 
-    def load(self, name: str) -> "Machine":
+    def load(self, name: str) -> "crane.Machine":
         """Load a machine by its name or path."""
-        from crane.formats.machine_loading import load
-
-        return load(
+        return crane.load(
             name, self.changed_values(), parse_values("--lock", self.lock), **self.assembly()
         )
 
@@ -284,7 +280,9 @@ class RecordingOptions(TimeOptions):
         ),
     ] = None
 
-    def read(self, path: Path, machine: "Machine | None" = None, needs: Any = ()) -> "Recording":
+    def read(
+        self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
+    ) -> "crane.Recording":
         """Read a recording, see `crane.recordings.run_folder.read_run`."""
         from crane.recordings.run_folder import read_run
 
@@ -306,8 +304,6 @@ class ParallelOptions(OptionBlock):
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `crane.study` and `crane.design` by name."""
-        import os
-
         return {
             "processes": (os.cpu_count() or 1) if self.processes is None else self.processes,
             "scheduler": self.scheduler,
@@ -344,7 +340,7 @@ class OptionalOutputFolder(OptionBlock):
         if self.out is not None:
             check_folder_is_writable(self.out, self.force)
 
-    def write(self, result: "Result", note: str = "", **options: Any) -> None:
+    def write(self, result: Result, note: str = "", **options: Any) -> None:
         """Print the summary of a result, and write it if there is a folder.
 
         Args:

@@ -6,12 +6,12 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import crane
 from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
     from crane.description.estimation_settings import ParameterPrior, TermValues
-    from crane.description.external_forces import Wrench
 
 CONFIGURATION_FORM = "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
 _VALUE_FORM = "JOINT=VALUE, as in X1=0.5"
@@ -292,15 +292,13 @@ def _finite_numbers(text: str, words: list[str], form: str) -> list[float]:
     return numbers
 
 
-def parse_load(text: str) -> "Wrench":
+def parse_load(text: str) -> "crane.Wrench":
     """External force from FRAME=FX,FY,FZ, FRAME=FX,FY,FZ,MX,MY,MZ or FRAME=FILE.
 
     Raises:
         InputError: The text has another form.
         RecordingError: A file cannot be read.
     """
-    from crane.description.external_forces import Wrench
-
     head, equals, wrench = text.partition("=")
     frame, _, axes = head.partition("@")
     what = f"--load {text!r}"
@@ -309,12 +307,12 @@ def parse_load(text: str) -> "Wrench":
     axes = axes or "world"
     if Path(wrench).suffix.lower() in (".csv", ".npz"):
         times, force, moment = _read_wrenches(Path(wrench))
-        return Wrench(frame, force, moment, times, axes)
+        return crane.Wrench(frame, force, moment, times, axes)
     message = f"{what}: give 3 or 6 numbers with commas, or a CSV file"
     numbers = parse_numbers(wrench.split(","), message)
     if len(numbers) not in (3, 6):
         raise InputError(message)
-    return Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)
+    return crane.Wrench(frame, numbers[:3], numbers[3:] or (0.0, 0.0, 0.0), axes=axes)
 
 
 def _read_wrenches(path: Path) -> "tuple[Array, Array, Array]":

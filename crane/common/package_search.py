@@ -200,7 +200,6 @@ def _search_package(name: str, folder: Path, packages: Sequence[str]) -> Path | 
 
 
 def _is_package(folder: Path, name: str) -> bool:
-    """Whether a folder is the package with a name."""
     name_in_manifest = _package_name(folder)
     return name_in_manifest == name or (
         folder.name == name and folder.is_dir() and not name_in_manifest
@@ -235,7 +234,6 @@ def _subfolders(folder: str) -> list[str]:
 
 
 def _package_name(folder: Path) -> str:
-    """The name in a folder's package.xml or model.config, empty without one."""
     for manifest in _MANIFESTS:
         file = folder / manifest
         try:

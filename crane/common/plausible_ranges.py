@@ -219,7 +219,6 @@ def _suggestion_text(value: float, plausible: PlausibleRange) -> str:
 
 
 def _format_in_si(value: float, size: float) -> str:
-    """A value in another unit, written in the SI unit."""
     power = math.log10(size)
     shown = f"{value:g}"
     if abs(power - round(power)) < 1e-9 and "e" not in shown and float(shown) == value:

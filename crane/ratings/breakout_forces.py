@@ -138,7 +138,6 @@ class Breakout(Result):
         return f"| {' | '.join(map(str, cells))} |"
 
     def _centre_text(self, force: BreakoutForce) -> str:
-        """Return the pin about which the frame turns, or the position of the centre."""
         if np.isinf(force.radius):
             return f"nothing: {force.joint} shifts it"
         if force.turn.offset <= _PIVOT_TOLERANCE * self.machine.closure.characteristic_length:

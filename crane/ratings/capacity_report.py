@@ -108,7 +108,6 @@ def _is_drive_limited(chart: RatingChart) -> NDArray[np.bool_]:
 
 
 def _round_step(radii: Array, heights: Array, columns: int) -> float:
-    """Return the smallest round step with no more than so many columns and rows."""
     min_step = max(np.ptp(radii) / columns, np.ptp(heights) / _MAX_ROWS)
     if not min_step:
         return 0.0
@@ -319,7 +318,6 @@ def table_note(chart: RatingChart, table: LoadTable) -> str:
 
 
 def _markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table with aligned columns."""
     width = [max(map(len, column)) for column in zip(heading, *rows, strict=True)]
     separator = ["-" * (w - 1) + ":" for w in width]
     cells = [

@@ -384,7 +384,6 @@ class ConfigurationSearch(Strokes):
         return q, statics_values, is_valid & is_within_limits
 
     def _unique_indices(self, configurations: ConfigurationSet) -> NDArray[np.intp]:
-        """Return the indices of distinct configurations at each position."""
         q_a = configurations.q[:, self.machine.closure.active] / (_DUPLICATE_TOLERANCE * self.span)
         keys = np.column_stack([configurations.position_index, np.round(q_a[:, self.moving])])
         return np.asarray(np.sort(np.unique(keys, axis=0, return_index=True)[1]))

@@ -94,7 +94,6 @@ def drive_force_limits(
 
 
 def _max_pressure(circuit: Hydraulics, cylinder: Cylinder, side: str, is_raising: bool) -> float:
-    """Return the largest pressure of chamber "a" or "b" under load [Pa]."""
     supply, tank = circuit.pumps[circuit.valves[cylinder.joint].supply], circuit.supply.tank
     supply_pressures = [supply.pressure, *([supply.relief] if supply.relief else [])]
     valve_pressures = [cylinder.relief] if cylinder.relief else []

@@ -189,7 +189,6 @@ class DimensionFinder:
         return best
 
     def _select_starts(self, score: Array) -> list[Array]:
-        """Return the configurations with the best scores that are not close to each other."""
         columns = self._machine.closure.active[self._strokes]
         out: list[Array] = []
         for k in np.argsort(-score, kind="stable"):
@@ -220,7 +219,6 @@ class DimensionFinder:
     def _maximize_fixed(
         self, objective: Objective, values: Array, fixed: Mapping[int, float]
     ) -> Optimum:
-        """Maximize an objective with some coordinates of the lip fixed."""
         if not fixed:
             return self._maximize(objective, values)
         axes, targets = list(fixed), list(fixed.values())

@@ -168,7 +168,6 @@ def _peak_to_peak(values: Array, first: int, last: int, period: float) -> Array:
 
 
 def _reversal_count(command: Array) -> int:
-    """Number of reversals of a command."""
     steps = np.diff(command)
     steps = steps[np.abs(steps) > 1e-9 * max(float(np.ptp(command)), 1e-300)]
     return int(np.count_nonzero(np.signbit(steps[1:]) != np.signbit(steps[:-1])))

@@ -123,7 +123,6 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _declared_types(archive: zipfile.ZipFile) -> dict[str, _Header]:
-    """Headers of the arrays, by name."""
     entries = archive.infolist()
     if len(entries) > MAX_COLUMNS:
         raise RecordingError(f"holds {len(entries)} arrays, give at most {MAX_COLUMNS}")

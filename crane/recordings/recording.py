@@ -184,7 +184,6 @@ class Recording(Result):
         )
 
     def _column_names(self) -> list[str]:
-        """Names of all columns in the order of a file."""
         joints = [x + suffix for suffix in ("", VELOCITY_SUFFIX) for x in self.joints]
         return [TIME, *joints, *(x + FORCE_SUFFIX for x in self._driven_joints), *self.channels]
 

@@ -108,13 +108,6 @@ def read_sensor_readings(
 
 
 def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
-    """Check that no column misspells the name of a quantity of the machine.
-
-    Other columns are channels and may have any name.
-
-    Raises:
-        RecordingError: A column does.
-    """
     names = quantity_names(machine.tree)
     nodes = [] if machine.hydraulics is None else machine.hydraulics.node_names
     # similar to the names of cylinder pressures
@@ -146,7 +139,6 @@ def _likeness(one: str, two: str) -> float:
 def _read_machine_log(
     path: Path, machine: Machine, sensors: Mapping[str, Sensor], arrays: Mapping[str, np.ndarray]
 ) -> Table:
-    """Table of a log whose columns the sensors of a machine define."""
     lines, missing_sensors = [], []
     for quantity, sensor in sensors.items():
         unit = sensor.unit or quantity_unit(machine.tree, quantity) or ""
@@ -187,7 +179,6 @@ def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sen
 
 
 def _sensor_notes(table: Table) -> dict[str, float]:
-    """Sensor parameters in the notes."""
     parameters = {}
     for name, text in table.notes.items():
         if not name.startswith(SENSOR_PREFIX):
@@ -205,7 +196,6 @@ def _sensor_notes(table: Table) -> dict[str, float]:
 
 
 def _warn_conflicting_notes(table: Table, machine: Machine) -> None:
-    """Warn of sensor parameters that differ between machine and recording."""
     machine_parameters = sensor_parameters(machine.sensors)
     messages = [
         f"{name} ({value:g}, not {machine_parameters[name]:g})"

@@ -68,7 +68,6 @@ def warn_discrepancies(machine: Machine, table: Table) -> None:
 
 
 def _redundant_columns(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str]:
-    """Redundant columns, in units of the machine, that the determining joints give as well."""
     names = [x for x, unit in table.units.items() if unit == quantity_unit(machine.tree, x)]
     determined = {*machine.joints, *(x + VELOCITY_SUFFIX for x in machine.joints)}
     return [
@@ -178,7 +177,6 @@ class _RedundantSensor:
         )
 
     def _determining_joints(self) -> list[str]:
-        """Determining joints that the reading depends on."""
         configurations = self._configurations
         q = configurations.q[configurations.derivative_slice]
         gamma = np.moveaxis(configurations.machine.closure.gamma(q), 2, 0)

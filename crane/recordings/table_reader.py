@@ -219,7 +219,6 @@ def _convert_to_si(table: Table) -> Table:
 
 
 def _detect_encoding(path: Path) -> str:
-    """Text encoding of a log."""
     with path.open("rb") as file:
         if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
             return "utf-16"
@@ -270,7 +269,6 @@ def _read_header(path: Path, encoding: str = _UTF8_ENCODING) -> tuple[dict[str, 
 
 
 def _parse_note(text: str) -> tuple[str, str]:
-    """Key and value of a line '# key: value'."""
     key, _, value = text.removeprefix("#").partition(":")
     return key.strip(), value.strip()
 
@@ -373,7 +371,6 @@ def _read_log_values(
 def _raise_invalid_cell(
     rows: Iterator[str], header: int, separator: str, names: Sequence[str]
 ) -> None:
-    """Raise an error about the first cell of a log that is not a number."""
     for line, text in enumerate(rows, start=header + 1):
         cells = text.rstrip("\n").split(separator) if text.strip() else []
         for name, cell in zip(names, cells, strict=False):
@@ -392,7 +389,6 @@ def _parse_number(cell: str) -> float | None:
 
 
 def _raise_first_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
-    """Raise an error about the first invalid line."""
     names, last = list(units), -np.inf
     with path.open(encoding=_UTF8_ENCODING) as file:
         for line, text in enumerate(file, start=1):

@@ -122,7 +122,6 @@ def power_balance(machine: Machine, recording: Recording) -> PowerBalance:
 
 
 def _engine_power(engine: Engine, speed: Array) -> Array:
-    """Return the power (N,) of the governed engine at speeds (N,) [rad/s]."""
     torque_share = np.clip(
         (engine.speed + engine.speed_droop - speed) / engine.speed_droop, 0.0, 1.0
     )

@@ -181,7 +181,6 @@ def _coupled_strokes(machine: Machine) -> NDArray[np.bool_]:
 
 
 def _values_per_stroke(is_coupled: NDArray[np.bool_]) -> int:
-    """Return the number of values of each stroke in the grid."""
     return max(3, int(_COUPLED_GRID_SIZE ** (1 / max(1, int(is_coupled.sum()))) + 1e-9))
 
 
@@ -200,7 +199,6 @@ def _stroke_ranges(machine: Machine, home_values: Array) -> tuple[Array, Array]:
 def _neighbouring_cells(
     cell: tuple[int, ...], grid_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, ...]]:
-    """Yield the neighbours of a cell along the axes of a grid."""
     for i, step in itertools.product(range(len(grid_shape)), (-1, 1)):
         if 0 <= cell[i] + step < grid_shape[i]:
             yield (*cell[:i], cell[i] + step, *cell[i + 1 :])
@@ -270,7 +268,6 @@ def _stroke_end(
     stroke_index: int,
     sign: float,
 ) -> float:
-    """Return the upper (sign 1) or lower (-1) end of a stroke from closed configurations."""
     column = machine.closure.active[stroke_index]
     limit = float(limits[int(sign > 0)][stroke_index])
     values = sign * configurations[:, column]
@@ -298,7 +295,6 @@ def _largest_reach(
     is_coupled: NDArray[np.bool_],
     limits: tuple[Array, Array],
 ) -> float:
-    """Return the largest horizontal distance of the tip over all strokes."""
     kinematics, up = Kinematics(machine), up_direction(machine)
     active = machine.closure.active
 
@@ -343,7 +339,6 @@ def _largest_reach(
 
 
 def _relative_strokes(q_a: Array, limits: tuple[Array, Array]) -> Array:
-    """Return active coordinates (N, n) as shares of their ranges."""
     return (q_a - limits[0]) / np.where(limits[1] > limits[0], limits[1] - limits[0], 1.0)
 
 

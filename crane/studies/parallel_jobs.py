@@ -74,7 +74,6 @@ def compute_on_cluster(
 
 
 def _job_result(future: Any, index: int, scheduler: str) -> Any:
-    """Return the result of a finished job, or raise the reason of its failure."""
     from distributed import KilledWorker
 
     if future.status == "finished":
@@ -126,7 +125,6 @@ def machine_from_files(machine: Machine | str | Path) -> tuple[Machine, str]:
 
 
 def _tasks_without_loads(machine: Machine) -> dict[str, tuple[object, int]]:
-    """Return the tasks without their loads, and the number of these loads."""
     return {
         name: (replace(task, loads=()), len(task.loads)) for name, task in machine.tasks.items()
     }
@@ -173,7 +171,6 @@ def compute_jobs(
 
 
 def _exit_with_parent() -> None:
-    """End this process when its parent ends, for whatever reason."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

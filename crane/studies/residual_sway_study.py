@@ -156,7 +156,6 @@ def sway_study(
 
 
 def _residual_sway(machine: Machine, control: ValveFeedforward, duration: float) -> float:
-    """Return the largest sway after a motion [rad]."""
     start = control.planned_trajectory.position(0.0)
     end_time = _STEP * np.ceil((duration + _OBSERVATION_TIME) / _STEP)
     run = simulate(

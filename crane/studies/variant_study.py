@@ -4,6 +4,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,10 +71,7 @@ class StudyJob(NamedTuple):
         with_strokes: Whether the strokes are measured.
         expressions: Expressions of measures, see `crane.studies.optimization`.
         requirements: Requirements.
-        user_measures: Python file of user measures, or functions by name.
-        frame: Link at which loads hang.
-        rule: Rating rule of loads.
-        expression_tasks: Tasks of expressions.
+        options: Options of the expressions.
     """
 
     machine: str
@@ -83,10 +81,7 @@ class StudyJob(NamedTuple):
     with_strokes: bool
     expressions: tuple[str, ...] = ()
     requirements: tuple[str, ...] = ()
-    user_measures: str | Mapping[str, MeasureFunction] | None = None
-    frame: str | None = None
-    rule: str | Rule = "none"
-    expression_tasks: tuple[str, ...] = ()
+    options: MeasureOptions = MeasureOptions()
 
 
 def study(
@@ -156,7 +151,7 @@ def study(
     units = _parameter_units(
         base_machine, vary, has_lever_tasks or bool(expressions) or bool(require)
     )
-    expression_tasks = tasks
+    options = MeasureOptions(frame, find_rule(rule), tasks, transferable_measures(user_measures))
     if not set(selected_measures) & set(task_measure_units):
         tasks = ()
     jobs = [
@@ -168,10 +163,7 @@ def study(
             not set(selected_measures) <= set(task_measure_units),
             expressions,
             tuple(require),
-            transferable_measures(user_measures),
-            frame,
-            find_rule(rule),
-            expression_tasks,
+            options,
         )
         for row in values
     ]
@@ -264,10 +256,8 @@ def _evaluate_expressions(machine: Machine, study_job: StudyJob) -> dict[str, fl
         *map(MeasureExpression, study_job.expressions),
         *(parse_requirement(x)[0] for x in study_job.requirements),
     ]
-    options = MeasureOptions(
-        study_job.frame, study_job.rule, study_job.expression_tasks,
-        load_user_measures(study_job.user_measures),
-    )  # fmt: skip
+    functions = load_user_measures(study_job.options.user_measures)
+    options = replace(study_job.options, user_measures=functions)
     evaluation = VariantEvaluation(
         MachineVariants(machine), (), np.zeros(0), np.zeros(0), options,
         load_positions(expressions),

@@ -51,13 +51,14 @@ class MeasureOptions:
         frame: Link at which loads hang; the tip if None.
         rule: Rating rule of `load` and `net_torque`.
         tasks: Tasks of peak_JOINT and similar measures.
-        user_measures: Functions of the user by name.
+        user_measures: Functions of the user by name, or until they are loaded the Python file that
+            defines them.
     """
 
     frame: str | None = None
     rule: str | Rule = "none"
     tasks: tuple[str, ...] = ()
-    user_measures: Mapping[str, MeasureFunction] = field(default_factory=dict)
+    user_measures: Any = field(default_factory=dict)
 
 
 class VariantEvaluation:
@@ -388,7 +389,6 @@ def load_positions(expressions: Sequence[MeasureExpression]) -> list[tuple[float
 
 
 def _check_call(name: str, arguments: tuple[Any, ...]) -> None:
-    """Check that a function exists and takes these arguments."""
     check_name(name, [*_ARGUMENT_COUNTS, *DUAL_FUNCTIONS], f"function '{name}' is unknown")
     text_arguments = [x for x in arguments if isinstance(x, str)]
     if text_arguments and name != "number":
