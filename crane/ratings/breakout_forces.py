@@ -382,8 +382,12 @@ def maximize_force(strokes: Strokes, limits: LoadLimits, q: Array, moved: list[i
     scales = np.array([abs(a[0]) + abs(b[0]) * force for a, b, *_ in at_start])
     constraints: Any = {"type": "ineq", "fun": slacks, "jac": jacobian}
     bounds: Any = [*[(0.0, 1.0)] * len(moved), (0.0, None)]
+
+    def cost(y: Any) -> tuple[float, Any]:
+        return -float(y[-1]), -np.eye(len(y))[-1]
+
     result = minimize(
-        lambda y: (-float(y[-1]), -np.eye(len(y))[-1]),
+        cost,
         np.r_[(q[active][moved] - lower) / lengths, 1.0],
         jac=True, bounds=bounds, constraints=[constraints], method="SLSQP",
         options={"ftol": 1e-14, "maxiter": 200},

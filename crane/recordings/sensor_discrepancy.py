@@ -131,7 +131,7 @@ class _RedundantSensor:
             random_walk = (
                 noise_std(reading) * float(time[-1] - time[0]) / float(np.sqrt(len(time)))
             )
-            reading = cumulative_trapezoid(reading, time, initial=0.0)
+            reading = cumulative_trapezoid(reading, time, initial=0)
         self.measured = reading[configurations.sample_slice]
         self.expected = configurations.expected_reading(self.quantity)
         self.off = self.measured - self.expected
@@ -327,7 +327,7 @@ class _RedundantSensor:
             sampled_derivative = configurations.directional_derivative(self.name, q, dq)
             if np.abs(sampled_derivative).max() < _ZERO_DERIVATIVE:
                 continue
-                link, _, axis = name.rpartition(".")
+            link, _, axis = name.rpartition(".")
             derivative = np.interp(self.time, time, sampled_derivative)
             (move, zero), residual_rms = self._fit_discrepancy([derivative, self._zero_column])
             (move_alone,), residual_without_zero = self._fit_discrepancy([derivative])

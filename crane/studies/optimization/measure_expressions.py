@@ -174,8 +174,10 @@ class MeasureExpression:
 
         def evaluate(node: ast.AST) -> Any:
             match node:
-                case ast.Constant(value=value):
-                    return value if isinstance(value, str) else constant(float(value))
+                case ast.Constant(value=str(word)):
+                    return word
+                case ast.Constant(value=int(number) | float(number)):
+                    return constant(float(number))
                 case ast.UnaryOp(op=op, operand=operand):
                     value = evaluate(operand)
                     return -value if isinstance(op, ast.USub) else value
