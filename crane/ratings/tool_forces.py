@@ -224,9 +224,9 @@ def _direction_action(
             i = bucket_and_arm_strokes(search, joint)[0]
             sign = -1.0 if direction.startswith("-") else 1.0
             action = PathUnitAction(i, sign * tangent_action(search, i).sign, up)
-            if direction.endswith("tangent"):
-                return action, machine.active[i]
-            return _normal_action(search, action, sign), None
+            is_tangent = direction.endswith("tangent")
+            normal = None if is_tangent else _normal_action(search, action, sign)
+            return normal or action, machine.active[i] if is_tangent else None
         outward = section.first_direction
         pushed = {"up": up, "down": -up, "in": -outward, "out": outward}[direction]
     else:

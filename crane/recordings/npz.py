@@ -63,12 +63,13 @@ def read_columns(path: Path) -> tuple[list[str], Array, str]:
     with _open_archive(path) as archive:
         types = _declared_types(archive)
         count = max((shape[0] for shape, *_ in types.values() if len(shape) == 1), default=0)
-        for name, (shape, _, dtype) in types.items():
-            if shape != (count,) or dtype.kind not in NUMERIC_KINDS:
-                raise RecordingError(
-                    f"'{name}' has the shape {shape} of {str(dtype)[:40]}, give ({count},) "
-                    "numbers per column"
-                )
+        others = [
+            f"'{name}' has the shape {shape} of {str(dtype)[:40]}"
+            for name, (shape, _, dtype) in types.items()
+            if shape != (count,) or dtype.kind not in NUMERIC_KINDS
+        ]
+        if others:
+            raise RecordingError(f"{others[0]}, give ({count},) numbers per column")
         if not count:
             raise RecordingError("holds no samples, give an array per column")
         if count * len(types) > MAX_NUMBERS:
@@ -98,15 +99,12 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         if (count := sum(math.prod(shape) for shape, *_ in numeric.values())) > MAX_NUMBERS:
             raise RecordingError(f"declares {count} numbers, give at most {MAX_NUMBERS}")
         _check_sizes(archive, numeric)
-        found: dict[str, np.ndarray] = {}
-        for entry, (name, (shape, is_fortran, dtype)) in zip(
-            archive.infolist(), types.items(), strict=True
-        ):
-            found[name] = np.empty(0, dtype)
-            if name in numeric:
-                values = scratch_arrays.empty_array(math.prod(shape), 1)[:, 0]
-                _read_array(archive, entry, values)
-                found[name] = values.reshape(shape, order="F" if is_fortran else "C")
+        found: dict[str, np.ndarray] = {name: np.empty(0, x[2]) for name, x in types.items()}
+        entries = dict(zip(types, archive.infolist(), strict=True))
+        for name, (shape, is_fortran, _) in numeric.items():
+            values = scratch_arrays.empty_array(math.prod(shape), 1)[:, 0]
+            _read_array(archive, entries[name], values)
+            found[name] = values.reshape(shape, order="F" if is_fortran else "C")
         return found
 
 
@@ -150,16 +148,19 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, values: Array)
     """Fill an array (N,) with the numbers of an entry."""
     name = _entry_name(entry)
     with archive.open(entry) as file:
-        dtype = _read_header(name, file)[2]
-        for start in range(0, len(values), _BLOCK_NUMBERS):
-            part = values[start : start + _BLOCK_NUMBERS]
-            data = file.read(len(part) * dtype.itemsize)
-            if len(data) != len(part) * dtype.itemsize:
-                raise RecordingError(f"'{name}' is cut short, save the file again")
-            with np.errstate(over="ignore", invalid="ignore"):  # reported when values are checked
-                part[:] = np.frombuffer(data, dtype)
-        if file.read(1):
-            raise RecordingError(f"'{name}' holds more than it declares, save the file again")
+        _read_column(name, file, _read_header(name, file)[2], values)
+
+
+def _read_column(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> None:
+    for start in range(0, len(column), _BLOCK_NUMBERS):
+        part = column[start : start + _BLOCK_NUMBERS]
+        data = file.read(len(part) * dtype.itemsize)
+        if len(data) != len(part) * dtype.itemsize:
+            raise RecordingError(f"'{name}' is cut short, save the file again")
+        with np.errstate(over="ignore", invalid="ignore"):  # reported when values are checked
+            part[:] = np.frombuffer(data, dtype)
+    if file.read(1):
+        raise RecordingError(f"'{name}' holds more than it declares, save the file again")
 
 
 def _entry_name(entry: zipfile.ZipInfo) -> str:
