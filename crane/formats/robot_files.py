@@ -58,8 +58,10 @@ def expand_xacro(xml: XmlFile) -> XmlFile:
     if "wrong" in answer:
         raise _expansion_error(xml.file, answer)
     _check_arguments(xml.file, answer["arguments"])
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
-    root = etree.fromstring(answer["text"].encode("utf-8"), parser)
+    root = etree.fromstring(
+        answer["text"].encode("utf-8"),
+        etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True),
+    )
     names = [Path(name).name for name in answer["files"]]
     locations = SourceLocations(xml.file.name)
     for element in root.iter(etree.Element):
@@ -79,13 +81,21 @@ def _run_xacro_process(file: Path) -> dict[str, Any]:
     }  # fmt: skip
     program = [sys.executable, "-P", xacro_process.__file__]  # without its folder in sys.path
     try:
-        completed = subprocess.run(
-            program, input=json.dumps(request).encode(), capture_output=True, timeout=_TIMEOUT
+        return dict(
+            json.loads(
+                subprocess.run(
+                    program,
+                    input=json.dumps(request).encode(),
+                    capture_output=True,
+                    timeout=_TIMEOUT,
+                ).stdout
+            )
         )
-        return dict(json.loads(completed.stdout))
     except (subprocess.TimeoutExpired, ValueError):  # killed before it could answer
-        reason = f"expanding it takes more than {xacro_process.MAX_SECONDS} s"
-        return {"wrong": reason, "file": str(file)}
+        return {
+            "wrong": f"expanding it takes more than {xacro_process.MAX_SECONDS} s",
+            "file": str(file),
+        }
 
 
 def _expansion_error(file: Path, answer: dict[str, Any]) -> CraneError:

@@ -88,8 +88,11 @@ def solve_coupling(coupling: Coupling) -> tuple[list[str], list[float], float]:
         Names of all joints, slopes of the joints after the first, offset.
     """
     joints, factors = list(coupling.factors), list(coupling.factors.values())
-    slopes = [-factor / factors[0] + 0.0 for factor in factors[1:]]
-    return joints, slopes, coupling.offset / factors[0] + 0.0
+    return (
+        joints,
+        ([-factor / factors[0] + 0.0 for factor in factors[1:]]),
+        coupling.offset / factors[0] + 0.0,
+    )
 
 
 def format_document(
@@ -102,8 +105,11 @@ def format_document(
         parent = element.getparent()
         parent.insert(parent.index(element) + 1, comment_element)
         comment_element.tail, element.tail = element.tail, "  "
-    header = f'<?xml version="1.0"?>\n<!-- {_comment_text(comment)} -->\n'
-    return header.encode() + etree.tostring(robot, encoding="utf-8") + b"\n"
+    return (
+        f'<?xml version="1.0"?>\n<!-- {_comment_text(comment)} -->\n'.encode()
+        + etree.tostring(robot, encoding="utf-8")
+        + b"\n"
+    )
 
 
 def _comment_text(comment: str) -> str:
@@ -119,8 +125,7 @@ def origin_text(machine: Machine) -> str:
 def compound_drive_factors(machine: Machine) -> dict[str, dict[str, float]]:
     """Return the factors of all drives if one of them acts along several joints, else nothing."""
     drives = {drive.name: dict(drive.factors) for drive in machine.drives}
-    is_plain = all(factors == {name: 1.0} for name, factors in drives.items())
-    return {} if is_plain else drives
+    return {} if all(factors == {name: 1.0} for name, factors in drives.items()) else drives
 
 
 def rotor_inertias(machine: Machine) -> dict[str, float]:

@@ -196,8 +196,10 @@ class XmlFile:
             is_correctable = bool(similar) and element.get(similar[0]) is None
             if element.tag in closed_elements or is_correctable:
                 hint = suggest_names(known_attributes, key.lower())
-                problem = f'unknown {key}="..." in <{element.tag}>, {hint}'
-                report_error(self.error_at(element, problem), harmless=is_correctable)
+                report_error(
+                    self.error_at(element, f'unknown {key}="..." in <{element.tag}>, {hint}'),
+                    harmless=is_correctable,
+                )
             if is_correctable:
                 element.set(similar[0], element.attrib.pop(key))
 
@@ -210,8 +212,10 @@ class XmlFile:
         if similar:
             hint = suggest_names(tags, child.tag.lower())
             is_correctable = similar[0] in _REPEATABLE_ELEMENTS or element.find(similar[0]) is None
-            problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
-            report_error(self.error_at(child, problem), harmless=is_correctable)
+            report_error(
+                self.error_at(child, f"unknown <{child.tag}> in <{element.tag}>, {hint}"),
+                harmless=is_correctable,
+            )
             if is_correctable:
                 child.tag = similar[0]
         elif any(child.tag in x for x in children.values() if tags):
