@@ -131,7 +131,7 @@ class MotionOptions(OptionBlock):
 
     def control(self, machine: "Machine", step: float) -> "tuple[Control | None, float | None]":
         """Controller and duration [s] of the motion, as `task_control` and `task_duration`."""
-        from crane.motion.path_reader import read_path
+        from crane.motion.task_trajectories import read_path
 
         if self.path is None:
             control = task_control(machine, self.task, self.controller, self.sway)

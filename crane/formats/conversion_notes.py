@@ -1,7 +1,7 @@
 """Warnings about parts of a machine that a conversion between formats leaves out or changes."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from crane.common.errors import CraneWarning
@@ -55,25 +55,18 @@ class ConversionNotes:
         return f" ({', '.join(listed)})" if listed else ""
 
 
-def warn_about_unsupported(
-    machine: Machine, format_name: str, names: Sequence[str] | Iterator[str]
-) -> None:
-    """Warn of parts of a machine that a written format cannot represent."""
-    if listed := ", ".join(names):
-        warnings.warn(
-            f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
-            "file has)",
-            CraneWarning,
-            stacklevel=3,
-        )
+def warn_about_unsupported(machine: Machine, format_name: str, others: Sequence[str]) -> None:
+    """Warn of parts of a machine that a written format cannot represent.
 
+    Those are the sections that only a machine file represents, and friction laws: other formats
+    have Coulomb and viscous friction alone.
 
-def unsupported_sections(machine: Machine) -> list[str]:
-    """Sections of a machine that only a machine file represents, and its friction laws.
-
-    Other formats have Coulomb and viscous friction alone.
+    Args:
+        machine: The machine.
+        format_name: Name of the format.
+        others: Further parts.
     """
-    unsupported = [
+    names = [
         f"the friction law of {joint}"
         for joint, law in machine.friction.items()
         if law.coulomb_offset or law.viscous_offset or law.stiction or (
@@ -87,4 +80,11 @@ def unsupported_sections(machine: Machine) -> list[str]:
         "gains": machine.control,
         "hydraulics": machine.hydraulics,
     }
-    return unsupported + [name for name, section in sections.items() if section]
+    names += [name for name, section in sections.items() if section]
+    if listed := ", ".join([*names, *others]):
+        warnings.warn(
+            f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
+            "file has)",
+            CraneWarning,
+            stacklevel=3,
+        )

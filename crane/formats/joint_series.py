@@ -40,18 +40,11 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
     normal = np.asarray(axis, dtype=np.float64)
     first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
     first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-
     return (
         ("x", "prismatic", to_vector(first)),
-        ("y", "prismatic", to_vector(second)),
+        ("y", "prismatic", to_vector(np.cross(normal, first))),
         ("rz", "revolute", to_vector(normal)),
     )
-
-
-def series_joint_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
-    """Return the names of the joints of a composite joint."""
-    return [f"{name}_{suffix}" for suffix, _, _ in freedoms]
 
 
 def joint_series(
@@ -75,13 +68,11 @@ def joint_series(
     found: list[Link | Joint] = [
         Link(link, source_location, composite_joint=name) for link in links[1:-1]
     ]
-    zero = (0.0, 0.0, 0.0)
     for i, (suffix, kind, axis) in enumerate(freedoms):
-        xyz, rpy = (zero, zero) if i else placement
-        parent, child = links[i : i + 2]
+        xyz, rpy = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) if i else placement
         found.append(
             Joint(
-                f"{name}_{suffix}", kind, parent, child, source_location, xyz, rpy, axis,
+                f"{name}_{suffix}", kind, links[i], links[i + 1], source_location, xyz, rpy, axis,
                 floating_joint=floating_joint,
             )
         )  # fmt: skip

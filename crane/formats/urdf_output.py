@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lxml import etree
@@ -44,25 +44,22 @@ def copy_shapes(
         chains: Names of the chains to copy from, all if not given.
         uris: Whether to name meshes by URIs, as ROS requires, instead of paths.
     """
-    links = {link.get("name"): link for link in robot.iterfind("link")}
+    targets = {link.get("name"): link for link in robot.iterfind("link")}
     materials: dict[str, etree._Element] = {}
     with open_robots(machine, chains) as sources:
-        for xml in sources:
-            for material in xml.root.iterfind("material"):
-                materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-            _copy_link_shapes(xml.root, links, xml.file.parent, uris)
+        shapes = [
+            (xml.file.parent, link.get("name", "").strip(), shape)
+            for xml in sources
+            for link in xml.root.iterfind("link")
+            for shape in (*link.iterfind("visual"), *link.iterfind("collision"))
+        ]
+        for material in (x for xml in sources for x in xml.root.iterfind("material")):
+            materials.setdefault(material.get("name", ""), copy.deepcopy(material))
+        for folder, name, shape in shapes:
+            if name in targets:
+                targets[name].append(_with_mesh_paths(shape, folder, uris))
     for material in reversed(materials.values()):
         robot.insert(0, material)
-
-
-def _copy_link_shapes(
-    source: etree._Element, links: Mapping[str, etree._Element], folder: Path, uris: bool
-) -> None:
-    for link in source.iterfind("link"):
-        target = links.get(link.get("name", "").strip())
-        if target is not None:
-            for shape in (*link.iterfind("visual"), *link.iterfind("collision")):
-                target.append(_with_mesh_paths(shape, folder, uris))
 
 
 def _with_mesh_paths(shape: etree._Element, folder: Path, uris: bool) -> etree._Element:

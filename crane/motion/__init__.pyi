@@ -1,15 +1,15 @@
 from .attitude import via_attitudes as via_attitudes
 from .kinematics import Kinematics as Kinematics
-from .path_reader import read_path as read_path
 from .sway import Sway as Sway
-from .sway_suppression import retime as retime
 from .sway_suppression import suppress_sway as suppress_sway
+from .task_trajectories import read_path as read_path
 from .task_trajectories import task_trajectory as task_trajectory
 from .task_trajectories import tip_trajectory as tip_trajectory
 from .trajectory import AttitudeTrajectory as AttitudeTrajectory
 from .trajectory import Trajectory as Trajectory
 from .trajectory import point_to_point as point_to_point
 from .trajectory import polynomial as polynomial
+from .trajectory import retime as retime
 from .trajectory import via_points as via_points
 from .transmission import Transmission as Transmission
 from .workspaces.workspace_mapping import workspace as workspace

@@ -39,7 +39,12 @@ class Sway(OneLineRepr):
         self.machine = machine
         self._driven = machine.is_driven
         self._dynamics = Dynamics(machine)
-        self._difference_steps = _DIFFERENCE_STEP * machine.closure.units[machine.closure.active]
+        units = machine.closure.units[machine.closure.active]
+        self._difference_steps = _DIFFERENCE_STEP * units
+        laws = (machine.friction.get(joint) for joint in machine.free)
+        self._viscous = np.array([0.0 if law is None else law.viscous for law in laws])
+        span = machine.upper - machine.lower
+        self._stroke_lengths = np.where(np.isfinite(span), span, units)
 
     def hanging_equilibrium(self, q_a: ArrayLike) -> Array:
         """Configurations with the free joints in static equilibrium.
@@ -103,10 +108,8 @@ class Sway(OneLineRepr):
             viscous friction, phi^T C phi / (2 omega phi^T M_ff phi).
         """
         omega, shapes, _ = self._modal_analysis(np.asarray(q_a, dtype=np.float64))
-        damping_ratios: Array = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes) / (
-            2.0 * omega
-        )
-        return omega, damping_ratios
+        modal_damping = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes)
+        return omega, np.asarray(modal_damping / (2.0 * omega))
 
     def frequency_matrix(self, q_a: Array) -> Array:
         """Matrix Omega (f, f) [rad/s] with Omega^2 = M_ff^-1 G, at an equilibrium (n,)."""
@@ -152,13 +155,10 @@ class Sway(OneLineRepr):
         coupled_mass = mass[:, :, d] + mass[:, :, f] @ hanging_derivatives
         # relative to the inertia of the free joints
         free_mass_diagonal = np.einsum("ijj->ij", mass[:, :, f])[:, :, None]
-        equations, right_sides = (
-            [coupled_mass / free_mass_diagonal],
-            [-mass[:, :, f] / free_mass_diagonal],
-        )
+        equations = [coupled_mass / free_mass_diagonal]
+        right_sides = [-mass[:, :, f] / free_mass_diagonal]
         if len(d) > len(f):
-            height_jacobian = self._suspension_kinematics.jacobian(q_a)[:, 2:3, d]
-            equations.append(height_jacobian)
+            equations.append(self._suspension_kinematics.jacobian(q_a)[:, 2:3, d])
             right_sides.append(np.zeros((len(q_a), 1, len(f))))
         stroke_lengths = self._stroke_lengths[d]
         matrix = np.concatenate(equations, axis=1) * stroke_lengths
@@ -175,19 +175,6 @@ class Sway(OneLineRepr):
         """Forces (N, f) of the free joints for a motion, without dry friction."""
         free = ~self._driven
         return self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
-
-    @cached_property
-    def _viscous(self) -> Array:
-        """Viscous friction coefficients (f,) of the free joints."""
-        laws = (self.machine.friction.get(joint) for joint in self.machine.free)
-        return np.array([0.0 if law is None else law.viscous for law in laws])
-
-    @cached_property
-    def _stroke_lengths(self) -> Array:
-        """Lengths (n,) of the strokes."""
-        span = self.machine.upper - self.machine.lower
-        units = self.machine.closure.units[self.machine.closure.active]
-        return np.where(np.isfinite(span), span, units)
 
     @cached_property
     def _suspension_kinematics(self) -> Kinematics:

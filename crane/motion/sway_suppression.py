@@ -1,78 +1,26 @@
 """Trajectories without residual sway: input shaping and flatness-based motions."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import ClosureError, InputError, LimitError, suggest_names
-from crane.common.samples import Array, as_number
+from crane.common.samples import Array
 from crane.machine.machine import Machine
 from crane.motion.limit_violations import limit_violation_message
 from crane.motion.quintic_splines import quintic_polynomials
 from crane.motion.sway import MAX_ITERATIONS, Sway
 from crane.motion.task_trajectories import add_free_joints
-from crane.motion.trajectory import Trajectory
+from crane.motion.trajectory import Trajectory, retime
 
+SWAY_METHODS = ("none", "zv", "zvd", "flat")
 _KNOTS_PER_SECOND = 100
 _CONVERGENCE_TOLERANCE = 1e-9  # [rad], [m] of the last correction of a flatness-based motion
 _STAGNATION_TOLERANCE = 1e-4  # likewise if it stagnates: the error of the splines
 _SMOOTHING_SHARE = 0.1  # of the duration, over which the motion of the load is smoothed
 _SPLINES_PER_SECOND = 12.0  # of the sway along a flatness-based motion
 _GAUSS_POINTS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
-
-
-class _RetimedTrajectory(Trajectory):
-    """Trajectory with the same path and another duration."""
-
-    def __init__(self, reference: Trajectory, duration: float):
-        self.duration = duration
-        self._reference, self._time_scale = reference, reference.duration / duration
-
-    def position(self, time: ArrayLike) -> Array:
-        """See `Trajectory`."""
-        return self._reference.position(np.asarray(time) * self._time_scale)
-
-    def _derivative(self, order: int, time: ArrayLike) -> Array:
-        time_scale = self._time_scale
-        return time_scale**order * self._reference._derivative(
-            order, np.asarray(time) * time_scale
-        )
-
-    def bounds(self) -> tuple[Array, Array]:
-        """See `Trajectory`."""
-        return self._reference.bounds()
-
-    def extremum_times(self) -> Array:
-        """See `Trajectory`."""
-        return self._reference.extremum_times() / self._time_scale
-
-    def breaks(self) -> Array:
-        """See `Trajectory`."""
-        return self._reference.breaks() / self._time_scale
-
-
-def retime(reference: Trajectory, duration: float) -> Trajectory:
-    """Trajectory with the same path and another duration: q(t T / duration).
-
-    Args:
-        reference: Trajectory of duration T [s].
-        duration: [s].
-
-    Raises:
-        InputError: The duration is not positive.
-    """
-    return _RetimedTrajectory(reference, as_number(duration, "the duration", "s", greater_than=0))
-
-
-def _sample_motion(
-    machine: Machine, duration: float, motion: Callable[[Array], Array]
-) -> Trajectory:
-    """Quintic trajectory through samples of a motion (N,) -> (N, n) from rest to rest."""
-    count = max(12, int(np.ceil(duration * _KNOTS_PER_SECOND)) + 1)
-    time = np.linspace(0.0, duration, count)
-    return _interpolating_trajectory(time, motion(time))
 
 
 def _spline_derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
@@ -83,28 +31,6 @@ def _spline_derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
     ends: Any = [(1, zero_values), (2, zero_values)]  # the stubs of scipy do not accept this
     spline = make_interp_spline(time, q_a, k=5, bc_type=(ends, ends))
     return spline(time, 1), spline(time, 2)
-
-
-def _interpolating_trajectory(time: Array, q_a: Array) -> Trajectory:
-    return Trajectory(quintic_polynomials(time, q_a, *_spline_derivatives(time, q_a)))
-
-
-def _with_hanging_joints(machine: Machine, reference: Trajectory) -> Trajectory:
-    """The reference with the free joints in equilibrium at all times."""
-    sway_model = Sway(machine)
-    return _sample_motion(
-        machine,
-        reference.duration,
-        lambda time: sway_model.hanging_equilibrium(reference.position(time)),
-    )
-
-
-def _shaper_impulses(omega: float, zeta: float, robust: bool) -> tuple[Array, Array]:
-    """Delays [s] and amplitudes of a ZV or ZVD shaper."""
-    decay = np.exp(-zeta * np.pi / np.sqrt(1.0 - zeta**2))
-    half_period = np.pi / (omega * np.sqrt(1.0 - zeta**2))
-    amplitudes = np.array([1.0, 2.0 * decay, decay**2] if robust else [1.0, decay])
-    return half_period * np.arange(len(amplitudes)), amplitudes / amplitudes.sum()
 
 
 def input_shaper(machine: Machine, q_a: ArrayLike, robust: bool = False) -> tuple[Array, Array]:
@@ -126,33 +52,33 @@ def input_shaper(machine: Machine, q_a: ArrayLike, robust: bool = False) -> tupl
     sway_model = Sway(machine)
     delays, shares = np.zeros(1), np.ones(1)
     for omega, zeta in zip(*sway_model.modes(sway_model.hanging_equilibrium(q_a)), strict=True):
-        mode_delays, mode_shares = _shaper_impulses(float(omega), float(zeta), robust)
-        delays = (delays[:, None] + mode_delays).ravel()
-        shares = (shares[:, None] * mode_shares).ravel()
+        decay = np.exp(-zeta * np.pi / np.sqrt(1.0 - zeta**2))
+        half_period = np.pi / (omega * np.sqrt(1.0 - zeta**2))
+        amplitudes = np.array([1.0, 2.0 * decay, decay**2] if robust else [1.0, decay])
+        delays = (delays[:, None] + half_period * np.arange(len(amplitudes))).ravel()
+        shares = (shares[:, None] * (amplitudes / amplitudes.sum())).ravel()
     order = np.argsort(delays)
     return delays[order], shares[order]
 
 
-def _apply_input_shaper(machine: Machine, reference: Trajectory, robust: bool) -> Trajectory:
-    """The reference, shortened by the duration of the shaper, after the shaper."""
+def _shaped_reference(machine: Machine, reference: Trajectory, time: Array, method: str) -> Array:
+    """Samples (N, n) of the reference, shortened by the length of the shaper, after the shaper."""
+    if method == "none":
+        return reference.position(time)
     middle = reference.position(0.5 * reference.duration)
-    delays, shares = input_shaper(machine, middle, robust)
+    delays, shares = input_shaper(machine, middle, robust=method == "zvd")
     remaining_duration = reference.duration - delays[-1]
     if remaining_duration <= 0:
         raise InputError(
             f"the shaper takes {delays[-1]:.3g} s, the motion {reference.duration:.3g} s: give it "
             "more time"
         )
-    shortened_reference, sway_model = retime(reference, remaining_duration), Sway(machine)
-
-    def motion(time: Array) -> Array:
-        delayed_references = [
-            size * shortened_reference.position(time - at)
-            for at, size in zip(delays, shares, strict=True)
-        ]
-        return sway_model.hanging_equilibrium(np.sum(delayed_references, axis=0))
-
-    return _sample_motion(machine, reference.duration, motion)
+    shortened_reference = retime(reference, remaining_duration)
+    delayed_references = [
+        size * shortened_reference.position(time - at)
+        for at, size in zip(delays, shares, strict=True)
+    ]
+    return np.asarray(np.sum(delayed_references, axis=0))
 
 
 def _smooth_reference(reference: Trajectory, time: Array, width: float) -> Array:
@@ -171,36 +97,24 @@ def _smooth_reference(reference: Trajectory, time: Array, width: float) -> Array
     return out
 
 
-def _rest_to_rest_splines(time: Array) -> Array:
-    """Quintic B-splines (N, s) with zero values and derivatives at both ends."""
+def _flatness_based_motion(sway_model: Sway, reference: Trajectory, time: Array) -> Array:
+    """Samples (N, n) of a motion for which the load follows the smoothed reference."""
     from scipy.interpolate import BSpline  # slow to import
 
-    count = max(10, int(np.ceil(_SPLINES_PER_SECOND * time[-1])))
-    knots = np.linspace(0.0, time[-1], count + 1)
-    knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, time[-1])])
-    return BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
-
-
-def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Trajectory:
-    """Motion of the drives for which the load follows the smoothed reference."""
     duration, smoothing = reference.duration, _SMOOTHING_SHARE * reference.duration
-    shortened_reference, sway_model, driven = (
-        retime(reference, duration - smoothing),
-        Sway(machine),
-        machine.is_driven,
-    )
-    count = max(12, int(np.ceil(duration * _KNOTS_PER_SECOND)) + 1)
-    time = np.linspace(0.0, duration, count)
+    driven = sway_model.machine.is_driven
     hanging_configurations = sway_model.hanging_equilibrium(
-        _smooth_reference(shortened_reference, time, smoothing)
+        _smooth_reference(retime(reference, duration - smoothing), time, smoothing)
     )
-    pivoting_motions, splines = (
-        sway_model.pivoting_motions(hanging_configurations),
-        _rest_to_rest_splines(time),
-    )
+    pivoting_motions = sway_model.pivoting_motions(hanging_configurations)
+    spline_count = max(10, int(np.ceil(_SPLINES_PER_SECOND * duration)))
+    knots = np.linspace(0.0, duration, spline_count + 1)
+    knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, duration)])
+    # without those that have values or derivatives at an end
+    splines = BSpline.design_matrix(time, knots, 5).toarray()[:, 3:-3]
     free_stiffness = sway_model.stiffness(hanging_configurations)[:, :, ~driven]
     spline_projection = splines @ np.linalg.pinv(splines)
-    theta = np.zeros((count, len(machine.free)))
+    theta = np.zeros((len(time), int((~driven).sum())))
     previous_correction = np.inf
     for _ in range(MAX_ITERATIONS):
         q_a = hanging_configurations.copy()
@@ -219,7 +133,7 @@ def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Traje
         if correction_size < _CONVERGENCE_TOLERANCE or (
             correction_size < _STAGNATION_TOLERANCE and correction_size > 0.5 * previous_correction
         ):
-            return _interpolating_trajectory(time, q_a)
+            return q_a
         if correction_size > previous_correction:
             break
         theta, previous_correction = theta - correction, correction_size
@@ -227,16 +141,6 @@ def _flatness_based_trajectory(machine: Machine, reference: Trajectory) -> Traje
         f"no motion of {duration:.3g} s without residual sway was found, the last "
         f"correction is {previous_correction:.2g} rad: give it more time"
     )
-
-
-_SWAY_METHOD_FUNCTIONS: dict[str, Callable[[Machine, Trajectory], Trajectory]] = {
-    "none": _with_hanging_joints,
-    "zv": lambda machine, reference: _apply_input_shaper(machine, reference, robust=False),
-    "zvd": lambda machine, reference: _apply_input_shaper(machine, reference, robust=True),
-    "flat": _flatness_based_trajectory,
-}
-
-SWAY_METHODS = tuple(_SWAY_METHOD_FUNCTIONS)
 
 
 def suppress_sway(machine: Machine, reference: Trajectory, method: str = "flat") -> Trajectory:
@@ -270,11 +174,16 @@ def suppress_sway(machine: Machine, reference: Trajectory, method: str = "flat")
             short.
         LimitError: The trajectory leaves the limits of the drives.
     """
-    if method not in _SWAY_METHOD_FUNCTIONS:
+    if method not in SWAY_METHODS:
         raise InputError(f"method '{method}' is unknown, {suggest_names(SWAY_METHODS, method)}")
-    if not machine.free:
-        raise InputError(f"nothing sways on '{machine.name}': it has no free joints")
-    trajectory = _SWAY_METHOD_FUNCTIONS[method](machine, add_free_joints(machine, reference))
+    sway_model, reference = Sway(machine), add_free_joints(machine, reference)
+    count = max(12, int(np.ceil(reference.duration * _KNOTS_PER_SECOND)) + 1)
+    time = np.linspace(0.0, reference.duration, count)
+    if method == "flat":
+        q_a = _flatness_based_motion(sway_model, reference, time)
+    else:
+        q_a = sway_model.hanging_equilibrium(_shaped_reference(machine, reference, time, method))
+    trajectory = Trajectory(quintic_polynomials(time, q_a, *_spline_derivatives(time, q_a)))
     if text := limit_violation_message(machine, trajectory):
         raise LimitError(f"method '{method}': {text}")
     return trajectory

@@ -8,7 +8,6 @@ from site to site are a force element between frames, or a rope if the spring is
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -43,6 +42,30 @@ class JointEffects:
     ropes: list[Rope] = field(default_factory=list)
     rotor_inertias: dict[str, float] = field(default_factory=dict)
 
+    def add_along(
+        self,
+        joint: str,
+        factor: float = 1.0,
+        *,
+        damping: float = 0.0,
+        friction: float = 0.0,
+        armature: float = 0.0,
+        stiffness: float = 0.0,
+        rest: float = 0.0,
+    ) -> None:
+        """Add effects along a length that is a factor times the coordinate of a joint."""
+        square = factor * factor
+        for values, value in (
+            (self.viscous, square * damping),
+            (self.coulomb, abs(factor) * friction),
+            (self.rotor_inertias, square * armature),
+        ):
+            if value:
+                values[joint] = values.get(joint, 0.0) + value
+        if square * stiffness:
+            spring = ForceElement(joint, stiffness=square * stiffness, rest=rest / factor)
+            self.springs.append(spring)
+
     @property
     def friction(self) -> dict[str, Friction]:
         """Friction laws by joint."""
@@ -63,15 +86,30 @@ def read_joint_effects(
         series_joints: Names of the joints of the machine by joint of MuJoCo.
         sites: Name of the link by site.
     """
-    effects = JointEffects()
+    model, effects = mjcf.model, JointEffects()
     for joint, names in series_joints.items():
-        if len(names) > 1:
-            _add_multi_freedom_effects(mjcf, joint, names, effects)
-        else:
-            _add_joint_effects(mjcf.model, joint, names[0], effects)
-    for tendon in range(mjcf.model.ntendon):
+        dof = int(model.jnt_dofadr[joint])
+        dofs = range(dof, dof + len(names))
+        damping, friction = model.dof_damping[dofs], model.dof_frictionloss[dofs]
+        stiffness, armature = float(model.jnt_stiffness[joint]), float(model.dof_armature[dof])
+        if len(names) == 1:
+            effects.add_along(
+                names[0],
+                damping=float(damping[0]),
+                friction=float(friction[0]),
+                armature=armature,
+                stiffness=stiffness,
+                rest=float(model.qpos_spring[model.jnt_qposadr[joint]]),
+            )
+            continue
+        if damping.any() or friction.any() or stiffness:
+            feature = "damping, friction and stiffness of ball and free joints"
+            mjcf.note_unsupported_elements(feature, "JOINT", [joint])
+        for name in names[:-3]:  # translations; see also `isotropic_rotor_inertia`
+            effects.add_along(name, armature=armature)
+    for tendon in range(model.ntendon):
         _add_tendon_effects(mjcf, tendon, series_joints, sites, effects)
-    for actuator in range(len(mjcf.model.actuator_trntype)):
+    for actuator in range(len(model.actuator_trntype)):
         _add_actuator_effects(mjcf, actuator, series_joints, effects)
     return effects
 
@@ -115,41 +153,6 @@ def isotropic_rotor_inertia(mjcf: MujocoFile, joint: int) -> float:
     return rotor
 
 
-def _add_value(values: dict[str, float], joint: str, value: float) -> None:
-    if value:
-        values[joint] = values.get(joint, 0.0) + value
-
-
-def _field_value(model: Any, field: str, index: int) -> float:
-    """Return a value of a field, 0 if this version of MuJoCo lacks the field."""
-    values = getattr(model, field, None)
-    return 0.0 if values is None else float(values[index])
-
-
-def _add_joint_effects(model: Any, joint: int, name: str, effects: JointEffects) -> None:
-    dof = int(model.jnt_dofadr[joint])
-    _add_value(effects.viscous, name, float(model.dof_damping[dof]))
-    _add_value(effects.coulomb, name, float(model.dof_frictionloss[dof]))
-    _add_value(effects.rotor_inertias, name, float(model.dof_armature[dof]))
-    if stiffness := float(model.jnt_stiffness[joint]):
-        rest = float(model.qpos_spring[model.jnt_qposadr[joint]])
-        effects.springs.append(ForceElement(name, stiffness=stiffness, rest=rest))
-
-
-def _add_multi_freedom_effects(
-    mjcf: MujocoFile, joint: int, names: Sequence[str], effects: JointEffects
-) -> None:
-    model, dof = mjcf.model, int(mjcf.model.jnt_dofadr[joint])
-    joint_dofs = range(dof, dof + len(names))
-    if model.dof_damping[joint_dofs].any() or model.dof_frictionloss[joint_dofs].any() or (
-        model.jnt_stiffness[joint]
-    ):  # fmt: skip
-        feature = "damping, friction and stiffness of ball and free joints"
-        mjcf.note_unsupported_elements(feature, "JOINT", [joint])
-    for name in names[:-3]:  # translations of a free joint; see also `isotropic_rotor_inertia`
-        _add_value(effects.rotor_inertias, name, float(model.dof_armature[dof]))
-
-
 def _add_tendon_effects(
     mjcf: MujocoFile,
     tendon: int,
@@ -157,67 +160,46 @@ def _add_tendon_effects(
     sites: Mapping[int, str],
     effects: JointEffects,
 ) -> None:
-    factors = fixed_tendon_factors(mjcf, tendon)
-    supported: set[str] = set()
-    if factors is not None and len(factors) == 1:
+    model, factors = mjcf.model, fixed_tendon_factors(mjcf, tendon)
+    stiffness, damping = float(model.tendon_stiffness[tendon]), float(model.tendon_damping[tendon])
+    slack_length, taut_length = (float(x) for x in model.tendon_lengthspring[tendon])
+    is_spring, supported = slack_length == taut_length, set[str]()
+    ends = straight_tendon_sites(mjcf, tendon)
+    is_along_joint = factors is not None and len(factors) == 1
+    is_rope = ends is not None and slack_length == 0
+    if (is_spring or is_rope) and tendon not in nonzero_rows(model, "tendon_stiffnesspoly"):
+        supported.add("stiffness")
+    if tendon not in nonzero_rows(model, "tendon_dampingpoly"):
+        supported.add("damping")
+    stiffness *= "stiffness" in supported
+    damping *= "damping" in supported
+    if factors is not None and is_along_joint:
+        supported |= {"friction", "armature"}
         ((joint, factor),) = factors.items()
-        (name,) = series_joints[joint]
-        supported = _add_joint_tendon(name, factor, mjcf.model, tendon, effects)
-    elif ends := straight_tendon_sites(mjcf, tendon):
+        effects.add_along(
+            series_joints[joint][0],
+            factor,
+            damping=damping,
+            friction=float(model.tendon_frictionloss[tendon]),
+            armature=float(model.tendon_armature[tendon]),
+            stiffness=stiffness,
+            rest=slack_length,
+        )
+    elif ends is not None:
         links = sites[ends[0]], sites[ends[1]]
-        supported = _add_straight_tendon(links, mjcf.model, tendon, effects)
+        if stiffness and not is_spring:
+            effects.ropes.append(Rope(links, length=taut_length, stiffness=stiffness))
+            stiffness = 0.0
+        if stiffness or damping:
+            rest = taut_length if stiffness else 0.0
+            effects.springs.append(ForceElement("", stiffness, rest, damping, between=links))
+    else:
+        supported.clear()
     for feature, fields in _TENDON_FIELDS.items():
         if feature not in supported and any(
-            tendon in nonzero_rows(mjcf.model, name) for name in fields
+            tendon in nonzero_rows(model, name) for name in fields
         ):
             mjcf.note_unsupported_elements(f"{feature} of tendons", "TENDON", [tendon])
-
-
-def _add_joint_tendon(
-    joint: str, factor: float, model: Any, tendon: int, effects: JointEffects
-) -> set[str]:
-    """Add the effects of a fixed tendon of one joint, and return the features it represents."""
-    supported = {"friction", "armature"}
-    square = factor * factor
-    slack_length, taut_length = (float(x) for x in model.tendon_lengthspring[tendon])
-    if slack_length == taut_length and tendon not in nonzero_rows(model, "tendon_stiffnesspoly"):
-        supported.add("stiffness")
-        if stiffness := square * float(model.tendon_stiffness[tendon]):
-            effects.springs.append(
-                ForceElement(joint, stiffness=stiffness, rest=slack_length / factor)
-            )
-    if tendon not in nonzero_rows(model, "tendon_dampingpoly"):
-        supported.add("damping")
-        _add_value(effects.viscous, joint, square * float(model.tendon_damping[tendon]))
-    _add_value(effects.coulomb, joint, abs(factor) * float(model.tendon_frictionloss[tendon]))
-    armature = _field_value(model, "tendon_armature", tendon)
-    _add_value(effects.rotor_inertias, joint, square * armature)
-    return supported
-
-
-def _add_straight_tendon(
-    links: tuple[str, str], model: Any, tendon: int, effects: JointEffects
-) -> set[str]:
-    """Add the spring and damper of a straight tendon, and return the features they represent."""
-    supported: set[str] = set()
-    stiffness = damping = rest = 0.0
-    lower, upper = (float(x) for x in model.tendon_lengthspring[tendon])
-    if tendon not in nonzero_rows(model, "tendon_stiffnesspoly") and (
-        lower == upper or lower == 0
-    ):
-        supported.add("stiffness")
-        spring_stiffness = float(model.tendon_stiffness[tendon])
-        if lower == upper:
-            stiffness, rest = spring_stiffness, upper
-        elif spring_stiffness:
-            effects.ropes.append(Rope(links, length=upper, stiffness=spring_stiffness))
-    if tendon not in nonzero_rows(model, "tendon_dampingpoly"):
-        supported.add("damping")
-        damping = float(model.tendon_damping[tendon])
-    if stiffness or damping:
-        rest = rest if stiffness else 0.0
-        effects.springs.append(ForceElement("", stiffness, rest, damping, between=links))
-    return supported
 
 
 def _add_actuator_effects(
@@ -227,8 +209,8 @@ def _add_actuator_effects(
     effects: JointEffects,
 ) -> None:
     model = mjcf.model
-    armature = _field_value(model, "actuator_armature", actuator)
-    damping = _field_value(model, "actuator_damping", actuator)
+    armature = float(model.actuator_armature[actuator])
+    damping = float(model.actuator_damping[actuator])
     if not (armature or damping):
         return
     kind, target = mjcf.transmission(actuator)
@@ -239,10 +221,9 @@ def _add_actuator_effects(
         feature = "armature and damping of actuators"
         mjcf.note_unsupported_elements(feature, "ACTUATOR", [actuator])
         return
-    ((joint, c),) = factors.items()
-    squared_ratio = (c * float(model.actuator_gear[actuator, 0])) ** 2
-    _add_value(effects.viscous, series_joints[joint][0], squared_ratio * damping)
-    _add_value(effects.rotor_inertias, series_joints[joint][0], squared_ratio * armature)
+    ((joint, factor),) = factors.items()
+    ratio = factor * float(model.actuator_gear[actuator, 0])
+    effects.add_along(series_joints[joint][0], ratio, damping=damping, armature=armature)
 
 
 def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) -> tuple[Drive, ...]:
@@ -264,9 +245,9 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
         factors: Mapping[str, float] = {}
         name = mjcf.name("ACTUATOR", actuator)
         if kind == "TENDON":
-            tendon = fixed_tendon_factors(mjcf, target)
+            tendon = fixed_tendon_factors(mjcf, target) or {}
             name = mjcf.name("TENDON", target)
-            factors = {series_joints[joint][0]: factor for joint, factor in (tendon or {}).items()}
+            factors = {series_joints[joint][0]: factor for joint, factor in tendon.items()}
         elif kind == "JOINT":
             factors = dict.fromkeys(series_joints[target], 1.0)
             if len(factors) > 1:
@@ -287,9 +268,8 @@ def _multi_freedom_factors(
     mjcf: MujocoFile, actuator: int, joint_names: Sequence[str], used_joints: set[str]
 ) -> dict[str, float]:
     """Return the factors of the parts of a ball or free joint, normalized to length 1."""
-    gear = np.array(mjcf.model.actuator_gear[actuator])
-    prismatic_joints, revolute_joints = joint_names[:-3], joint_names[-3:]
-    force_direction, axis = (gear[:3], gear[3:6]) if prismatic_joints else (np.zeros(3), gear[:3])
+    gear, translations = np.array(mjcf.model.actuator_gear[actuator]), joint_names[:-3]
+    force_direction, axis = (gear[:3], gear[3:6]) if translations else (np.zeros(3), gear[:3])
     force_norm = float(np.linalg.norm(force_direction))
     if axis.any():
         mjcf.note_difference(
@@ -297,11 +277,8 @@ def _multi_freedom_factors(
             mjcf.name("ACTUATOR", actuator),
         )
     if force_norm:
-        return {
-            x: float(f) / force_norm
-            for x, f in zip(prismatic_joints, force_direction, strict=True)
-            if f
-        }
-    nearest = [revolute_joints[i] for i in np.argsort(-np.abs(axis), kind="stable") if axis[i]]
+        forces = zip(translations, force_direction, strict=True)
+        return {x: float(f) / force_norm for x, f in forces if f}
+    nearest = [joint_names[-3:][i] for i in np.argsort(-np.abs(axis), kind="stable") if axis[i]]
     unused = [part for part in nearest if part not in used_joints]
     return {part: 1.0 for part in (unused or nearest)[:1]}

@@ -18,8 +18,17 @@ _COUNTED_FEATURES = {"sensor": "nsensor", "camera": "ncam", "skin": "nskin", "pl
 def note_unsupported_features(mjcf: MujocoFile) -> None:
     """Note all features that are left out or interpreted differently."""
     disabled = mjcf.disabled_features
-    if "CONTACT" not in disabled:
-        _note_contacts(mjcf, disabled)
+    geoms = [] if "CONTACT" in disabled else colliding_geoms(mjcf.model, disabled)
+    if geoms:
+        bodies = mjcf.model.geom_bodyid
+        # floors and walls first
+        geoms.sort(key=lambda geom: mjcf.model.body_weldid[bodies[geom]] != 0)
+        names = [
+            mjcf.element_name("GEOM", x).strip() or f"one of {mjcf.name('BODY', int(bodies[x]))}"
+            for x in geoms
+        ]
+        count = f"{len(geoms)} geom{'s' * (len(geoms) > 1)}"
+        mjcf.note_unsupported(f"contacts of {count}", *names)
     _note_world(mjcf, disabled)
     _note_joints(mjcf, disabled)
     _note_actuators(mjcf, disabled)
@@ -56,21 +65,6 @@ def _note_world(mjcf: MujocoFile, disabled: set[str]) -> None:
         mjcf.note_difference("the file switches its constraints off, loops are closed here")
 
 
-def _note_contacts(mjcf: MujocoFile, disabled: set[str]) -> None:
-    geoms = colliding_geoms(mjcf.model, disabled)
-    if not geoms:
-        return
-    body_of_geom = mjcf.model.geom_bodyid
-    # floors and walls first
-    geoms.sort(key=lambda geom: mjcf.model.body_weldid[body_of_geom[geom]] != 0)
-    names = [
-        mjcf.element_name("GEOM", x).strip() or f"one of {mjcf.name('BODY', int(body_of_geom[x]))}"
-        for x in geoms
-    ]
-    count = f"{len(geoms)} geom{'s' * (len(geoms) > 1)}"
-    mjcf.note_unsupported(f"contacts of {count}", *names)
-
-
 def colliding_geoms(model: Any, disabled: set[str]) -> list[int]:
     """Return the indices of geoms that can touch another geom by MuJoCo's rules.
 
@@ -96,21 +90,17 @@ def colliding_geoms(model: Any, disabled: set[str]) -> list[int]:
     excluded = {divmod(int(x), 1 << 16) for x in model.exclude_signature}
     excluded |= {(two, one) for one, two in excluded}
     is_touching = np.zeros(len(unique_geoms), dtype=bool)
-    filtered = "FILTERPARENT" not in disabled
     for i in range(len(unique_geoms)):
         can_touch = ((contype[i] & conaffinity) | (contype & conaffinity[i])) != 0
         can_touch &= rigid_bodies != rigid_bodies[i]
-        if filtered:
+        if "FILTERPARENT" not in disabled:
             are_parent_and_child = (parent_bodies[rigid_bodies] == rigid_bodies[i]) | (
                 rigid_bodies == parent_bodies[rigid_bodies[i]]
             )
             can_touch &= ~(are_parent_and_child & (rigid_bodies != 0) & (rigid_bodies[i] != 0))
-        others = np.flatnonzero(can_touch)
-        if excluded:
-            others = np.array(
-                [j for j in others if (int(body[i]), int(body[j])) not in excluded], dtype=int
-            )
-        is_touching[i] = len(others) > 0
+        is_touching[i] = any(
+            (int(body[i]), int(body[j])) not in excluded for j in np.flatnonzero(can_touch)
+        )
     found = is_touching[np.ravel(unique_index)]
     found[np.concatenate([model.pair_geom1, model.pair_geom2]).astype(int)] = True
     return np.flatnonzero(found).tolist()
@@ -145,24 +135,21 @@ def _note_joints(mjcf: MujocoFile, disabled: set[str]) -> None:
 def _note_actuators(mjcf: MujocoFile, disabled: set[str]) -> None:
     """Note actuators other than motors, whose force [N], [N m] is not their control signal."""
     model = mjcf.model
-    count = len(model.actuator_trntype)
-    nonstandard = set()
+    is_nonstandard = (model.actuator_gainprm[:, 0] != 1) | (
+        np.abs(np.linalg.norm(model.actuator_gear, axis=1) - 1) > 1e-9
+    )
     for field in (
         "actuator_gaintype", "actuator_biastype", "actuator_dyntype", "actuator_forcelimited",
         "actuator_ctrllimited", "actuator_actlimited", "actuator_dampingpoly", "actuator_delay",
     ):  # fmt: skip
-        nonstandard.update(nonzero_rows(model, field))
-    nonstandard.update(i for i in range(count) if model.actuator_gainprm[i, 0] != 1)
-    nonstandard.update(
-        i for i in range(count) if abs(np.linalg.norm(model.actuator_gear[i]) - 1) > 1e-9
-    )
-    if nonstandard:
+        is_nonstandard[nonzero_rows(model, field)] = True
+    if is_nonstandard.any():
         mjcf.note_difference(
             "drives take forces in N and N m, without gains, gears, dynamics and limits of the "
             "actuators",
-            *(mjcf.name("ACTUATOR", i) for i in sorted(nonstandard)),
+            *(mjcf.name("ACTUATOR", int(i)) for i in np.flatnonzero(is_nonstandard)),
         )
-    if count and "ACTUATION" in disabled:
+    if len(is_nonstandard) and "ACTUATION" in disabled:
         mjcf.note_difference(
             "the file switches its actuators off, what they act on is driven here"
         )

@@ -9,7 +9,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.errors import InputError
 from crane.description.kinematic_tree import Tree
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.conversion_notes import unsupported_sections, warn_about_unsupported
+from crane.formats.conversion_notes import warn_about_unsupported
 from crane.formats.urdf_elements import (
     add_friction,
     add_joint,
@@ -78,13 +78,15 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
         etree.SubElement(robot, "end_effector", tip)
     copy_shapes(robot, machine)
-    unsupported = unsupported_sections(machine)
-    unsupported += ["springs and forces"] if machine.forces else []
-    unsupported += ["ropes"] if machine.ropes else []
-    unsupported += ["rotor inertias"] if rotor_inertias(machine) else []
-    unsupported += ["drives along several joints"] if compound_drive_factors(machine) else []
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(format_document(robot, origin_text(machine)))
+    sections = {
+        "springs and forces": machine.forces,
+        "ropes": machine.ropes,
+        "rotor inertias": rotor_inertias(machine),
+        "drives along several joints": compound_drive_factors(machine),
+    }
+    unsupported = [name for name, section in sections.items() if section]
     warn_about_unsupported(machine, "URDF+", unsupported)
 
 
@@ -143,24 +145,19 @@ def _coupling_ends(
     All joints on the path to the successor have the factor of the first joint, and all joints on
     the path to the predecessor have one other factor.
     """
-    model = machine.model
-    successor_joints = [joints[0]] + [
-        x for x, slope in zip(joints[1:], derivatives, strict=True) if slope == -1
-    ]
-    predecessor_joints = [x for x in joints if x not in successor_joints]
-    ratios = {
-        slope for x, slope in zip(joints[1:], derivatives, strict=True) if x in predecessor_joints
-    }
+    model, slopes = machine.model, dict(zip(joints, [-1.0, *derivatives], strict=True))
+    ratios = {slope for slope in slopes.values() if slope != -1}
     if len(ratios) > 1:
         return None
-    joint_paths = [
-        sorted(model.getJointId(x) for x in way) for way in (predecessor_joints, successor_joints)
+    joint_paths = [  # indices rise from parent to child
+        sorted(model.getJointId(x) for x, slope in slopes.items() if (slope == -1) == is_successor)
+        for is_successor in (False, True)
     ]
-    for path in joint_paths:  # indices rise from parent to child
-        if any(model.parents[b] != a for a, b in zip(path, path[1:], strict=False)):
-            return None
-    top_joints = [model.parents[way[0]] for way in joint_paths if way]
-    if len(set(top_joints)) > 1:
+    top_joints = [model.parents[path[0]] for path in joint_paths if path]
+    is_chain = all(
+        model.parents[b] == a for x in joint_paths for a, b in zip(x, x[1:], strict=False)
+    )
+    if len(set(top_joints)) > 1 or not is_chain:
         return None
     joints_of_ends = [path[-1] if path else top_joints[0] for path in joint_paths]
     links = [
