@@ -287,7 +287,7 @@ def tracking_control(
 ) -> "Control":
     """The controller that tracks a reference, see `task_control`."""
     from crane.control.controller_registry import default_controller_name, make_controller
-    from crane.motion.sway_suppression import suppress_sway
+    from crane.motion.sway import suppress_sway
 
     if sway is not None:
         reference = suppress_sway(machine, reference, sway)

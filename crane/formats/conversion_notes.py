@@ -1,11 +1,10 @@
-"""Warnings about parts of a machine that a conversion between formats leaves out or changes."""
+"""Warnings about parts of a file that a conversion between formats leaves out or changes."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from crane.common.errors import CraneWarning
-from crane.machine.machine import Machine
 
 
 class ConversionNotes:
@@ -53,38 +52,3 @@ class ConversionNotes:
         if (more := len(listed) - self._max_names) > 0:
             listed[self._max_names :] = [f"{more} more"]
         return f" ({', '.join(listed)})" if listed else ""
-
-
-def warn_about_unsupported(machine: Machine, format_name: str, others: Sequence[str]) -> None:
-    """Warn of parts of a machine that a written format cannot represent.
-
-    Those are the sections that only a machine file represents, and friction laws: other formats
-    have Coulomb and viscous friction alone.
-
-    Args:
-        machine: The machine.
-        format_name: Name of the format.
-        others: Further parts.
-    """
-    names = [
-        f"the friction law of {joint}"
-        for joint, law in machine.friction.items()
-        if law.coulomb_offset or law.viscous_offset or law.stiction or (
-            law.coulomb and law.smoothing
-        )
-    ]  # fmt: skip
-    sections = {
-        "gas springs": machine.gas_springs,
-        "end stops": machine.end_stops,
-        "tasks": machine.tasks,
-        "gains": machine.control,
-        "hydraulics": machine.hydraulics,
-    }
-    names += [name for name, section in sections.items() if section]
-    if listed := ", ".join([*names, *others]):
-        warnings.warn(
-            f"{machine.name}: {format_name} has no place for {listed}, left out (a machine "
-            "file has)",
-            CraneWarning,
-            stacklevel=3,
-        )

@@ -63,7 +63,6 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
 
 
 def _run_xacro_process(file: Path) -> dict[str, Any]:
-    """Return the answer of the process."""
     options = load_options()
     request = {
         "file": str(file), "root": str(_PACKAGE_ROOT), "packages": list(options.packages),

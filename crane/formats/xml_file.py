@@ -262,9 +262,8 @@ class XmlFile:
         Raises:
             DescriptionError: The text is something else.
         """
-        words = text.split()
         try:
-            values = tuple(float(word) for word in words)
+            values = tuple(float(word) for word in text.split())
         except ValueError:
             hint = "write digits"
             if "," in text:

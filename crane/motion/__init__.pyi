@@ -1,7 +1,7 @@
 from .attitude import via_attitudes as via_attitudes
 from .kinematics import Kinematics as Kinematics
 from .sway import Sway as Sway
-from .sway_suppression import suppress_sway as suppress_sway
+from .sway import suppress_sway as suppress_sway
 from .task_trajectories import read_path as read_path
 from .task_trajectories import task_trajectory as task_trajectory
 from .task_trajectories import tip_trajectory as tip_trajectory

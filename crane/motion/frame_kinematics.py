@@ -167,7 +167,6 @@ class FrameKinematics(OneLineRepr):
         self._thread_local_data = ThreadLocal(self._model.createData)
 
     def _one_line(self) -> str:
-        """Frame and machine."""
         return f"{type(self).__name__} of '{self.frame}' of '{self.machine.name}'"
 
     def position(self, q_a: ArrayLike) -> Array:
@@ -208,8 +207,7 @@ class FrameKinematics(OneLineRepr):
         Returns:
             (3, 3) or (N, 3, 3).
         """
-        configurations = self.machine.closure.solve(q_a)
-        return apply_per_sample(lambda one: self._pose(one)[1], configurations)
+        return apply_per_sample(lambda q: self._pose(q)[1], self.machine.closure.solve(q_a))
 
     def inclination(self, q_a: ArrayLike) -> Array:
         """Inclination of the frame: elevation of its x axis above the horizontal.

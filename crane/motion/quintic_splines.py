@@ -228,8 +228,7 @@ def smooth_samples(time: Array, x: Array, noise_rms: float) -> tuple[Array, Arra
     """
     from scipy.linalg import solveh_banded  # slow to import
 
-    grid = np.arange(time[0], time[-1], _MIN_KNOT_SPACING)
-    first = np.searchsorted(time, grid)
+    first = np.searchsorted(time, np.arange(time[0], time[-1], _MIN_KNOT_SPACING))
     knots = _JerkQuadraticForm(time[np.unique(np.r_[first, len(time) - 1])])
     interval = np.clip(np.searchsorted(knots.time, time, "right") - 1, 0, len(knots.time) - 2)
     u = (time - knots.time[interval]) / np.diff(knots.time)[interval]

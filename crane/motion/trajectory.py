@@ -51,7 +51,6 @@ class Trajectory(OneLineRepr):
         self._polynomials = (curve, curve.derivative(), curve.derivative(2))
 
     def _one_line(self) -> str:
-        """Duration and number of coordinates."""
         count = np.size(self.position(0.0))
         summary = f"{self.duration:.6g} s of {format_count(count, 'coordinate')}"
         return f"{type(self).__name__}({summary}{', by its tip' * (self.tip is not None)})"
@@ -84,8 +83,7 @@ class Trajectory(OneLineRepr):
     def extremum_times(self) -> Array:
         """Times (k,) [s] at which a coordinate may be extremal: knots, and zeros of velocities."""
         curve, rate = self._polynomials[:2]
-        rest_times = [np.ravel(roots) for roots in np.ravel(rate.roots())]
-        times = np.concatenate([curve.x, *rest_times])
+        times = np.concatenate([curve.x, *map(np.ravel, np.ravel(rate.roots()))])
         return np.unique(times[np.isfinite(times)])
 
     def breaks(self) -> Array:

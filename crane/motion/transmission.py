@@ -76,7 +76,6 @@ class Transmission(OneLineRepr):
         self._jacobians = FrameJacobians(machine)
 
     def _one_line(self) -> str:
-        """Machine, actuators, and number of joints."""
         actuators = ", ".join(self.actuators)
         return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
 

@@ -42,8 +42,7 @@ from crane.formats.machine_file.parameter_locations import (
     parameter_locations,
 )
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
-from crane.formats.urdf_elements import add_joint, add_link
-from crane.formats.urdf_output import (
+from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
     copy_shapes,
     format_document,
@@ -51,6 +50,7 @@ from crane.formats.urdf_output import (
     rotor_inertias,
     with_floating_joints,
 )
+from crane.formats.urdf_elements import add_joint, add_link
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine

@@ -10,7 +10,7 @@ import pinocchio as pin
 from crane.common.errors import DescriptionError
 from crane.description.pinocchio_conversion import to_vector
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.mjcf.joint_effects import fixed_tendon_factors
+from crane.formats.mjcf.model_features import fixed_tendon_factors
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
 
 _DISTANCE_TOLERANCE = 1e-9  # relative
@@ -188,9 +188,9 @@ def _combine_two_connects(
     ]
     is_one_axis = np.abs(axes[1] - axes[0]).max() < _DISTANCE_TOLERANCE * length[0]
     if all(first.link for first in first_ends) and is_one_axis:
-        for second in second_ends:  # sites that only define an axis, as written files have them
-            if second.link is not None and second.link.endswith("_axis"):
-                frames.placements.pop(second.link, None)
+        for site in [second.link or "" for second in second_ends]:
+            if site.endswith("_axis"):  # only defines an axis, as in written files
+                frames.placements.pop(site, None)
         axis = axes[0] / length[0]
         nearest = np.round(axis)
         if np.abs(axis - nearest).max() < 1e-12:  # along an axis of the frame
@@ -224,24 +224,22 @@ def _create_coupling(
 ) -> Coupling:
     """Return the coupling y - y_0 = a_0 + a_1 (x - x_0), where x and y are joints or tendons."""
     model, label = mjcf.model, f"{source_location}: the constraint '{name}'"
-    joint_sums: list[dict[int, float]] = [{}, {}]  # of y and x, none for an absent object
-    for terms, object_id in zip(joint_sums, (model.eq_obj1id, model.eq_obj2id), strict=True):
-        i = int(object_id[index])
+    joint_sums: list[dict[int, float]] = []  # of y and x, none for an absent object
+    for i in (int(model.eq_obj1id[index]), int(model.eq_obj2id[index])):
+        terms: dict[int, float] | None = {i: 1.0} if i >= 0 else {}
         if kind == "TENDON" and i >= 0:
-            tendon = fixed_tendon_factors(mjcf, i)
-            if tendon is None:
-                raise DescriptionError(f"{label} is about a tendon in space, use a fixed one")
-            terms |= tendon
-        elif i >= 0:
-            terms[i] = 1.0
+            terms = fixed_tendon_factors(mjcf, i)
+        if terms is None:
+            raise DescriptionError(f"{label} is about a tendon in space, use a fixed one")
+        joint_sums.append(terms)
     offset, linear_coefficient, *higher_coefficients = (float(x) for x in model.eq_data[index, :5])
     if any(higher_coefficients) and joint_sums[1]:
         raise DescriptionError(
             f"{label} is not linear, leave the higher powers of its polycoef away"
         )
     factors: dict[str, float] = {}
-    for terms, sign in zip(joint_sums, (1.0, -linear_coefficient), strict=True):
-        for joint, factor in terms.items():
+    for factor_by_joint, sign in zip(joint_sums, (1.0, -linear_coefficient), strict=True):
+        for joint, factor in factor_by_joint.items():
             (part,) = series_joints[joint]
             factors[part] = factors.get(part, 0.0) + sign * factor
             offset += sign * factor * float(model.qpos0[model.jnt_qposadr[joint]])

@@ -25,13 +25,13 @@ from crane.description.specification import Chain, MachineSpec, source_locations
 from crane.formats.joint_series import joint_freedoms, joint_series
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
-from crane.formats.mjcf.joint_effects import (
+from crane.formats.mjcf.model_features import (
     isotropic_rotor_inertia,
+    note_unsupported_features,
     read_drives,
     read_joint_effects,
 )
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose
-from crane.formats.mjcf.unsupported_features import note_unsupported_features
 from crane.formats.urdf.urdf_reader import UrdfModel
 
 
@@ -130,7 +130,6 @@ class _MjcfReader:
         return name
 
     def _add_fixed_joint(self, link: str, parent: str, placement: pin.SE3) -> None:
-        """Add a joint that fixes a link to another."""
         name = f"{link}_fixed"
         while name in self.joints or name in self.names:
             name += "_"
@@ -140,7 +139,6 @@ class _MjcfReader:
         )
 
     def _read_body(self, body: int) -> None:
-        """Read a body with its joints."""
         model, name = self.model, self.mjcf.name("BODY", body)
         source_location = self.mjcf.source_location(name, "body")
         self.body_links.append(name)

@@ -12,9 +12,13 @@ from crane.common.atomic_output import replace_file
 from crane.common.errors import CraneWarning, InputError
 from crane.description.force_elements import ForceElement, Friction, Rope, element_name
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.conversion_notes import warn_about_unsupported
+from crane.formats.urdf.urdf_writer import (
+    format_document,
+    origin_text,
+    solve_coupling,
+    warn_about_unsupported,
+)
 from crane.formats.urdf_elements import finite_limits, format_numbers
-from crane.formats.urdf_output import format_document, origin_text, solve_coupling
 from crane.machine.machine import Machine
 
 _HINGE_POINT_DISTANCE = 0.1  # [m] between the two points that define a hinge
@@ -42,9 +46,8 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
         OutputError: The file cannot be written.
     """
     writer = _MjcfWriter(machine)
-    content = writer.build_content()
     with replace_file(path) as temporary_file:
-        temporary_file.write_bytes(content)
+        temporary_file.write_bytes(writer.build_content())
     floating = [
         machine.joints[column + i]
         for column in machine.coordinates.floating_base_columns
@@ -118,7 +121,8 @@ class _MjcfWriter:
             if dict(drive.factors) != {drive.name: 1.0}:
                 target = {"tendon": _add_fixed_tendon(tendons, drive.name, drive.factors)}
             add(actuator, "motor", {"name": drive.name, **target})
-        for item in (*self.machine.forces, *self.machine.ropes):
+        force_elements: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
+        for item in force_elements:
             if item.between is not None:
                 self._add_spatial_tendon(tendons, item, item.between)
         self.root.extend(part for part in (tendons, equality, actuator) if len(part))
@@ -159,7 +163,6 @@ class _MjcfWriter:
         return series
 
     def _add_body(self, series: list[int], parent: etree._Element) -> etree._Element:
-        """Add a body with the series of joints that moves it."""
         placements = [pin.SE3.Identity()]
         for i in series:
             placements.append(placements[-1] * self.model.jointPlacements[i])

@@ -82,7 +82,6 @@ def _count_elements(
 
 
 def _check_sizes(xml: XmlFile, element: etree._Element) -> None:
-    """Raise for sizes from which MuJoCo would allocate too much."""
     keys, maximum = _SIZE_ATTRIBUTES.get(element.tag, ((), 0))
     product = math.prod(max(abs(x), 1.0) for key in keys for x in _read_numbers(element, key))
     if keys and product > maximum:
@@ -130,18 +129,16 @@ def _remove_shapes(
     """
     removed = [x for x in (*spec.meshes, *spec.hfields) if x.file and name.endswith(x.file)]
     shapes = {x.name for x in removed}
-    for geom in list(spec.geoms):
-        if shapes & {geom.meshname, geom.hfieldname}:
-            if geom.parent.name in moving_bodies and _contributes_mass(spec.compiler, geom):
-                lighter_bodies.setdefault(geom.parent.name, name)
-            spec.delete(geom)
+    for geom in [x for x in spec.geoms if shapes & {x.meshname, x.hfieldname}]:
+        if geom.parent.name in moving_bodies and _contributes_mass(spec.compiler, geom):
+            lighter_bodies.setdefault(geom.parent.name, name)
+        spec.delete(geom)
     for item in removed:
         spec.delete(item)
     return bool(shapes)
 
 
 def _contributes_mass(settings: Any, geom: Any) -> bool:
-    """Whether a geom contributes to the mass of its body."""
     inertia_mode = int(settings.inertiafromgeom)
     is_explicit = inertia_mode == _AUTOMATIC_INERTIA and geom.parent.explicitinertial
     lowest, highest = settings.inertiagrouprange
@@ -328,10 +325,9 @@ class MujocoFile(ConversionNotes):
     @property
     def disabled_features(self) -> set[str]:
         """Names of the parts of MuJoCo's model that the file disables, such as CONTACT."""
-        bits = self._mujoco.mjtDisableBit.__members__
         return {
             name.partition("_")[2]
-            for name, bit in bits.items()
+            for name, bit in self._mujoco.mjtDisableBit.__members__.items()
             if name.startswith("mjDSBL_") and self.model.opt.disableflags & int(bit)
         }
 

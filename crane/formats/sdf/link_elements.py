@@ -162,8 +162,7 @@ def _count_open_edges(triangles: Array) -> int:
     points = triangles.reshape(-1, 3)
     grid = float(np.ptp(points, axis=0).max()) * 1e-9 or 1.0
     _, index = np.unique(np.round(points / grid), axis=0, return_inverse=True)
-    corners = index.reshape(-1, 3)
-    directed_edges = np.concatenate([corners[:, [i, (i + 1) % 3]] for i in range(3)])
+    directed_edges = index.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     directed_edges = directed_edges[directed_edges[:, 0] != directed_edges[:, 1]]
     sign = np.where(directed_edges[:, 0] < directed_edges[:, 1], 1, -1)
     _, edge = np.unique(np.sort(directed_edges, axis=1), axis=0, return_inverse=True)

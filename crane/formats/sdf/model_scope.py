@@ -237,7 +237,6 @@ class ModelReader:
         return scope
 
     def _read_children(self, scope: ModelScope, item: SdfElement, depth: int) -> None:
-        """Add the children of an element to a scope."""
         parts_by_tag = {"link": scope.links, "joint": scope.joints, "frame": scope.frames}
         for child in item.element:
             tag = child.tag
@@ -347,7 +346,6 @@ def _file_from_config(folder: Path) -> Path:
 
 
 def _parse_version(text: str) -> tuple[int, int]:
-    """Return an SDF version as numbers."""
     major, _, minor = text.strip().partition(".")
     try:
         return int(major), int(minor.partition(".")[0])

@@ -146,9 +146,8 @@ class SdfJoints:
         ends = self._end_node(scope, joint, "parent"), self._end_node(scope, joint, "child")
         if ends[0] == ends[1]:
             raise joint.error(f"{joint.label} joins '{ends[0]}' to itself")
-        child = joint.text("child")
         placement_in_scope = self._frames.element_pose(
-            scope, joint, "" if ends[1] == WORLD_NODE else child
+            scope, joint, "" if ends[1] == WORLD_NODE else joint.text("child")
         )
         scope_pose = self._frames.nested_model_pose(self._top, scope, scope.item)
         placement = scope_pose * placement_in_scope
@@ -182,7 +181,6 @@ class SdfJoints:
             self.edges.append(SdfJointEdge(name, edge_kind, *ends, placement, joint, axis))
 
     def _end_node(self, scope: ModelScope, joint: SdfElement, tag: str) -> str:
-        """Return the node at an end of a joint."""
         name = joint.text(tag)
         if not name:
             raise joint.error(f"{joint.label} has no <{tag}>, add it")

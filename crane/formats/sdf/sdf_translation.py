@@ -177,8 +177,7 @@ class _SdfTranslation:
                 initial = etree.SubElement(state, "joint", name=name, value=repr(axis.initial))
                 self._set_source_location(initial, axis.item)
         self._notes.warn_about_notes()
-        xml = XmlFile(self._xml.file, self._robot, self._locations)
-        return xml, tuple(self._springs)
+        return XmlFile(self._xml.file, self._robot, self._locations), tuple(self._springs)
 
     def _set_source_location(self, element: etree._Element, item: SdfElement) -> etree._Element:
         for inner in element.iter(etree.Element):
@@ -283,8 +282,7 @@ class _SdfTranslation:
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
                 end = etree.SubElement(loop, tag, link=self._link_name(link))
-                offset = self._link_poses[link].actInv(edge.placement)
-                add_origin(end, *xyz_rpy_from_se3(offset))
+                add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
             if edge.axis is not None:
                 etree.SubElement(loop, "axis", xyz=format_numbers(edge.axis.direction))
                 if finite_limits(edge.axis.limits) is not None:

@@ -77,7 +77,7 @@ def _read_inertial(xml: XmlFile, label: str, inertial: etree._Element, is_moved:
 
 
 def read_joint(
-    xml: XmlFile, name: str, element: etree._Element, end_links: tuple[str, str]
+    xml: XmlFile, name: str, element: etree._Element, end_links: tuple[str, str], is_cut: bool
 ) -> Joint:
     """Read a joint with one or no degree of freedom, except its limits.
 
@@ -86,11 +86,12 @@ def read_joint(
         name: Name of the joint.
         element: The `<joint>`.
         end_links: Parent and child link.
+        is_cut: Whether it closes a cycle.
     """
     label, kind = f"joint '{name}'", element.get("type")
-    xml.single_child(element, "mimic", label)
     xyz, rpy = xml.placement(element, label)
-    joint = Joint(name, kind, *end_links, xml.source_location(element), xyz, rpy)
+    place = xml.source_location(element)
+    joint = Joint(name, kind, *end_links, place, xyz, rpy, is_cut=is_cut)
     if kind == "fixed":
         return joint
     return dataclasses.replace(
@@ -282,12 +283,12 @@ def _link_in_cycle(parents: Mapping[str, tuple[str, str]], links: Iterable[str])
     """Return the first link that occurs twice among the ancestors of a link, None without one."""
     visited = {""}  # links whose ancestors have been followed
     for link in links:
-        seen = {link}
-        while link in parents and link not in visited:
-            link = parents[link][0]
-            if link in seen:
-                return link
+        seen: set[str] = set()
+        while link in parents and link not in visited and link not in seen:
             seen.add(link)
+            link = parents[link][0]
+        if link in seen:
+            return link
         visited |= seen
     return None
 

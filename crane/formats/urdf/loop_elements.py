@@ -176,8 +176,7 @@ def independent_joints(
         if joint.get("independent") == "false":
             continue
         if kind in MULTI_FREEDOM_TYPES:
-            freedoms = joint_freedoms(kind, (0.0, 0.0, 1.0))
-            names += [f"{name}_{suffix}" for suffix, _, _ in freedoms]
+            names += [f"{name}_{x[0]}" for x in joint_freedoms(kind, (0.0, 0.0, 1.0))]
         else:
             names.append(name)
     return tuple(names)

@@ -150,11 +150,10 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
             parts += _read_joint_series(xml, name, end_links[name], links, joints)
             continue
         with error_recovery():
-            single = read_joint(xml, name, joint, end_links[name])
-            parts.append(dataclasses.replace(single, is_cut=name in cut))
-            if single.is_movable:  # without limits if they are wrong
-                limits = read_limits(xml, name, joint)
-                parts[-1] = dataclasses.replace(parts[-1], limits=limits)
+            single = read_joint(xml, name, joint, end_links[name], name in cut)
+            parts.append(single)  # without limits if they are wrong
+            limits = read_limits(xml, name, joint) if single.is_movable else single.limits
+            parts[-1] = dataclasses.replace(single, limits=limits)
         with error_recovery(harmless=True):
             friction[name] = read_friction(xml, name, joint)
     independent_names = independent_joints(xml, joints)
@@ -190,7 +189,6 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
 
 
 def _check_elements(xml: XmlFile, edit: Callable[[XmlFile], None] | None) -> None:
-    """Check names of elements and attributes, and edit the elements."""
     if xml.root.tag != "robot":
         raise xml.error_at(
             xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>"

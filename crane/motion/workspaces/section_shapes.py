@@ -121,7 +121,6 @@ def _tip_singular_edges(
 def _find_crossings(
     patch: WorkspacePatch, crossing: Callable[[GridNode, GridNode], Array | None]
 ) -> dict[GridEdge, Array]:
-    """Crossings by edges of the grid."""
     a, b = patch.is_closed.shape
     crossings: dict[GridEdge, Array] = {}
     for i, j, side in itertools.product(range(a), range(b), (0, 1)):
@@ -240,10 +239,9 @@ def _subdivide_cell(
         ]
     if subdivisions == 0:
         return []
-    active = kinematics.machine.closure.active
 
     def midpoint(*corners: CellCorner) -> CellCorner | None:
-        target = np.mean([q[active] for q, _ in corners], axis=0)
+        target = np.mean([q for q, _ in corners], axis=0)[kinematics.machine.closure.active]
         q, is_closed = last_closed_configuration(kinematics.machine, corners[0][0], target)
         if not is_closed:
             return None

@@ -43,6 +43,8 @@ def workspace_extremes(
         limits: Limits (n,) of the active coordinates.
         curves: Singular curves.
     """
+    curve_positions = np.concatenate([np.empty((0, 2)), *(x.section_positions for x in curves)])
+    curve_q_a = [q_a for curve in curves for q_a in curve.q_a]
     results, signs = [], ((1.0, "least"), (-1.0, "largest"))
     names = enumerate(kinematics.section.coordinate_names)
     for (axis, name), (sign, adjective) in itertools.product(names, signs):
@@ -60,11 +62,11 @@ def workspace_extremes(
             kinematics.machine, q[best_index], kinematics.strokes, limits, objective
         )
         value, q_a = -sign * value, configuration[kinematics.machine.closure.active]
-        for curve in curves:
-            k = int((sign * curve.section_positions[:, axis]).argmin())
-            if sign * curve.section_positions[k, axis] < sign * value:
-                value, q_a = float(curve.section_positions[k, axis]), curve.q_a[k]
-        results.append(WorkspaceExtreme(f"{adjective} {name}", value, q_a))
+        coordinates = np.array([value, *curve_positions[:, axis]])
+        k = int((sign * coordinates).argmin())
+        results.append(
+            WorkspaceExtreme(f"{adjective} {name}", float(coordinates[k]), [q_a, *curve_q_a][k])
+        )
     return tuple(results)
 
 
@@ -172,7 +174,6 @@ def maximize_on_branch(
 
 
 def _satisfies_constraints(constraints: Sequence[ObjectiveConstraint], q: Array) -> bool:
-    """Whether a configuration satisfies all constraints."""
     values = [(kind, demand(q)[0]) for kind, demand in constraints]
     return all((abs(x) if kind == "eq" else -x) < _CONSTRAINT_TOLERANCE for kind, x in values)
 

@@ -270,7 +270,7 @@ def _closed_share(patches: list[WorkspacePatch], is_sliced: bool) -> float:
     closed = total = 0.0
     for k, patch in enumerate(patches):
         is_face = is_sliced and k in (0, len(patches) - 1)
-        weights = np.full(patch.is_closed.shape, 0.5 if is_face else 1.0)
+        weights: Array = np.full(patch.is_closed.shape, 0.5 if is_face else 1.0)
         weights[[0, -1]] *= 0.5
         if weights.shape[1] > 1:  # more than one stroke
             weights[:, [0, -1]] *= 0.5

@@ -156,28 +156,25 @@ def _close_row(
     targets = np.array([patch.active_coordinates(x) for x in row])
     if machine.closure.is_compiled:
         closed = _follow(machine, start, targets)
-        if closed is None:
-            return []
-        if len(closed) < len(row):
-            previous = closed[-1] if len(closed) else start
-            strokes = previous[machine.closure.active]
-            shares = np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None]
-            path = strokes + shares * (targets[len(closed)] - strokes)
-            steps = _follow(machine, previous, path)
-            if steps is not None and len(steps) == _CONTINUATION_STEPS:
-                closed = np.vstack([closed, steps[-1:]])
     else:
         last_configuration, is_closed = last_closed_configuration(machine, start, targets[0])
         closed = last_configuration[None][: int(is_closed)]
+    if machine.closure.is_compiled and len(closed) < len(row):
+        previous = closed[-1] if len(closed) else start
+        strokes = previous[machine.closure.active]
+        shares = np.linspace(0, 1, _CONTINUATION_STEPS + 1)[1:, None]
+        path = strokes + shares * (targets[len(closed)] - strokes)
+        steps = _follow(machine, previous, path)
+        if len(steps) == _CONTINUATION_STEPS:
+            closed = np.vstack([closed, steps[-1:]])
     for x, q in zip(row, closed, strict=False):
         patch.is_closed[x], patch.configurations[x] = True, q
     return row[: len(closed)]
 
 
-def _follow(machine: Machine, start: Array, targets: Array) -> Array | None:
-    """Configurations (k, nq) at the first k of targets (N, n), None if the start is singular."""
+def _follow(machine: Machine, start: Array, targets: Array) -> Array:
+    """Configurations (k, nq) at the first k of targets (N, n); none if the start is singular."""
     compiled_closure, out = machine.closure.compiled_closure, np.empty((len(targets), len(start)))
     cursor = compiled_closure.new_cursor()
-    if not compiled_closure.start_cursor_at(cursor, start):
-        return None
-    return out[: compiled_closure.follow_targets(cursor, targets, out)]
+    is_started = compiled_closure.start_cursor_at(cursor, start)
+    return out[: compiled_closure.follow_targets(cursor, targets, out) if is_started else 0]

@@ -174,7 +174,6 @@ class Workspace(Result):
     is_complete: bool
 
     def _one_line(self) -> str:
-        """Frame, strokes, and the share that closes."""
         return (
             f"Workspace of '{self.frame}' of '{self.machine.name}': {len(self.tip_positions)} "
             f"configurations over {', '.join(self.strokes)}, {100 * self.closed_share:.3g} % "
