@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.active_joint_selection import translational_coordinates
 from crane.closure.assembly_modes import AssemblyMode, find_alternative_assembly_modes
 from crane.closure.closure import Closure
 from crane.closure.constraint_structure import OpenLoopError
@@ -147,8 +146,9 @@ def _rounding_text(spec: MachineSpec, closure: Closure) -> str:
 
 
 def _coordinate_text(closure: Closure, column: int, value: float, verb: str = "") -> str:
-    unit = "m" if translational_coordinates(closure.model)[column] else "rad"
-    return f"{closure.equations.coordinates.names[column]}{verb} {value:.3g} {unit}"
+    coordinates = closure.equations.coordinates
+    unit = "m" if coordinates.is_translation[column] else "rad"
+    return f"{coordinates.names[column]}{verb} {value:.3g} {unit}"
 
 
 def _list_names(names: Sequence[str]) -> str:

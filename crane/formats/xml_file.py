@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from lxml import etree
 
 from crane.common.errors import DescriptionError, suggest_names
 from crane.common.package_search import read_plain_file
-from crane.description.findings import error_recovery, report_error
+from crane.description.findings import report_error
 from crane.description.kinematic_tree import Placement, Vector
 from crane.description.specification import AXISLESS_TYPES, unit_vector
 
@@ -25,25 +25,59 @@ _MAX_VALUE_LENGTH = 60  # characters shown
 _REPEATABLE_ELEMENTS = {"link", "joint", "loop", "visual", "collision"}
 
 
-class SourceLocations:
-    """Source locations of elements that come from several files.
+def set_source_location(element: etree._Element, location: str, locations: dict[str, int]) -> None:
+    """Set the source location of an element of an `XmlFile` whose parts come from several files.
 
     Args:
-        file: Name of the file, the location of elements without another.
+        element: The element.
+        location: File and line.
+        locations: Index of each location; the first is that of elements without another.
     """
+    number = locations.setdefault(location, len(locations))
+    element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
 
-    def __init__(self, file: str):
-        self._numbers = {file: 0}
 
-    @property
-    def locations(self) -> list[str]:
-        """All locations."""
-        return list(self._numbers)
+def _read_root(file: Path) -> etree._Element:
+    """Read the root element of a file, without comments.
 
-    def set_location(self, element: etree._Element, location: str) -> None:
-        """Set the location of an element."""
-        number = self._numbers.setdefault(location, len(self._numbers))
-        element.sourceline = number if number < _MAX_LINE_NUMBER else 0  # 16 bits in libxml2
+    <!DOCTYPE> is refused, because its entities can expand without bounds or read other files.
+    """
+    try:
+        data = read_plain_file(file, MAX_FILE_SIZE)
+    except OSError as error:
+        raise DescriptionError(
+            f"{file}: cannot be read ({error.strerror}), check the path"
+        ) from None
+    if not data.strip():
+        element = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
+        raise DescriptionError(f"{file.name}: the file is empty, write {element} in it")
+    if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError as error:
+            line = data.count(b"\n", 0, error.start) + 1
+            raise DescriptionError(
+                f"{file.name}:{line}: not UTF-8, save it as UTF-8 or declare its encoding"
+            ) from None
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+    )
+    line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
+    document_type_error = DescriptionError(
+        f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
+    )
+    try:
+        root = etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        if b"<!DOCTYPE" in data or re.search("amplification|reference loop", error.msg or ""):
+            raise document_type_error from None
+        text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
+        raise DescriptionError(
+            f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
+        ) from None
+    if root.getroottree().docinfo.doctype:
+        raise document_type_error
+    return root
 
 
 class XmlFile:
@@ -51,65 +85,25 @@ class XmlFile:
 
     Args:
         file: The file.
+        root: Its root element if the file was expanded; else the file is read.
+        locations: Source locations if elements come from several files.
 
     Attributes:
         file: The file.
         root: Its root element, without comments.
         unnamed_kinds: Tags of elements of which one has no unique name.
-        locations: Source locations if elements come from several files; `sourceline` of an element
-            is then an index in this list.
+        locations: As given; `sourceline` of an element is then an index in this list.
 
     Raises:
         DescriptionError: The file cannot be read, is not XML, or has a document type.
     """
 
-    def __init__(self, file: Path):
-        self.file = file
+    def __init__(
+        self, file: Path, root: etree._Element | None = None, locations: Iterable[str] = ()
+    ):
+        self.file, self.locations = file, list(locations)
         self.unnamed_kinds: set[str] = set()
-        self.locations: Sequence[str] = ()
-        try:
-            data = read_plain_file(file, MAX_FILE_SIZE)
-        except OSError as error:
-            raise DescriptionError(
-                f"{file}: cannot be read ({error.strerror}), check the path"
-            ) from None
-        if not data.strip():
-            root = _ROOT_ELEMENTS.get(file.suffix.lower(), "a <robot>")
-            raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
-        if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
-            try:
-                data.decode("utf-8")
-            except UnicodeDecodeError as error:
-                line = data.count(b"\n", 0, error.start) + 1
-                raise DescriptionError(
-                    f"{file.name}:{line}: not UTF-8, save it as UTF-8 or declare its encoding"
-                ) from None
-        parser = etree.XMLParser(
-            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
-        )
-        line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
-        # its entities can expand without bounds or read other files
-        document_type_error = DescriptionError(
-            f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
-        )
-        try:
-            self.root = etree.fromstring(data, parser)
-        except etree.XMLSyntaxError as error:
-            if b"<!DOCTYPE" in data or re.search("amplification|reference loop", error.msg or ""):
-                raise document_type_error from None
-            text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
-            raise DescriptionError(
-                f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
-            ) from None
-        if self.root.getroottree().docinfo.doctype:
-            raise document_type_error
-
-    @classmethod
-    def from_root(cls, file: Path, root: etree._Element, locations: Sequence[str]) -> "XmlFile":
-        """Return an expanded file: its root element, and the source locations of its parts."""
-        xml = cls.__new__(cls)
-        xml.file, xml.root, xml.unnamed_kinds, xml.locations = file, root, set(), locations
-        return xml
+        self.root = _read_root(file) if root is None else root
 
     def source_location(self, element: etree._Element) -> str:
         """Return file and line of an element."""
@@ -228,15 +222,17 @@ class XmlFile:
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
         """Read finite numbers, see `number`."""
-        with error_recovery():
-            text = element.get(name)
-            if text is None and default is not None:
-                return default
+        text = element.get(name)
+        if text is None and default is not None:
+            return default
+        try:
             if text is None:
                 raise self.error_at(element, f'{label} has no {name}, add {name}="..."')
-            short = text if len(text) < _MAX_VALUE_LENGTH else f"{text[:_MAX_VALUE_LENGTH]}..."
+            short = text if len(text) < _MAX_VALUE_LENGTH else text[:_MAX_VALUE_LENGTH] + "..."
             return self.parse_numbers(element, text, f'{name}="{short}" of {label}', length)
-        return (math.nan,) * length
+        except DescriptionError as error:
+            report_error(error)
+            return (math.nan,) * length
 
     def parse_numbers(
         self, element: etree._Element, text: str, label: str, length: int
@@ -252,9 +248,8 @@ class XmlFile:
         Raises:
             DescriptionError: The text is something else.
         """
-        words = text.split()
         try:
-            values = tuple(float(word) for word in words)
+            values = tuple(float(word) for word in text.split())
         except ValueError:
             hint = "write digits"
             if "," in text:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.active_joint_selection import coordinate_units
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
@@ -194,7 +193,7 @@ def _scan_joint_range(
     column, index = machine.column(joint), machine.active.index(joint)
     home = float(machine.home[column])
     default_range = (
-        np.pi if machine.unit(joint) == "rad" else float(coordinate_units(machine.model)[column])
+        np.pi if machine.unit(joint) == "rad" else float(machine.coordinates.units[column])
     )
     lower, upper = (float(limits[index]) for limits in (machine.lower, machine.upper))
     lower = lower if np.isfinite(lower) else min(home, upper) - default_range

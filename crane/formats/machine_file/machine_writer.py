@@ -38,8 +38,7 @@ from crane.formats.machine_file.force_sections import external_force_data, load_
 from crane.formats.machine_file.identification_sections import estimation_data
 from crane.formats.machine_file.machine_reader import read_machine_spec
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
-from crane.formats.urdf_elements import add_joint, add_link
-from crane.formats.urdf_output import (
+from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
     copy_shapes,
     format_document,
@@ -47,6 +46,7 @@ from crane.formats.urdf_output import (
     rotor_inertias,
     with_floating_joints,
 )
+from crane.formats.urdf_elements import add_joint, add_link
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine
