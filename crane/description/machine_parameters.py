@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
@@ -101,29 +102,31 @@ def parameter_paths(spec: Any) -> dict[str, FieldPath]:
         name: ("tree", "links" if isinstance(owner, Link) else "joints", owner.name, *field_path)
         for name, owner, field_path in tree_parameters(spec.tree, spec.chains)
     }
-    for section, joints, element_type in (
-        ("friction", [joint.name for joint in spec.tree.moving_joints], Friction),
-        ("control", list(spec.control), PIGains),
-    ):
-        for joint in joints:
-            for field in dataclasses.fields(element_type):
-                paths[f"{section}.{joint}.{field.name}"] = section, joint, field.name
-    prefixes: dict[str, int] = {}
+    parts: list[tuple[str, FieldPath, type]] = [
+        (f"friction.{joint.name}", ("friction", joint.name), Friction)
+        for joint in spec.tree.moving_joints
+    ]
+    parts += [(f"control.{joint}", ("control", joint), PIGains) for joint in spec.control]
+    counts: Counter[str] = Counter()
     for prefix, section in ELEMENT_FIELDS.items():
         for i, element in enumerate(getattr(spec, section)):
-            between = getattr(element, "between", None)
-            label = f"{prefix}.{'-'.join(between) if between else element.joint}"
-            prefixes[label] = prefixes.get(label, 0) + 1
-            if prefixes[label] > 1:
-                label += f"#{prefixes[label]}"
-            for field in dataclasses.fields(element):
-                if field.name not in ("joint", "between"):
-                    paths[f"{label}.{field.name}"] = section, i, field.name
+            label = f"{prefix}.{'-'.join(getattr(element, 'between', None) or [element.joint])}"
+            counts[label] += 1
+            number_text = f"#{counts[label]}" if counts[label] > 1 else ""
+            parts.append((label + number_text, (section, i), type(element)))
+    paths |= {
+        f"{prefix}.{field.name}": (*path, field.name)
+        for prefix, path, part_type in parts
+        for field in dataclasses.fields(part_type)
+        if field.name not in ("joint", "between")
+    }
     if spec.hydraulics is not None:
-        for prefix, path in _component_paths(spec.hydraulics).items():
-            for name in parameter_names(type(value_at(spec.hydraulics, path))):
-                if not (prefix.startswith("supply.") and name == "tank"):
-                    paths[f"{prefix}.{name}"] = "hydraulics", *path, name
+        paths |= {
+            f"{prefix}.{name}": ("hydraulics", *path, name)
+            for prefix, path in _component_paths(spec.hydraulics).items()
+            for name in parameter_names(type(value_at(spec.hydraulics, path)))
+            if not (prefix.startswith("supply.") and name == "tank")
+        }
     return paths | {
         f"{PINS_PREFIX}{name}": ("pin_capacities", name) for name in spec.pin_capacities
     }

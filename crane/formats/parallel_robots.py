@@ -16,8 +16,8 @@ from crane.description.key_types import (
 from crane.description.kinematic_tree import Joint, Link, Tree, joint_series
 from crane.description.specification import Chain, Drive, LoopSpec, MachineSpec, source_locations
 from crane.formats.machine_file.structure_sections import TreeBuilder, read_home
-from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE, format_value
 from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE, format_value
 from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
 from crane.formats.xml_file import XmlFile
@@ -81,8 +81,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
             f"{urdf.loops[0].source_location}: the loops stand in {path.name}, keep <loop> or "
             "closed_loop"
         )
-    name = urdf.name
-    chain = Chain(name, file, None, path.name, urdf.moving_joints)
+    chain = Chain(urdf.name, file, None, path.name, urdf.moving_joints)
     tree = TreeBuilder()
     tree.add_chain(chain, urdf)
     if not tree.joints:
@@ -96,15 +95,13 @@ def read_parallel_robot(path: Path) -> MachineSpec:
                 f"the motor '{joint}' is {replaced_types[joint]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.source_location("name_mot"))
-    home, home_lines = read_home(top, tree)
-    locations = {"active": top.source_location("name_mot")} | source_locations(
-        loops, urdf.couplings
-    )
-    locations |= {f"home {joint}": place for joint, place in home_lines.items()}
+    home, home_locations = read_home(top, tree)
+    locations = source_locations(loops, urdf.couplings) | home_locations
+    locations["active"] = top.source_location("name_mot")
     if "home" in top:
         locations["home"] = top.source_location("home")
     return MachineSpec(
-        name=name,
+        name=urdf.name,
         source=path.name,
         path=path,
         chains=(chain,),
@@ -165,25 +162,20 @@ def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) ->
     """Return the URDF with a universal joint as two joints, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
-        if isinstance(part, Joint) and part.name == name:
-            parts += _universal_joint_parts(part, axes, urdf.tree)
-        else:
+        if not isinstance(part, Joint) or part.name != name:
             parts.append(part)
-    return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
-
-
-def _universal_joint_parts(joint: Joint, axes: tuple[str, str], tree: Tree) -> list[Link | Joint]:
-    """Return the joints and links of a universal joint; their names must be unused."""
-    freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
-    place, end_links = (joint.xyz, joint.rpy), (joint.parent, joint.child)
-    parts = joint_series(joint.name, freedoms, place, end_links, joint.source_location)
-    for made in parts:
-        if made.name in (tree.links if isinstance(made, Link) else tree.joints):
+            continue
+        freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
+        placement, end_links = (part.xyz, part.rpy), (part.parent, part.child)
+        series = joint_series(name, freedoms, placement, end_links, part.source_location)
+        used_names = {(type(x), x.name) for x in urdf.tree}
+        if taken := [x.name for x in series if (type(x), x.name) in used_names]:
             raise DescriptionError(
-                f"{joint.source_location}: joint '{joint.name}' makes '{made.name}', which is "
-                "there already, rename one"
+                f"{part.source_location}: joint '{name}' makes '{taken[0]}', which is there "
+                "already, rename one"
             )
-    return parts
+        parts += series
+    return dataclasses.replace(urdf, tree=Tree({}, {}).with_parts(*parts))
 
 
 def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:

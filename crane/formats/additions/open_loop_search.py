@@ -1,10 +1,11 @@
 """Search for loops that a description leaves open.
 
 There are three indications: frames that are named as the two ends of a loop (see
-`crane.formats.machine_file.open_loop_warning`), ends of bodies that coincide at home, and a barrel
-and a rod on two bodies that point at each other.
+`crane.formats.machine_file.structure_sections`), ends of bodies that coincide at home, and a
+barrel and a rod on two bodies that point at each other.
 """
 
+import itertools
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from crane.common.samples import Array
 from crane.description.kinematic_tree import Joint, Vector, to_vector
 from crane.description.specification import LoopSpec, MachineSpec
 from crane.formats.additions.steel_cylinder import joints_between
-from crane.formats.machine_file.open_loop_warning import loop_end_pairs
+from crane.formats.machine_file.structure_sections import loop_end_pairs
 
 # largest gaps relative to the characteristic length, the second without a common normal
 _MAX_GAP_SHARE = 0.05
@@ -111,9 +112,9 @@ class _OpenLoopSearch:
                 ends = {proposal.loop.predecessor, proposal.loop.successor}
                 if self._bodies_of(ends) in closed_bodies or ends & used_frames:
                     continue
-                name, number = proposal.loop.name, 2
-                while name in names:
-                    name, number = f"{proposal.loop.name}_{number}", number + 1
+                stem = proposal.loop.name
+                numbered = (f"{stem}_{number}" for number in itertools.count(2))
+                name = next(x for x in itertools.chain([stem], numbered) if x not in names)
                 names.add(name)
                 proposed.append(replace(proposal, loop=replace(proposal.loop, name=name)))
                 closed_bodies.add(self._bodies_of(ends))
@@ -122,15 +123,13 @@ class _OpenLoopSearch:
 
     def _named_proposals(self) -> Iterator[LoopProposal]:
         for name, first, second in loop_end_pairs(self.spec.tree):
-            if len(self._bodies_of((first, second))) == 2:
-                kind, axis = self._loop_type_and_axis(first, second)
-                if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
-                    kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
-                yield LoopProposal(
-                    LoopSpec(name, kind, first, second, axis, ""),
-                    self._gap(first, second),
-                    is_named=True,
-                )
+            if len(self._bodies_of((first, second))) < 2:
+                continue
+            kind, axis = self._loop_type_and_axis(first, second)
+            if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
+                kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
+            loop = LoopSpec(name, kind, first, second, axis, "")
+            yield LoopProposal(loop, self._gap(first, second), is_named=True)
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
         """Yield loops between a barrel and a rod, each on its own pin."""

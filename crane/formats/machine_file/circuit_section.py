@@ -17,8 +17,8 @@ from crane.common.plausible_ranges import implausible_value_text
 from crane.description.circuit_schema import AREA_KEYS, BORE_KEYS, ORIFICE_KEYS
 from crane.description.findings import FollowUpError, UnknownNames, error_recovery, report_error
 from crane.formats.machine_file.structure_sections import TreeBuilder
-from crane.formats.machine_file.yaml_parser import MAX_FILE_SIZE
 from crane.formats.machine_file.yaml_section import YamlSection
+from crane.formats.machine_file.yaml_text import MAX_FILE_SIZE
 from crane.hydraulics.circuit_elements import MAIN_PUMP, Supply
 from crane.hydraulics.components import (
     COUNTERBALANCE_KEYS,

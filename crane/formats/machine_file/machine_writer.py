@@ -35,8 +35,7 @@ from crane.description.machine_schema import (
 from crane.description.sensors import SENSOR_PARAMETERS, SENSOR_PREFIX, quantity_unit
 from crane.description.specification import LoopSpec, Task
 from crane.formats.machine_file.force_sections import external_force_data, load_data
-from crane.formats.machine_file.identification_sections import estimation_data
-from crane.formats.machine_file.machine_reader import read_machine_spec
+from crane.formats.machine_file.machine_reader import estimation_data, read_machine_spec
 from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.urdf.urdf_writer import (
     compound_drive_factors,
@@ -288,7 +287,7 @@ def _machine_data(machine: Machine) -> dict[str, Any]:
             for name, sensor in machine.sensors.items()
             if quantity_unit(machine.tree, name) is not None  # a joint that is locked has none
         },
-        "identification": estimation_data(machine),
+        "identification": estimation_data(machine.estimation),
     }
     data |= MACHINE.values_of(machine, *data)
     return {key: data[key] for key in MACHINE.keys if key in data}

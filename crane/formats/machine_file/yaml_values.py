@@ -19,7 +19,7 @@ from crane.description.key_types import (
     SectionSchema,
     TextKey,
 )
-from crane.formats.machine_file.yaml_parser import LocatedMapping, format_value
+from crane.formats.machine_file.yaml_text import LocatedMapping, format_value
 
 _BOOLEAN_WORDS = {"on": True, "yes": True, "true": True, "off": False, "no": False, "false": False}
 
