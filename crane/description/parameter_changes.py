@@ -64,10 +64,14 @@ def apply_parameter_changes(spec: MachineSpec, changes: Mapping[str, float]) -> 
             new_values[*path[:-1], "source_location"] = f"changed by {name}"
         new_values[path] = value
     changed_joints = [str(path[1]) for path in new_values if path[0] == "friction"]
-    friction = {**spec.friction} | {
-        joint: Friction() for joint in changed_joints if joint not in spec.friction
-    }
-    changed = _replace_values(dataclasses.replace(spec, friction=friction), new_values)
+    changed = _replace_values(
+        dataclasses.replace(
+            spec,
+            friction={**spec.friction}
+            | {joint: Friction() for joint in changed_joints if joint not in spec.friction},
+        ),
+        new_values,
+    )
     for name, value in values.items():
         if name not in sensor_changes and paths[name][0] == "hydraulics":
             _warn_about_unit(spec, name, value)
@@ -105,8 +109,9 @@ def _replace_values(owner: T, new_values: Mapping[FieldPath, Any]) -> T:
     replaced: dict[Any, Any] = {}
     container: Any = owner
     for key, values in values_by_key.items():
-        part = value_at(owner, (key,))
-        replaced[key] = values[()] if () in values else _replace_values(part, values)
+        replaced[key] = (
+            values[()] if () in values else _replace_values(value_at(owner, (key,)), values)
+        )
     if isinstance(container, tuple):
         container = tuple(replaced.get(i, item) for i, item in enumerate(container))
     elif isinstance(container, dict):

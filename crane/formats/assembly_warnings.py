@@ -176,11 +176,10 @@ def warn_about_assembly_modes(
         return
     is_from_simulator = is_simulator_file(spec.path)
     names = closure.equations.coordinates.names
-    is_specified = [is_from_simulator or name in spec.home for name in names]
     alternatives = find_alternative_assembly_modes(
         closure,
         initial_guess,
-        np.flatnonzero(is_specified),
+        np.flatnonzero([is_from_simulator or name in spec.home for name in names]),
         _THOROUGH_STARTS if thorough else _QUICK_STARTS,
     )
     remainder = ""

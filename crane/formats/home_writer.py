@@ -76,8 +76,7 @@ def write_home(
         edited = text.removeprefix(_BYTE_ORDER_MARK)
         for start, end, new in sorted(find_edits(edited, home), reverse=True):
             edited = edited[:start] + new + edited[end:]
-        has_mark = text.startswith(_BYTE_ORDER_MARK)
-        _replace_text(path, _BYTE_ORDER_MARK * has_mark + edited)
+        _replace_text(path, _BYTE_ORDER_MARK * text.startswith(_BYTE_ORDER_MARK) + edited)
         try:
             _check_written_home(path, machine)
         except CraneError:
@@ -93,8 +92,12 @@ def _replace_text(path: Path, text: str) -> None:
 
 
 def _without_lenience(machine: Machine) -> Machine:
-    arguments = {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
-    return replace(machine, arguments=MappingProxyType(arguments))
+    return replace(
+        machine,
+        arguments=MappingProxyType(
+            {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
+        ),
+    )
 
 
 def _check_is_writable(machine: Machine, path: Path) -> None:

@@ -94,8 +94,9 @@ def load(
         use_load_options(package_paths, values, bool(floating), strict) as options,
     ):
         chosen_joints = _check_chosen_joints(active=active, free=free)
-        spec = _read_spec(name, chosen_joints, floating)
-        machine = _assemble_machine(spec, changes, lock, chosen_joints, floating)
+        machine = _assemble_machine(
+            _read_spec(name, chosen_joints, floating), changes, lock, chosen_joints, floating
+        )
         return replace(
             machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
         )

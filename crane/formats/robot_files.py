@@ -55,8 +55,9 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
     root = etree.fromstring(answer["text"].encode("utf-8"), parser)
     locations = {xml.file.name: 0}
     for element in root.iter(etree.Element):
-        place = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1")
-        number, _, line = place.partition(":")
+        number, _, line = element.attrib.pop(xacro_process.LOCATION_ATTRIBUTE, "0:1").partition(
+            ":"
+        )
         file_name = Path(answer["files"][int(number)]).name
         set_source_location(element, f"{file_name}:{line}", locations)
     return XmlFile(xml.file, root, locations)

@@ -128,8 +128,11 @@ class _OpenLoopSearch:
             kind, axis = self._loop_type_and_axis(first, second)
             if re.match(r"closed?_?loop", name, re.IGNORECASE):  # example-parallel-robots
                 kind, axis = "spherical" if "3d" in name.lower() else "fixed", _Z
-            loop = LoopSpec(name, kind, first, second, axis, "")
-            yield LoopProposal(loop, self._gap(first, second), is_named=True)
+            yield LoopProposal(
+                LoopSpec(name, kind, first, second, axis, ""),
+                self._gap(first, second),
+                is_named=True,
+            )
 
     def _slide_proposals(self) -> Iterator[LoopProposal]:
         """Yield loops between a barrel and a rod, each on its own pin."""

@@ -241,8 +241,11 @@ def _total_inertial(*inertias: pin.Inertia) -> Inertial:
 def _add_cylinder_visual(link: etree._Element, start: float, end: float, diameter: float) -> None:
     visual = etree.SubElement(link, "visual")
     add_origin(visual, ((start + end) / 2, 0, 0), (0, math.pi / 2, 0))
-    size = {"radius": format_numbers([diameter / 2]), "length": format_numbers([end - start])}
-    etree.SubElement(etree.SubElement(visual, "geometry"), "cylinder", size)
+    etree.SubElement(
+        etree.SubElement(visual, "geometry"),
+        "cylinder",
+        {"radius": format_numbers([diameter / 2]), "length": format_numbers([end - start])},
+    )
 
 
 _OFFSET_TOLERANCE = 1e-6  # relative to the cylinder's length
@@ -303,9 +306,10 @@ def add_barrel_and_rod(
         )
     )
     home = dict(zip(machine.joints, q.tolist(), strict=True))
-    pins = [f"{name}_pin"] if is_planar else [f"{name}_pin_y", f"{name}_pin_z"]
     draft.data["home"] = (
-        home | dict.fromkeys(pins, 0.0) | {name: length - cylinder.retracted_length}
+        home
+        | dict.fromkeys([f"{name}_pin"] if is_planar else [f"{name}_pin_y", f"{name}_pin_z"], 0.0)
+        | {name: length - cylinder.retracted_length}
     )
     return notes
 
@@ -355,7 +359,6 @@ def _cylinder_urdf(
             Joint(f"{name}_pin_z", "revolute", cross, barrel, "", axis=_Z),
         ]
     links += [Link(barrel, "", cylinder.barrel_inertial), Link(rod, "", cylinder.rod_inertial)]
-    limits = Limits(0.0, cylinder.stroke, cylinder.max_force)
     slide = Joint(
         name,
         "prismatic",
@@ -364,7 +367,7 @@ def _cylinder_urdf(
         "",
         to_vector(np.array([cylinder.retracted_length, 0, 0])),
         axis=_X,
-        limits=limits,
+        limits=Limits(0.0, cylinder.stroke, cylinder.max_force),
     )
     for link in links:
         add_link(robot, link)

@@ -419,5 +419,4 @@ def _coefficient_factor(section: YamlSection, quantity: str) -> float:
         if not drop > 0:
             raise InputError("'drop' is 0, give the pressure drop that the flows were measured at")
         return 1.0 / math.sqrt(drop)
-    discharge = section.number("discharge")
-    return discharge * math.sqrt(2.0 / section.number("density"))
+    return section.number("discharge") * math.sqrt(2.0 / section.number("density"))

@@ -78,8 +78,9 @@ class _SchemaDefinitions:
         excluded: dict[str, list[dict[str, Any]]] = {}
         for first, second, _ in section.exclusive:
             for key in first:
-                others_of_key = [{"required": [x]} for x in second if x != key]
-                excluded.setdefault(key, []).extend(others_of_key)
+                excluded.setdefault(key, []).extend(
+                    [{"required": [x]} for x in second if x != key]
+                )
         return {
             "type": ["object", "null"],
             "properties": {

@@ -233,9 +233,10 @@ class MachineDraft:
         circuit = nonempty.get("hydraulics", {})
         if not circuit.get("oil", True):
             nonempty["hydraulics"] = {k: value for k, value in circuit.items() if k != "oil"}
-        header = "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
         (folder / file).write_text(
-            header + format_yaml(nonempty, self._line_notes), encoding="utf-8"
+            "".join(f"# {format_one_line(line)}\n" for line in self._header_notes)
+            + format_yaml(nonempty, self._line_notes),
+            encoding="utf-8",
         )
 
     def _path_from_file(self, file: str) -> str:

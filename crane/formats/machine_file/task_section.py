@@ -50,9 +50,8 @@ def read_tasks(
             task = _read_via_task(name, item, active, tip)
         else:
             task = _read_continuous_task(name, item, spaces)
-        description = item.text("description")
         return dataclasses.replace(
-            task, description=description, loads=read_loads(item, tree, has_phases)
+            task, description=item.text("description"), loads=read_loads(item, tree, has_phases)
         )
 
     return top.read_map("tasks", read_task)
@@ -69,9 +68,14 @@ def _read_continuous_task(
         raise item.error_at(None, f"task '{name}' has none of {MOTIONS}, give one")
     motion.check_keys(spaces[space])
     if space == "joystick":
-        levers = item.value_map(space, lambda part, joint: _read_lever(part, joint, duration))
         return Task(
-            name, "", duration, space, {}, levers, start=_read_start(name, item, spaces["active"])
+            name,
+            "",
+            duration,
+            space,
+            {},
+            item.value_map(space, lambda part, joint: _read_lever(part, joint, duration)),
+            start=_read_start(name, item, spaces["active"]),
         )
     coefficients = {}
     for coordinate in spaces[space]:
@@ -135,11 +139,17 @@ def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: s
         missing = [x for x in required if x not in via_points[i].point]
         if missing:
             raise points[i].error_at(None, f"the {which} {title} has no '{missing[0]}', add it")
-    ordered = tuple(
-        ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
-        for one in via_points
+    return Task(
+        name,
+        "",
+        via_points[-1].time,
+        space,
+        {},
+        via=tuple(
+            ViaPoint(one.time, {x: one.point[x] for x in required if x in one.point}, one.rates)
+            for one in via_points
+        ),
     )
-    return Task(name, "", via_points[-1].time, space, {}, via=ordered)
 
 
 def _read_via_point(point: YamlSection, title: str) -> ViaPoint:

@@ -142,8 +142,11 @@ def _construct_mapping(loader: Any, node: yaml.MappingNode) -> LocatedMapping:
             continue
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
-            number = isinstance(key, int) and not isinstance(key, bool)
-            hint = ", and decimals with a point" if number else ""
+            hint = (
+                ", and decimals with a point"
+                if (isinstance(key, int) and not isinstance(key, bool))
+                else ""
+            )
             problem = f"key {format_value(key)} is not a name, write names in quotes{hint}"
             report_error(DescriptionError(f"{where}: {problem}"))
             continue
