@@ -11,7 +11,7 @@ from crane.common.errors import InputError, check_name
 
 if TYPE_CHECKING:
     from crane.common.samples import Array
-    from crane.description.estimation_settings import ParameterPrior, TermValues
+    from crane.description.specification import ParameterPrior, TermValues
 
 CONFIGURATION_FORM = "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
 _VALUE_FORM = "JOINT=VALUE, as in X1=0.5"
@@ -188,7 +188,7 @@ def parse_priors(texts: Sequence[str] | None) -> "dict[str, ParameterPrior] | No
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import ParameterPrior
+    from crane.description.specification import ParameterPrior
 
     if texts and list(texts) == ["none"]:
         return None
@@ -212,7 +212,7 @@ def parse_trials(texts: Sequence[str] | None) -> "dict[str, list[float | Paramet
     Raises:
         InputError: A text has another form, or a name is given twice.
     """
-    from crane.description.estimation_settings import ParameterPrior
+    from crane.description.specification import ParameterPrior
 
     def parse(name: str, values: str | None) -> "list[float | ParameterPrior]":
         words = (values or "").split(",")

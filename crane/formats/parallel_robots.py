@@ -180,7 +180,19 @@ def _split_universal_joint(urdf: UrdfModel, name: str, axes: tuple[str, str]) ->
 
 def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Return the loops between the frames of `closed_loop`: spherical or fixed."""
-    pairs = _read_pairs(top, "closed_loop") if "closed_loop" in top else []
+    pairs: list[list[str]] = []
+    if "closed_loop" in top:
+        pairs = top.read_list(
+            "closed_loop",
+            "give a list of pairs [[a, b]]",
+            lambda item: isinstance(item, list) and len(item) == 2,
+            "write pairs as [a, b]",
+        )
+    for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
+        raise top.error_at(
+            "closed_loop",
+            f"'closed_loop' lists {format_value(invalid)}, which is not a name, quote it",
+        )
     kinds = _read_texts(top, "type") if "type" in top else ["6d"] * len(pairs)
     if len(kinds) != len(pairs):
         raise top.error_at(
@@ -221,20 +233,6 @@ def _read_loops(top: YamlSection, urdf: UrdfModel, tree: TreeBuilder) -> tuple[L
 
 def _read_texts(top: YamlSection, key: str) -> list[str]:
     return top.read_list(key, "give a list such as [a, b]", _is_text, "which is no text, quote it")
-
-
-def _read_pairs(top: YamlSection, key: str) -> list[list[str]]:
-    pairs = top.read_list(
-        key,
-        "give a list of pairs [[a, b]]",
-        lambda item: isinstance(item, list) and len(item) == 2,
-        "write pairs as [a, b]",
-    )
-    for invalid in [x for pair in pairs for x in pair if not _is_text(x)]:
-        raise top.error_at(
-            key, f"'{key}' lists {format_value(invalid)}, which is not a name, quote it"
-        )
-    return pairs
 
 
 def _is_text(value: object) -> bool:

@@ -20,7 +20,6 @@ from crane.common.errors import InputError, LimitError, suggest_names
 from crane.common.one_line_repr import OneLineRepr, format_count
 from crane.common.package_search import LoadOptions
 from crane.common.samples import Array, as_samples, read_only_copy
-from crane.description.estimation_settings import EstimationSettings
 from crane.description.external_forces import ExternalForce, PhasedWrench
 from crane.description.force_elements import (
     AnyForceElement,
@@ -39,7 +38,7 @@ from crane.description.machine_lookup import (
 )
 from crane.description.pinocchio_conversion import add_rigid_load
 from crane.description.sensors import Sensor
-from crane.description.specification import Chain, Drive, PIGains, Task
+from crane.description.specification import Chain, Drive, EstimationSettings, PIGains, Task
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine_checks import check_force_elements, check_limited
 from crane.machine.payload import Payload

@@ -17,13 +17,14 @@ from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.samples import Array
 from crane.description.findings import is_strict, report_error
 from crane.description.force_elements import AnyForceElement, GasSpring, element_name
-from crane.description.inertia_feasibility import (
+from crane.description.kinematic_tree import (
     InertiaProblem,
+    Joint,
+    Link,
     format_inertia,
     inertia_problem,
     nearest_inertia,
 )
-from crane.description.kinematic_tree import Joint, Link
 from crane.description.specification import MachineSpec
 from crane.machine.machine_assembly import assemble_tree
 

@@ -230,10 +230,7 @@ def _tube_inertia(start: float, end: float, inner: float, outer: float) -> pin.I
 
 
 def _total_inertial(*inertias: pin.Inertia) -> Inertial:
-    whole = inertias[0]
-    for part in inertias[1:]:
-        whole = whole + part
-    found = inertial_from_inertia(whole)
+    found = inertial_from_inertia(sum(inertias[1:], start=inertias[0]))
     assert found is not None
     return found
 

@@ -6,7 +6,7 @@ import itertools
 import math
 import string
 import warnings
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -70,16 +70,8 @@ def read_hydraulics(
     driving_joints = section.known_item_names("cylinders") + section.known_item_names("motors")
     check_joint = partial(check_active_joint, active)
 
-    def read_cylinder(joint: str, item: YamlSection) -> Cylinder:
-        return _read_cylinder(joint, item, tree, supply)
-
-    def read_motor(joint: str, item: YamlSection) -> Cylinder:
-        if joint in cylinders:
-            raise item.error_at(None, f"'{joint}' has a cylinder and a motor, keep one of them")
-        return _read_motor(joint, item, supply)
-
-    cylinders = section.read_map("cylinders", read_cylinder, check_joint)
-    cylinders |= section.read_map("motors", read_motor, check_joint)
+    cylinders = section.read_map("cylinders", partial(_read_cylinder, tree, supply), check_joint)
+    cylinders |= section.read_map("motors", partial(_read_motor, cylinders, supply), check_joint)
     valves = section.read_map("valves", _read_valve, check_joint)
     joints_by_component = {"cylinder": driving_joints, "valve": section.known_item_names("valves")}
     named_joints = (*driving_joints, *joints_by_component["valve"])
@@ -216,7 +208,7 @@ def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinde
 
 
 def _read_cylinder(
-    joint: str, item: YamlSection, tree: TreeBuilder, supply: Supply | None
+    tree: TreeBuilder, supply: Supply | None, joint: str, item: YamlSection
 ) -> Cylinder:
     if missing_limit := tree.missing_limit_text(joint):
         report_error(
@@ -258,8 +250,12 @@ def _read_cylinder(
     return cylinder
 
 
-def _read_motor(joint: str, item: YamlSection, supply: Supply | None) -> Cylinder:
+def _read_motor(
+    cylinders: Container[str], supply: Supply | None, joint: str, item: YamlSection
+) -> Cylinder:
     """A motor as a cylinder with equal areas; its joint turns slower by the gear."""
+    if joint in cylinders:
+        raise item.error_at(None, f"'{joint}' has a cylinder and a motor, keep one of them")
     values = item.values()
     size = {key: values.pop(key, 1.0) for key in ("displacement", "gear", "volume")}
     for key, value in size.items():

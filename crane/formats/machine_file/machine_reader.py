@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 from crane.common.errors import DescriptionError, InputError, suggest_names
 from crane.common.package_search import load_options
 from crane.common.units import accepted_units
-from crane.description.estimation_settings import EstimationSettings, ParameterPrior, TermValues
 from crane.description.external_forces import ExternalForce
 from crane.description.findings import UnknownNames, error_recovery, report_error
 from crane.description.ground_contact import Contact
@@ -27,11 +26,14 @@ from crane.description.sensors import (
 )
 from crane.description.specification import (
     Chain,
+    EstimationSettings,
     LoopSpec,
     MachineSpec,
+    ParameterPrior,
     PayloadSpec,
     PIGains,
     Task,
+    TermValues,
     source_locations,
 )
 from crane.formats.machine_file.circuit_section import (

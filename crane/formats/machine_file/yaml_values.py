@@ -110,30 +110,16 @@ class YamlValues:
     def _key(self, name: str) -> Key:
         return self.schema.keys.get(name) or self.schema.others or Key()
 
-    def _get_value(self, key: str) -> Any:
-        """The value of a key, or its default.
-
-        Raises:
-            DescriptionError: The key is required and absent, or empty.
-        """
-        default = self._key(key).default
-        value = self._data.get(key, default)
-        if value is REQUIRED:
-            raise self.error_at(None, f"{self.title} has no '{key}', add it")
-        if value is None and default is not None:
-            raise self.error_at(key, f"'{key}' of {self.title} is empty, give its value")
-        return value
-
     def raw_value(self, key: str) -> Any:
         """A value, whatever it is.
 
         Raises:
             DescriptionError: There is none.
         """
-        value = self._get_value(key)
+        value = self._data.get(key, self._key(key).default)
         if value is None and key in self._data:
             raise self.error_at(key, f"'{key}' of {self.title} is empty, give its value")
-        if value is None:
+        if value is None or value is REQUIRED:
             raise self.error_at(None, f"{self.title} has no '{key}', add it")
         return value
 
@@ -178,9 +164,10 @@ class YamlValues:
     def text(self, key: str) -> Any:
         """A non-empty string, None where there may be none; empty where its error is reported."""
         with error_recovery():
-            spec, value = self._key(key), self._get_value(key)
-            if value is spec.default:
-                return value
+            default = self._key(key).default
+            if default is not REQUIRED and self._data.get(key, default) is default:
+                return default
+            value = self.raw_value(key)
             if not isinstance(value, str) or not value.strip():
                 raise self._value_error(key, format_value(value), "give text (or quote it)")
             if not "".join(value.split()).isprintable():

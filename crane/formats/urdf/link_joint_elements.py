@@ -11,13 +11,13 @@ from lxml import etree
 from crane.common.errors import CraneWarning, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.force_elements import Friction
-from crane.description.inertia_feasibility import inertia_problem
 from crane.description.kinematic_tree import (
     MULTI_FREEDOM_TYPES,
     Inertial,
     Joint,
     Limits,
     Link,
+    inertia_problem,
     joint_freedoms,
     joint_series,
     parse_limit,

@@ -18,7 +18,7 @@ import numpy as np
 from crane.common.errors import CraneError, InputError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import Array
-from crane.description.inertia_feasibility import inertia_problem
+from crane.description.kinematic_tree import inertia_problem
 
 _MIN_EIGENVALUE = 1e-4  # smallest eigenvalue of X
 _SOLVER_TOLERANCES = {

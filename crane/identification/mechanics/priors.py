@@ -10,7 +10,7 @@ from scipy.linalg import qr
 from crane.common.errors import InputError
 from crane.common.errors import suggest_names as known_names
 from crane.common.samples import Array, as_number, as_sample
-from crane.description.estimation_settings import ParameterPrior
+from crane.description.specification import ParameterPrior
 from crane.identification.estimation.regression_problem import Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel

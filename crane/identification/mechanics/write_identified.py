@@ -15,7 +15,7 @@ from crane.common.atomic_output import replace_folder
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
-from crane.description.inertia_feasibility import inertia_problem
+from crane.description.kinematic_tree import inertia_problem
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
