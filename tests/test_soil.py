@@ -295,7 +295,7 @@ def test_machine_files_dig(sled, tmp_path):
     for old, new, text in (
         ("ground:", "#", "yaml:8: cutters without ground, add 'ground: {height: 0}'"),
         ("soil:", "#", "yaml:8: cutters without soil, add 'soil: {kind: sandy loam}'"),
-        ("lean clay", "lean cla", "yaml:6: unknown soil 'lean cla', did you mean 'lean clay'"),
+        ("lean clay", "lean cla", "'kind' of 'soil': 'lean cla' is unknown, did you"),
         ("kind: lean clay", "friction: 0.3", "yaml:6: 'soil' has no 'unit_weight', add it"),
         ("surcharge: 500", "friction: 0.1", "yaml:6: .*tool_friction .* above its friction 0.1"),
         ("surcharge: 500", "fricton: 0.1", "yaml:6: unknown key 'fricton' in 'soil'"),

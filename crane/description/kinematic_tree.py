@@ -49,8 +49,7 @@ class Inertial:
         com: Centre of mass in the link's frame [m].
         rpy: Rotation from the axes of the link's frame to those of the tensor [rad].
         tensor: xx, xy, xz, yy, yz, zz about the centre of mass [kg m2].
-        finding_location: File and line of a tensor with a formal error, see
-            `crane.description.kinematic_tree`.
+        finding_location: File and line of a tensor with a formal error, see `InertiaProblem`.
     """
 
     mass: float

@@ -102,7 +102,6 @@ def _check_change(
 
 
 def _replace_values(owner: T, new_values: Mapping[FieldPath, Any]) -> T:
-    """Return a copy of an object with other values at field paths."""
     values_by_key: dict[str | int, dict[FieldPath, Any]] = {}
     for (key, *rest), value in new_values.items():
         values_by_key.setdefault(key, {})[tuple(rest)] = value

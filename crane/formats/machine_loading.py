@@ -4,7 +4,6 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from weakref import WeakKeyDictionary
@@ -17,6 +16,7 @@ from crane.common.errors import CraneWarning, DescriptionError, InputError, summ
 from crane.common.package_search import (
     check_argument_values,
     check_package_folders,
+    load_options,
     use_load_options,
 )
 from crane.common.samples import read_only_copy
@@ -89,17 +89,10 @@ def load(
     """
     package_paths, values = check_package_folders(packages), check_argument_values(arguments)
     floating = floating if isinstance(floating, bool) else check_freedoms(floating)
-    with (
-        summarize_warnings(),
-        use_load_options(package_paths, values, bool(floating), strict) as options,
-    ):
+    with summarize_warnings(), use_load_options(package_paths, values, bool(floating), strict):
         chosen_joints = _check_chosen_joints(active=active, free=free)
-        machine = _assemble_machine(
-            _read_spec(name, chosen_joints, floating), changes, lock, chosen_joints, floating
-        )
-        return replace(
-            machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
-        )
+        spec = _read_spec(name, chosen_joints, floating)
+        return _assemble_machine(spec, changes, lock, chosen_joints, floating)
 
 
 ClosureProvider = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
@@ -160,17 +153,16 @@ class MachineVariants:
     def _build_variant(
         self, changes: Mapping[str, float], closure_provider: ClosureProvider
     ) -> Machine:
-        original, all_changes = self._machine, {**self._machine.parameter_changes, **changes}
+        original = self._machine
         with summarize_warnings(), self._load_options():
-            variant = _assemble_machine(
+            return _assemble_machine(
                 self._spec_before_changes,
-                all_changes,
+                {**original.parameter_changes, **changes},
                 original.locked_joints,
                 original.chosen_joints,
                 original.floating_base,
                 closure_provider,
             )
-        return replace(variant, packages=original.packages, arguments=original.arguments)
 
     def _load_options(self) -> AbstractContextManager[object]:
         original = self._machine
@@ -239,8 +231,8 @@ def _assemble_machine(
         sensors=MappingProxyType(dict(spec.sensors)),
         chosen_joints=MappingProxyType(dict(chosen_joints)),
         floating_base=floating,
-        packages=(),
-        arguments=MappingProxyType({}),
+        packages=load_options().packages,
+        arguments=MappingProxyType(load_options().arguments),
         parameter_changes=MappingProxyType(
             {name: float(value) for name, value in (changes or {}).items()}
         ),

@@ -118,7 +118,6 @@ def read_parallel_robot(path: Path) -> MachineSpec:
 
 
 def _replaced_joint_types(top: YamlSection) -> dict[str, str]:
-    """Return the new type of joints of the URDF by joint."""
     names = top.names("joint_name")
     if not names:
         return {}

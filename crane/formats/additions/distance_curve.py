@@ -221,7 +221,6 @@ def _scan_joint_range(
 def _samples_outwards(
     machine: Machine, joint: str, sample: RangeSample, values: Sequence[float]
 ) -> list[RangeSample]:
-    """Return configurations at successive coordinates, up to the last one that closes."""
     found: list[RangeSample] = []
     for value in values:
         configuration = _solve_at(machine, joint, value, sample[1])

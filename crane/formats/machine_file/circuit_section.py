@@ -189,7 +189,6 @@ def _warn_about_unit(
 
 
 def _check_relief(section: YamlSection, supply: Supply | None, cylinder: Cylinder) -> None:
-    """A cylinder's relief beside the supply, which may have been refused."""
     if supply is None:
         return
     section.create(check_relief_pressure, supply, cylinder)
@@ -379,7 +378,6 @@ def _read_pairs(item: YamlSection, key: str) -> Sequence[tuple[float, float]]:
 
 
 def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
-    """What a file has over |u|, and its points."""
     try:
         rows = list(
             csv.DictReader(
@@ -407,7 +405,6 @@ def _read_csv_table(path: Path) -> tuple[str, Sequence[tuple[float, float]]]:
 
 
 def _coefficient_factor(section: YamlSection, quantity: str) -> float:
-    """Coefficient per what is given."""
     if quantity == "coefficient":
         return 1.0
     if quantity == "flow":

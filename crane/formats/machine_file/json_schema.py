@@ -92,7 +92,6 @@ class _SchemaDefinitions:
         }
 
     def _described(self, name: str, key: Key, is_partial: bool) -> dict[str, Any]:
-        """The value of a key with its text, unit, usual range and default."""
         text = key.text
         if isinstance(key, NumberKey) and key.units:
             text += f" [{key.units}]"

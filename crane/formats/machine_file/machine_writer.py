@@ -337,7 +337,6 @@ def _hydraulics_data(circuit: Hydraulics) -> dict[str, Any]:
 
 
 def _motor_data(motor: Cylinder) -> dict[str, Any]:
-    """A motor from its values as a cylinder."""
     expected = {"area_b": motor.area_a, "hose_b": motor.hose_a}
     expected |= {
         name: key.default

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
-from crane.common.errors import DescriptionError
 from crane.description.findings import error_recovery
 from crane.description.machine_schema import MOTIONS
 from crane.description.specification import (
@@ -17,6 +16,8 @@ from crane.description.specification import (
 from crane.formats.machine_file.force_sections import read_loads
 from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.machine_file.yaml_section import YamlSection
+
+_TIP_HINT = "name its frame under 'tip:'"
 
 
 def read_tasks(
@@ -43,7 +44,7 @@ def read_tasks(
                 lever_key, f"task '{name}' moves levers of no valve, add 'hydraulics'"
             )
         if tip is None and "tip" in item:
-            raise _missing_tip_error(name, item, "tip")
+            raise item.error_at("tip", f"task '{name}' moves the tip, {_TIP_HINT}")
         if has_phases:
             task = _read_phased_task(name, item, spaces, tree, home)
         elif "via" in item:
@@ -82,10 +83,6 @@ def _read_continuous_task(
         with error_recovery():
             coefficients[coordinate] = motion.numbers(coordinate)
     return Task(name, "", duration, space, coefficients)
-
-
-def _missing_tip_error(name: str, item: YamlSection, key: str) -> DescriptionError:
-    return item.error_at(key, f"task '{name}' moves the tip, name its frame under 'tip:'")
 
 
 def _read_start(name: str, item: YamlSection, active: tuple[str, ...]) -> dict[str, float]:
@@ -130,7 +127,7 @@ def _read_via_task(name: str, item: YamlSection, active: tuple[str, ...], tip: s
     space, required = "active", active
     if not joint_names:
         if tip is None:
-            raise _missing_tip_error(name, item, "via")
+            raise item.error_at("via", f"task '{name}' moves the tip, {_TIP_HINT}")
         attitude = _attitude_coordinates(
             name, point_of_coordinate, list(zip(points, via_points, strict=True))
         )
