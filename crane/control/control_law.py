@@ -179,8 +179,9 @@ class ControlLaw(OneLineRepr):
         """Inputs at a time [s] as floats, from q_a (n,), v_a (n,) and states (k,)."""
 
         def inverse(a_a: Sequence[Scalar], friction: bool) -> list[Scalar]:
-            accelerations = np.array(a_a, dtype=np.float64)
-            return self._dynamics.inverse(q_a, v_a, accelerations, friction).tolist()
+            return self._dynamics.inverse(
+                q_a, v_a, np.array(a_a, dtype=np.float64), friction
+            ).tolist()
 
         def gravity() -> list[Scalar]:
             return self._dynamics.gravity(q_a).tolist()

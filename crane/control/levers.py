@@ -66,8 +66,13 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self.initial_coordinates = start
         q = machine.home[machine.closure.active] if start is None else start
         start_positions: dict[str, float] = dict(zip(machine.active, q.tolist(), strict=True))
-        joint_limits = zip(machine.lower.tolist(), machine.upper.tolist(), strict=True)
-        limits = dict(zip(machine.active, joint_limits, strict=True))
+        limits = dict(
+            zip(
+                machine.active,
+                zip(machine.lower.tolist(), machine.upper.tolist(), strict=True),
+                strict=True,
+            )
+        )
         for phase in phases:
             for _, _, problem in phase.find_problems(circuit.joints, limits, start_positions):
                 raise InputError(problem)
@@ -96,9 +101,11 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self._phase_start: dict[str, float] = {}  # positions at the begin of the phase
         self._pending_joints: set[str] = set()
         self._levers = np.zeros(len(self._joints))
-        neutral = np.append([spool.neutral for spool in self._spools], 0.0)
         # signals and clock at each sample, and at last at the next one
-        self._sample_times, self._sample_rows = [0.0], [neutral]
+        self._sample_times, self._sample_rows = (
+            [0.0],
+            [np.append([spool.neutral for spool in self._spools], 0.0)],
+        )
         self.is_finished = False
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
@@ -133,8 +140,9 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
     def _begin_phase(self, index: int, time: float, positions: Mapping[str, float]) -> None:
         """Start a phase."""
         self._phase_index, self._phase_start_time, self._phase_start = index, time, dict(positions)
-        is_done = index == len(self._phases)
-        self._pending_joints = set() if is_done else set(self._phases[index].until)
+        self._pending_joints = (
+            set() if (index == len(self._phases)) else set(self._phases[index].until)
+        )
 
     def _check_arrivals(self, time: float, positions: Mapping[str, float]) -> None:
         """Find the joints that have reached their positions; start the next phase if all have."""

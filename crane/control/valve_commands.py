@@ -309,8 +309,9 @@ class SampledCommand(ValveCommand, OneLineRepr):
         self._spool_names = tuple(circuit.spools)
         self._active_columns = machine.closure.active
         self.period = as_number(period, "the period", "s", greater_than=0)
-        neutral = np.array([spool.neutral for spool in circuit.spools.values()])
-        self._held_signals = _SampledSignals(neutral)  # a run is in one thread
+        self._held_signals = _SampledSignals(
+            np.array([spool.neutral for spool in circuit.spools.values()])
+        )  # a run is in one thread
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `ValveCommand`."""

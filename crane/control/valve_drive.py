@@ -167,8 +167,9 @@ class ValveDrive(ControlLaw):
         """Signals (N, s) [V] of an open-loop command at times (N,), before the dead times."""
         if not self.period:
             return self._signal_source.references(times)[:, : len(self.delays)]
-        rows = [self._signal_source.references(times[i : i + 1]) for i in range(len(times))]
-        return np.vstack(rows)[:, : len(self.delays)]
+        return np.vstack(
+            [self._signal_source.references(times[i : i + 1]) for i in range(len(times))]
+        )[:, : len(self.delays)]
 
     def breaks(self) -> Array:
         """Times (k,) [s] at which slopes of signals change, before and after the dead times."""
@@ -185,8 +186,7 @@ class ValveDrive(ControlLaw):
         """Next instant after a time [s] at which a sampled signal jumps after its dead time."""
         earliest = np.inf
         for delay in np.unique(self.delays[self.delays > 0]) if self.period else ():
-            count = max(np.floor((time - delay) / self.period) + 1.0, 1.0)
-            jump = count * self.period + delay
+            jump = max(np.floor((time - delay) / self.period) + 1.0, 1.0) * self.period + delay
             earliest = min(earliest, jump if jump > time else jump + self.period)
         return earliest
 
@@ -209,8 +209,9 @@ class ValveDrive(ControlLaw):
         circuit_values, signals = self._evaluate_circuit(inputs)
         out: list[Scalar] = []
         signals_and_positions = iter(zip(signals, circuit_values.spool_positions, strict=True))
-        valves = self.circuit.hydraulics.valves.values()
-        for valve, sides in zip(valves, circuit_values.chambers, strict=True):
+        for valve, sides in zip(
+            self.circuit.hydraulics.valves.values(), circuit_values.chambers, strict=True
+        ):
             out += [*next(signals_and_positions), *(side.pressure for side in sides)]
             out += [side.hose_flow for side in sides]
             if valve.spool_b:

@@ -52,8 +52,11 @@ def openings_per_velocity(
         drop = np.minimum(supply - np.maximum(force, 0.0) / inlet_area, valve.margin or np.inf)
         by_inlet = inlet_area / (inlet * np.sqrt(np.maximum(drop, _MIN_PRESSURE_DROP)))
         load_pressure = np.maximum(np.maximum(-force, 0.0) / outlet_area, _MIN_PRESSURE_DROP)
-        by_outlet = outlet_area / (outlet * np.sqrt(load_pressure))
-        return np.where(force < 0, np.minimum(by_inlet, by_outlet), by_inlet)
+        return np.where(
+            force < 0,
+            np.minimum(by_inlet, outlet_area / (outlet * np.sqrt(load_pressure))),
+            by_inlet,
+        )
 
     return (
         opening(force, valve.c1, cylinder.area_a, valve.c2, cylinder.area_b),
@@ -145,8 +148,7 @@ def required_openings(
         return y, (area_b * w - q_b * y) / cb
 
     openings = np.empty_like(v)
-    holding_force = force[0] - tank * (area_a - area_b)
-    p_b = tank + np.maximum(-holding_force, 0.0) / area_b
+    p_b = tank + np.maximum(-(force[0] - tank * (area_a - area_b)), 0.0) / area_b
     steps = np.diff(time, append=2.0 * time[-1] - time[-2])
     for i in range(len(time)):
         p_b = np.maximum(
@@ -182,8 +184,9 @@ def largest_flow_share(machine: Machine, reference: Trajectory) -> float:
         drop = valve.margin or 0.5 * (circuit.supply.pressure - circuit.supply.tank)
         out = np.maximum(rate, 0.0) * cylinder.area_a
         back = np.maximum(-rate, 0.0) * cylinder.area_b
-        shares = out / valve.c1 + back / valve.c4
-        largest_share = max(largest_share, float(shares.max()) / np.sqrt(drop))
+        largest_share = max(
+            largest_share, float((out / valve.c1 + back / valve.c4).max()) / np.sqrt(drop)
+        )
         total_flow = total_flow + out + back
     pump = circuit.supply.flow
     return max(largest_share, float(total_flow.max()) / pump) if pump else largest_share
@@ -341,8 +344,9 @@ class ValveFeedforward(ValvePD):
         shifts = sway.pivoting_motions(configurations)
         roots = np.array([sway.frequency_matrix(q) for q in configurations])
         driven = np.flatnonzero(machine.is_driven).tolist()
-        driven_indices = [driven.index(i) for i in self._active_indices]
-        gains = -2.0 * damping * (shifts @ roots)[:, driven_indices]
+        gains = (
+            -2.0 * damping * (shifts @ roots)[:, [driven.index(i) for i in self._active_indices]]
+        )
         stiffness = sway.stiffness(configurations)
         coupling = -np.linalg.solve(stiffness[:, :, free], stiffness[:, :, self._active_indices])
         return [*gains.reshape(len(q_a), -1).T, *coupling.reshape(len(q_a), -1).T]

@@ -119,9 +119,13 @@ class CircuitValues:
         elements = circuit.hydraulics.elements
         loads = merged_load_pressures(elements.values(), self._load_pressures(), tank, openings)
         for name, element in elements.items():
-            element_constants = self._constants.elements[name]
-            flow = element_flow(name, element, element_constants, self.pressures, openings)
-            self._balance.add_flows([flow])
+            self._balance.add_flows(
+                [
+                    element_flow(
+                        name, element, self._constants.elements[name], self.pressures, openings
+                    )
+                ]
+            )
         self.chambers = [
             self._add_cylinder(cylinder, rates, loads)
             for cylinder, rates in zip(self._cylinders, self._spool_rates, strict=True)
@@ -253,8 +257,9 @@ class CircuitValues:
             self._balance.add_flows(pump.flows)
         for name in self._circuit.hydraulics.pumps:
             if name not in pumps:  # it keeps its pressure at any flow
-                flow = Flow(TANK_NODE, name, -self._balance.net_inflows[name], "pump")
-                self._balance.add_flows([flow])
+                self._balance.add_flows(
+                    [Flow(TANK_NODE, name, -self._balance.net_inflows[name], "pump")]
+                )
         return pumps
 
     def _power_limiting_pressure(self, name: str) -> Scalar:

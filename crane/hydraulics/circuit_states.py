@@ -263,8 +263,9 @@ class CircuitStates:
             values[f"oil_{name}"] = item.volume * (1.0 - item.precharge / max(p, item.precharge))
         if self.engine is not None:
             values["engine"] = 1.0 + self.engine.speed_droop / self.engine.speed
-        stiff_states = [values.get(name, 0.0) for name in self.state_units]
-        return np.array(stiff_states + [0.0] * len(BALANCE_UNITS))
+        return np.array(
+            [values.get(name, 0.0) for name in self.state_units] + [0.0] * len(BALANCE_UNITS)
+        )
 
 
 def _inverse(value: float) -> float:

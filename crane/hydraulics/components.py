@@ -54,8 +54,7 @@ class OpeningCurve:
         """Share at the stroke |u|, a float or a formula."""
         share: Scalar = self.points[0][1]
         for (u0, share0), (u1, share1) in itertools.pairwise(self.points):
-            slope = (share1 - share0) / (u1 - u0)
-            share = share + slope * (clip(u, u0, u1) - u0)
+            share = share + ((share1 - share0) / (u1 - u0)) * (clip(u, u0, u1) - u0)
         return share
 
 
@@ -354,8 +353,9 @@ class Valve:
 
     def opening(self, u: float) -> float:
         """Opening y at a spool position u."""
-        size = min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0)
-        return math.copysign(size, u)
+        return math.copysign(
+            min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0), u
+        )
 
 
 def _check_spool(spool: Spool | Valve, label: str) -> None:

@@ -239,8 +239,7 @@ class ValveCylinderEquations:
         constants, flows = self._constants, []
         for name, p in zip("ab", self.pressures, strict=True):
             node = f"{self.joint}.{name}"
-            leakage = constants[f"leakage_{name}"] * (p - tank)
-            flows.append(Flow(node, TANK_NODE, leakage, "leak"))
+            flows.append(Flow(node, TANK_NODE, constants[f"leakage_{name}"] * (p - tank), "leak"))
             if self._cylinder.relief > 0:
                 rate = constants["relief_gain"] * maximum(p - constants["relief"], 0.0)
                 flows.append(Flow(node, TANK_NODE, rate, "relief"))
@@ -377,8 +376,11 @@ def spool_equations(
     w, limited_speed = constants["bandwidth"], speed
     if spool.rate > 0:
         limited_speed = clip(speed, -1.0 * constants["rate"], constants["rate"])
-    acceleration = w * (w * (target - u) - 2.0 * constants["spool_damping"] * speed)
-    return u, [*rates, limited_speed, acceleration]
+    return u, [
+        *rates,
+        limited_speed,
+        w * (w * (target - u) - 2.0 * constants["spool_damping"] * speed),
+    ]
 
 
 def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:

@@ -226,8 +226,9 @@ class ReplayInputs:
             line_pressures = [
                 None if x is None else np.interp(time, self.time, x) for x in line_pressures
             ]
-        signals = ValveSignals(machine, time, self.signals, *line_pressures)
-        return ValveDrive(machine, signals, self.pressures)
+        return ValveDrive(
+            machine, ValveSignals(machine, time, self.signals, *line_pressures), self.pressures
+        )
 
 
 def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
@@ -411,6 +412,7 @@ def _fit_parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
     """Value or rate of a parabola at the first instant, and its standard deviation."""
     A = np.vander(time - time[0], 3)
     values, *_ = np.linalg.lstsq(A, x, rcond=None)
-    variance = float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)
-    std = np.sqrt(variance * np.diag(np.linalg.pinv(A.T @ A)))
+    std = np.sqrt(
+        (float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)) * np.diag(np.linalg.pinv(A.T @ A))
+    )
     return float(values[2 - order]), float(std[2 - order])

@@ -145,8 +145,9 @@ def find_piston_outside_cylinder(
 
     For the arguments see `passed_limits_text`.
     """
-    cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
-    for joint, cylinder in cylinders.items():
+    for joint, cylinder in (
+        machine.hydraulics.cylinders if machine.hydraulics is not None else {}
+    ).items():
         if cylinder.motor:
             continue
         release_pages()
@@ -175,9 +176,11 @@ def buried_contact_text(machine: Machine, q: Array) -> str:
     frames = FrameJacobians(machine)
     frames.set_configuration(q)
     for contact in contacts:
-        position = frames.frame_pose(contact.frame).translation.tolist()
-        height = float(contact.ground.distance_and_normal(position)[0])  # type: ignore[arg-type]
-        depth = contact.radius - height
+        depth = contact.radius - float(
+            contact.ground.distance_and_normal(
+                frames.frame_pose(contact.frame).translation.tolist()
+            )[0]
+        )
         if contact.stiffness * depth > _MAX_CONTACT_FORCE_RATIO * weight:
             return (
                 f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight "
@@ -194,8 +197,9 @@ def _energy_imbalance(rows: LayoutView) -> Array:
 
 def _energy_throughput(rows: LayoutView) -> float:
     """The energy throughput: largest range of work, dissipation and energies [J]."""
-    parts = rows.work, rows.dissipated, rows.kinetic, rows.potential
-    return float(max(np.ptp(part) for part in parts))
+    return float(
+        max(np.ptp(part) for part in (rows.work, rows.dissipated, rows.kinetic, rows.potential))
+    )
 
 
 def find_stop_energy_gain(
@@ -209,8 +213,11 @@ def find_stop_energy_gain(
         i = machine.column(stop.joint)
         lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
         depth = np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper)
-        edges = np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
-        for first, behind in edges.reshape(-1, 2).tolist():
+        for first, behind in (
+            np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
+            .reshape(-1, 2)
+            .tolist()
+        ):
             before, after = max(first - 1, 0), min(behind, len(energy_imbalance) - 1)
             stored_energy = 0.5 * stop.stiffness * float(depth[first:behind].max()) ** 2
             energy_gain = float(energy_imbalance[before] - energy_imbalance[after])

@@ -162,7 +162,6 @@ def simulate(
     if text := reference_limits_text(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
-    ends_with_command = duration is None
     run = integrate(
         dynamics,
         control,
@@ -172,7 +171,7 @@ def simulate(
         method,
         progress,
         tolerance,
-        ends_with_command=ends_with_command,
+        ends_with_command=duration is None,
     )
     for note in run.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
@@ -305,8 +304,11 @@ def _default_method(dynamics: Dynamics, control: Controller) -> str:
     """Name of the default method."""
     if isinstance(control, ValveDrive):
         return "rosenbrock"
-    traced = dynamics.backend == "compiled" and isinstance(control, TracedController)
-    return "DOP853" if traced else "rk4"
+    return (
+        "DOP853"
+        if (dynamics.backend == "compiled" and isinstance(control, TracedController))
+        else "rk4"
+    )
 
 
 def _initial_controller_state(control: Controller, dynamics: Dynamics, q: Array) -> Array:

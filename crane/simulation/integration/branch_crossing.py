@@ -28,8 +28,9 @@ RateFunction = Callable[[float, Array], tuple[Array, Array]]
 def relative_rank(machine: Machine, q: Array) -> float:
     """Least over largest singular value of the loop equations at a configuration (nq,)."""
     equations, rows = machine.closure.equations, machine.closure.structure.independent_rows
-    scaled_jacobian = equations.evaluate(q)[1][rows] * equations.motion_scales
-    values = np.linalg.svd(scaled_jacobian, compute_uv=False)
+    values = np.linalg.svd(
+        equations.evaluate(q)[1][rows] * equations.motion_scales, compute_uv=False
+    )
     return float(values[-1] / values[0]) if len(values) else 1.0
 
 

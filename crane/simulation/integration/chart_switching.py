@@ -393,8 +393,9 @@ class ChartSwitchingIntegrator:
                 "joints with them"
             )
         at.v_a[:] = np.einsum("nij,nj->ni", velocity_maps, at.v_a)
-        transposed_maps = np.swapaxes(velocity_maps, 1, 2)
-        at.friction[:] = np.einsum("nij,nj->ni", np.linalg.pinv(transposed_maps), at.friction)
+        at.friction[:] = np.einsum(
+            "nij,nj->ni", np.linalg.pinv(np.swapaxes(velocity_maps, 1, 2)), at.friction
+        )
 
     @property
     def _uses_inverse_dynamics(self) -> bool:

@@ -63,8 +63,12 @@ class Chart:
     def from_dynamics(cls, dynamics: Dynamics) -> "Chart":
         """The chart of the coordinates of the user."""
         machine = dynamics.machine
-        sticking = StickSlipModes(machine, dynamics.forces.sticking)
-        return cls(dynamics, machine.closure.active, sticking, machine.free)
+        return cls(
+            dynamics,
+            machine.closure.active,
+            StickSlipModes(machine, dynamics.forces.sticking),
+            machine.free,
+        )
 
     @property
     def machine(self) -> Machine:
@@ -192,15 +196,15 @@ class Chart:
         """
         machine = self.machine
         closure, scale = machine.closure, machine.closure.equations.motion_scales
-        jacobian = closure.equations.evaluate(q)[1]
-        basis = null_space_basis(jacobian, scale, _RANK_TOLERANCE)
+        basis = null_space_basis(closure.equations.evaluate(q)[1], scale, _RANK_TOLERANCE)
         active = closure.active
         if basis.shape[1] != len(active):
             return None
 
         def condition(columns: Indices) -> float:
-            least = np.linalg.svd(basis[columns], compute_uv=False).min(initial=1.0)
-            return 1.0 / max(float(least), 1e-300)
+            return 1.0 / max(
+                float(np.linalg.svd(basis[columns], compute_uv=False).min(initial=1.0)), 1e-300
+            )
 
         now, everything = condition(active), range(machine.model.nv)
         # keep those of the present coordinates that have small entries of gamma

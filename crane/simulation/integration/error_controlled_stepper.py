@@ -217,8 +217,11 @@ class ErrorControlledStepper(MachineCodeStepper):
             event_distances += scale_vector(
                 1.0 / closure.characteristic_length, machine.external_forces.event_lengths
             )
-            parts = {"rate": rate, "margin": [margin], "event_distances": event_distances}
-            program.add_formula("rate" + suffix, 5, parts)
+            program.add_formula(
+                "rate" + suffix,
+                5,
+                {"rate": rate, "margin": [margin], "event_distances": event_distances},
+            )
         if self.external_callback is not None:
             program.add_formula("callback_inputs", 5, machine.external_forces.callback_inputs)
             with program.add_routine(
@@ -260,15 +263,17 @@ class ErrorControlledStepper(MachineCodeStepper):
             size = maximum(apply_function("abs", x), apply_function("abs", y))
             if i >= self.state_layout.start_index("work"):
                 size = ENERGY_TOLERANCE_FACTOR * size
-            tolerance = tape.load(argument, len(start)) * size
-            out.append(1.0 / maximum(tape.load(argument, i), tolerance))
+            out.append(
+                1.0 / maximum(tape.load(argument, i), tape.load(argument, len(start)) * size)
+            )
         return out
 
     def _largest_move(self, tape: Tape, displacements: Sequence[Scalar]) -> Scalar:
         """Largest displacement of a joint [rad], [characteristic lengths]."""
         is_length = [not turns for turns in self.closure_code.geometry.is_revolute[1:]]
-        inverse_length = self.closure_code.inverse_characteristic_length(tape)
-        return largest_scaled_value(displacements, is_length, inverse_length)
+        return largest_scaled_value(
+            displacements, is_length, self.closure_code.inverse_characteristic_length(tape)
+        )
 
     def _finish_outputs(
         self,
@@ -299,8 +304,9 @@ class ErrorControlledStepper(MachineCodeStepper):
         start = program.formula_outputs("rate").start_index("event_distances")
         if not count:
             return
-        signs = [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
-        program.add_formula("event_signs", 1, signs)
+        program.add_formula(
+            "event_signs", 1, [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
+        )
         tape = Tape()
         distances = tape.load_vector(0, start, count)
         smallest: Scalar = 1.0
@@ -330,8 +336,10 @@ def break_times(machine: Machine, control: TracedController) -> Array:
     """Break times (k,) [s] of a controller, or its reference, and of external forces, in order."""
     sources: list[Any] = [control, getattr(control, "reference", None)]
     sources = [*machine.external_forces, *[x for x in sources if hasattr(x, "breaks")][:1]]
-    times = {time for source in sources for time in np.asarray(source.breaks()).tolist()}
-    return np.array(sorted(times), dtype=np.float64)
+    return np.array(
+        sorted({time for source in sources for time in np.asarray(source.breaks()).tolist()}),
+        dtype=np.float64,
+    )
 
 
 def _scipy_method() -> Any:
@@ -379,19 +387,23 @@ class DormandPrinceStepper(ErrorControlledStepper):
         fifth: Scalar = 0.0
         third: Scalar = 0.0
         errors = weighted_sum(tape, 2, size, method.E5), weighted_sum(tape, 2, size, method.E3)
-        scales = self._inverse_error_scales(tape, 4, state, after)
-        for error5, error3, scale in zip(*errors, scales, strict=True):
+        for error5, error3, scale in zip(
+            *errors, self._inverse_error_scales(tape, 4, state, after), strict=True
+        ):
             fifth = fifth + error5 * scale * (error5 * scale)
             third = third + error3 * scale * (error3 * scale)
         denominator = maximum(fifth + 0.01 * third, 1e-300)
         error = (
             apply_function("abs", h) * fifth / apply_function("sqrt", denominator * float(size))
         )
-        rates = tape.load_vector(2, 0, self.state_layout.parts["q"])
-        largest_move = h * self._largest_move(tape, rates)
-        ratio = _DORMAND_PRINCE_MAX_STEP_RATIO
-        outputs = self._finish_outputs(after, error, largest_move, 8.0, ratio)
-        program.add_formula("finish", 5, outputs)
+        largest_move = h * self._largest_move(
+            tape, tape.load_vector(2, 0, self.state_layout.parts["q"])
+        )
+        program.add_formula(
+            "finish",
+            5,
+            self._finish_outputs(after, error, largest_move, 8.0, _DORMAND_PRINCE_MAX_STEP_RATIO),
+        )
         # dense output: from the states and rates at both ends, and the extra stages
         tape = Tape()
         state, h = tape.load_vector(0, 0, size), tape.load(2, 0)
@@ -430,8 +442,12 @@ class DormandPrinceStepper(ErrorControlledStepper):
             r.copy(k.element_pointer(STAGES * size), step.end_rate, size)
             for i in range(INTERPOLATION_STAGES):
                 r.call(f"extra{i}", r.state, k, step.length, stage)
-                rate = k.element_pointer((STAGES + 1 + i) * size)
-                step.call("rate", t + length * float(method.C_EXTRA[i]), stage, rate)
+                step.call(
+                    "rate",
+                    t + length * float(method.C_EXTRA[i]),
+                    stage,
+                    k.element_pointer((STAGES + 1 + i) * size),
+                )
             r.call("dense", r.state, k, step.length, step.step_result, step.dense_output)
 
         return attempt, interpolate

@@ -301,8 +301,9 @@ class FixedStepIntegrator(StickSlipIntegrator):
             )
         if event and i:
             state[:] = rows[i - 1, :size]
-            event_time_offset = self._advance_to_transition(times[i - 1], state, event, step)
-            self.offset = self._rounded_offset(event_time_offset - step, step)
+            self.offset = self._rounded_offset(
+                self._advance_to_transition(times[i - 1], state, event, step) - step, step
+            )
         elif event:
             self._find_modes(times[0], state)
         return True
@@ -441,8 +442,9 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         at = self.python_stepper.state_layout.view(state)
         assert self._sampled_drive is not None
         try:
-            v_a = self._chart.user_velocities(at.q, at.v_a)
-            self._sampled_drive.update(time, at.q, v_a, at.controller)
+            self._sampled_drive.update(
+                time, at.q, self._chart.user_velocities(at.q, at.v_a), at.controller
+            )
         except ClosureError as error:
             raise IntegrationHaltError(
                 time, self.python_stepper.user_coordinates(state), f": {error}"

@@ -79,8 +79,9 @@ class MachineCodeStepper:
         self._dynamics_constants = chart.dynamics.formula_constants
         self.bounds = np.concatenate([self.closure_code.tolerances, chart.chart_limits, [0.0]])
         self.controller_columns = reference_count(control)
-        external_counts = external_forces.reference_counts(machine.external_forces)
-        self.reference_columns = self.controller_columns + sum(external_counts)
+        self.reference_columns = self.controller_columns + sum(
+            external_forces.reference_counts(machine.external_forces)
+        )
         self.external_callback = (
             None
             if machine.has_traceable_forces

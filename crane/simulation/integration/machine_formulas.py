@@ -84,11 +84,14 @@ class MachineFormulas:
     ) -> "MachineFormulas":
         """The machine with the Coulomb friction of seals and brakes of a circuit."""
         dynamics = self.dynamics_formulas
-        has_friction = bool(dynamics.formula_structure.circuit_friction_columns)
-        if not has_friction or not isinstance(control, ValveDrive):
+        if not bool(dynamics.formula_structure.circuit_friction_columns) or not isinstance(
+            control, ValveDrive
+        ):
             return self
-        friction = control.circuit_friction(inputs)
-        return replace(self, dynamics_formulas=dynamics.with_circuit_friction(friction))
+        return replace(
+            self,
+            dynamics_formulas=dynamics.with_circuit_friction(control.circuit_friction(inputs)),
+        )
 
     def accelerations(
         self, tau: Sequence[Scalar], with_joints_at_rest: bool
@@ -131,8 +134,10 @@ class MachineFormulas:
         dynamics = self.dynamics_formulas
         a: list[Scalar] = []
         if self.chart.machine.supports:
-            rows = sorted(dynamics.gamma.items())
-            a = [dot(row, accelerations.a_a) + dynamics.drift[i] for i, row in rows]
+            a = [
+                dot(row, accelerations.a_a) + dynamics.drift[i]
+                for i, row in sorted(dynamics.gamma.items())
+            ]
         return [
             *tau,
             *accelerations.active_friction,
@@ -166,8 +171,9 @@ class MachineFormulas:
         """
         gamma = self.dynamics_formulas.gamma
         user_coordinates = [x for x in self.q_a if isinstance(x, SymbolicExpression)]
-        outputs = [*controller_rate, *self.chart.trace_chart_forces(gamma, tau)]
-        rows = differentiate(outputs, user_coordinates)
+        rows = differentiate(
+            [*controller_rate, *self.chart.trace_chart_forces(gamma, tau)], user_coordinates
+        )
         if not self.chart.has_user_coordinates:
             columns = list(
                 zip(*(gamma[i + 1] for i in self.chart.user_columns.tolist()), strict=True)

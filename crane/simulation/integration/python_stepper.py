@@ -78,8 +78,12 @@ def _passed_limit_text(
     lower, upper = machine.lower, machine.upper
     excess = np.maximum(lower - halt.q_a, halt.q_a - upper)
     active = machine.closure.active
-    span = np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
-    i = int(np.argmax(excess / span))
+    i = int(
+        np.argmax(
+            excess
+            / np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
+        )
+    )
     slack = limit_tolerances(machine)[active[i]]
     if not excess[i] > slack:
         return ""
@@ -87,8 +91,7 @@ def _passed_limit_text(
     limit = lower[i] if value < lower[i] else upper[i]
     text = f"; '{joint}' is at {value:.6g} {unit}, beyond its limit {limit:.6g} {unit}"
     if len(times):
-        outside = (q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)
-        inside = np.flatnonzero(~outside)
+        inside = np.flatnonzero(~((q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)))
         first = int(inside[-1]) + 1 if len(inside) else 0
         passed_time = times[first] if first < len(times) else halt.time
         text += f" since t = {passed_time:.4g} s"

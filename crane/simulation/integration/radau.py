@@ -120,10 +120,12 @@ class RadauStepper(ErrorControlledStepper):
         self._add_difference_formulas(program)
         for name in ("real", "complex"):
             tape = Tape()
-            blocks = self._system.load_blocks(tape, 0)
-            matrix = self._system.matrix(blocks, EigenvalueShift(name, tape.load(1, 0)))
-            factors = [x for row in lu_factorize(matrix) for x in row]
-            program.add_formula(f"{name}_factors", 2, factors)
+            matrix = self._system.matrix(
+                self._system.load_blocks(tape, 0), EigenvalueShift(name, tape.load(1, 0))
+            )
+            program.add_formula(
+                f"{name}_factors", 2, [x for row in lu_factorize(matrix) for x in row]
+            )
         self._add_newton(program)
         self._add_error_estimate(program)
         self._add_finish(program)
@@ -143,8 +145,9 @@ class RadauStepper(ErrorControlledStepper):
         size, n, layout = self.state_layout.size, self._mobility, self.state_layout
         start = size + 1  # of the displacements in `tolerances`
         tape = Tape()
-        displaced = add_vectors(tape.load_vector(0, 0, size), tape.load_vector(1, 0, size))
-        program.add_formula("displaced", 2, displaced)
+        program.add_formula(
+            "displaced", 2, add_vectors(tape.load_vector(0, 0, size), tape.load_vector(1, 0, size))
+        )
         tape = Tape()
         first_state = layout.start_index("controller")
         columns = [layout.start_index("v_a") + j for j in range(n)]
@@ -161,8 +164,9 @@ class RadauStepper(ErrorControlledStepper):
         for j in range(n):
             ratio = tape.load(2, start + n + j) / tape.load(2, start + j)
             rate = tape.load_vector(0, 0, layout.parts["q"])
-            displaced_rate = tape.load_vector(1, j * size, layout.parts["q"])
-            directions += scale_vector(ratio, subtract_vectors(displaced_rate, rate))
+            directions += scale_vector(
+                ratio, subtract_vectors(tape.load_vector(1, j * size, layout.parts["q"]), rate)
+            )
             directions += [0.0] * (size - len(rate))
         program.add_formula("coordinate_directions", 3, directions)
         program.add_formula("jacobian", 5, self._system.blocks_from_differences(Tape()))
@@ -223,8 +227,9 @@ class RadauStepper(ErrorControlledStepper):
         sums = [dot(ERROR_WEIGHTS.tolist(), column) for column in zip(*Z, strict=True)]
         right_side = add_vectors(rate, scale_vector(1.0 / h, sums))
         blocks, shift = self._system.load_blocks(tape, 0), EigenvalueShift("real", h)
-        factors = self._system.load_factors(tape, 1, shift)
-        (error,) = self._system.solve(blocks, factors, shift, [right_side])
+        (error,) = self._system.solve(
+            blocks, self._system.load_factors(tape, 1, shift), shift, [right_side]
+        )
         program.add_formula("estimate", 5, error)
 
     def _add_finish(self, program: Program) -> None:
@@ -235,18 +240,23 @@ class RadauStepper(ErrorControlledStepper):
         error, rate = tape.load_vector(3, 0, size), tape.load_vector(4, 0, size)
         after = add_vectors(state, Z[2])
         scales = self._inverse_error_scales(tape, 6, state, after)
-        total = _sum_of_squares(error, scales)
-        norm = apply_function("sqrt", total * (1.0 / len(scales)))
+        norm = apply_function("sqrt", _sum_of_squares(error, scales) * (1.0 / len(scales)))
         # error of the dense output: the polynomial through the stages against the cubic that has
         # the rate at the start and the end of the stages
-        slope_weights = INTERPOLATION_WEIGHTS[:, 0].tolist()
-        gaps = [dot([row[i] for row in Z], slope_weights) - h * rate[i] for i in range(nq)]
+        gaps = [
+            dot([row[i] for row in Z], INTERPOLATION_WEIGHTS[:, 0].tolist()) - h * rate[i]
+            for i in range(nq)
+        ]
         scaled_gaps = [gap * scale for gap, scale in zip(gaps, scales, strict=False)]
         interpolation_error = _sum_of_squares(scaled_gaps, [_INTERPOLATION_ERROR_FACTOR] * nq)
         norm = maximum(norm, apply_function("sqrt", interpolation_error * (1.0 / nq)))
-        largest_move = self._largest_move(tape, Z[2][:nq])
-        outputs = self._finish_outputs(after, norm, largest_move, 4.0, _MAX_STEP_RATIO)
-        program.add_formula("finish", 7, outputs)
+        program.add_formula(
+            "finish",
+            7,
+            self._finish_outputs(
+                after, norm, self._largest_move(tape, Z[2][:nq]), 4.0, _MAX_STEP_RATIO
+            ),
+        )
 
     def _add_dense_output(self, program: Program) -> None:
         """dense(Z): x (Q0 + Q1 x + Q2 x^2) in the form x (c0 + (1 - x) (c1 + x c2))."""
@@ -386,8 +396,12 @@ class _RadauStepCode:
         with r.loop_forever():
             for i in range(STAGES):
                 stage = iterate.element_pointer("stages").element_pointer(i * self._size)
-                stage_rate = self._stage_rates.element_pointer(i * self._size)
-                step.call("rate", t + length * float(NODES[i]), stage, stage_rate)
+                step.call(
+                    "rate",
+                    t + length * float(NODES[i]),
+                    stage,
+                    self._stage_rates.element_pointer(i * self._size),
+                )
             r.call(
                 "newton", r.state, self._jacobian, self._real_factors, self._complex_factors,
                 self._stage_rates, iterate.element_pointer("W"), step.length, r.tol, iterate,
@@ -439,5 +453,6 @@ def _sum_of_squares(values: list[Scalar], scales: list[Scalar]) -> Scalar:
 
 def _combine_rows(weights: Array, rows: list[list[Scalar]]) -> list[list[Scalar]]:
     """Linear combinations of rows by rows of weights."""
-    columns = list(zip(*rows, strict=True))
-    return [[dot(row, column) for column in columns] for row in weights.tolist()]
+    return [
+        [dot(row, column) for column in list(zip(*rows, strict=True))] for row in weights.tolist()
+    ]

@@ -173,8 +173,9 @@ class RosenbrockStepper(ErrorControlledStepper):
         # the errors of other integrals only have to be finite
         error = maximum(max_abs(shares), max_abs(scale_vector(1e-30, errors[checked_count:])))
         largest_move = self._largest_move(tape, subtract_vectors(after[:q], state[:q]))
-        outputs = self._finish_outputs(after, error, largest_move, 3.0, _MAX_STEP_RATIO)
-        program.add_formula("finish", 4, outputs)
+        program.add_formula(
+            "finish", 4, self._finish_outputs(after, error, largest_move, 3.0, _MAX_STEP_RATIO)
+        )
 
     def _add_stage_solvers(self, program: Program, suffix: str, with_joints_at_rest: bool) -> None:
         """Add prepare(..., h), which factorizes 1 - h gamma J, and the solvers of the stages.
@@ -215,8 +216,11 @@ class RosenbrockStepper(ErrorControlledStepper):
             "directions": coordinate_directions,
             "free": [dynamics.active_motion_factors if with_joints_at_rest else [1.0] * n],
         }
-        outputs = {name: symbolic_entries(table) for name, table in tables.items()}
-        program.add_formula(f"prepare{suffix}", 6, outputs)
+        program.add_formula(
+            f"prepare{suffix}",
+            6,
+            {name: symbolic_entries(table) for name, table in tables.items()},
+        )
         for i in range(STAGES):
             self._add_stage_solver(program, i, suffix, tables)
 
@@ -260,8 +264,14 @@ class RosenbrockStepper(ErrorControlledStepper):
         free = loaded["free"][0]
         v_a = [factor * x for factor, x in zip(free, solution[k : k + len(free)], strict=True)]
         q = add_vectors(part.q, matvec(loaded["directions"], v_a))
-        controller = [*solution[:k], *part.controller[k:]]
-        outputs = [*q, *v_a, *part.contacts, *controller, *part.work, *part.dissipated]
+        outputs = [
+            *q,
+            *v_a,
+            *part.contacts,
+            *[*solution[:k], *part.controller[k:]],
+            *part.work,
+            *part.dissipated,
+        ]
         program.add_formula(f"solve{stage}{suffix}", 4, outputs)
 
     def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
@@ -282,13 +292,18 @@ class RosenbrockStepper(ErrorControlledStepper):
                     rate = stage_rate
                     r.call(f"combine{i}", r.state, u, stage)
                     step.call("rate", t + length * float(ALPHA[i].sum()), stage, rate)
-                solution = u.element_pointer(i * size)
-                self.call_formula(r, f"solve{i}", rate, u, factors, step.length, solution)
+                self.call_formula(
+                    r, f"solve{i}", rate, u, factors, step.length, u.element_pointer(i * size)
+                )
             r.call("finish", r.geometry, r.state, u, r.tol, step.step_result)
 
         def interpolate(t: RoutineValue, length: RoutineValue) -> None:
-            ends = step.start_rate, step.length, step.step_result, step.end_rate
-            r.call("dense", r.state, *ends, step.dense_output)
+            r.call(
+                "dense",
+                r.state,
+                *(step.start_rate, step.length, step.step_result, step.end_rate),
+                step.dense_output,
+            )
 
         return attempt, interpolate
 

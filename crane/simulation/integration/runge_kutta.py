@@ -88,8 +88,7 @@ class RungeKuttaStepper(MachineCodeStepper):
             r.call("finish", r.geometry, r.state, k1, k2, k3, k4, r.h, stage)
             with r.if_then(~(stage["move"] < 1.0)):
                 r.return_value(i)
-            closed = r.call("close", r.geometry, stage, result, r.bounds)
-            with r.if_then(closed < 1):
+            with r.if_then(r.call("close", r.geometry, stage, result, r.bounds) < 1):
                 r.return_value(i)
             r.copy(r.state, stage, size)
             with r.if_then(exceeds_chart_limits(r, result)):
@@ -137,8 +136,9 @@ class RungeKuttaStepper(MachineCodeStepper):
         size, coordinates = self.state_layout.size, self.state_layout["q"]
         tape = Tape()
         state, rate = tape.load_vector(0, 0, size), tape.load_vector(1, 0, size)
-        displaced = add_vectors(state, scale_vector(tape.load(2, 0), rate))
-        program.add_formula("displaced", 3, displaced)
+        program.add_formula(
+            "displaced", 3, add_vectors(state, scale_vector(tape.load(2, 0), rate))
+        )
         tape = Tape()
         state = tape.load_vector(1, 0, size)
         k1, k2, k3, k4 = (tape.load_vector(array, 0, size) for array in range(2, 6))
@@ -149,8 +149,9 @@ class RungeKuttaStepper(MachineCodeStepper):
         )
         rates = [*k1[coordinates], *k2[coordinates], *k3[coordinates]]
         is_length = 3 * [not turns for turns in self.closure_code.geometry.is_revolute[1:]]
-        inverse_length = self.closure_code.inverse_characteristic_length(tape)
-        largest_rate = largest_scaled_value(rates, is_length, inverse_length)
+        largest_rate = largest_scaled_value(
+            rates, is_length, self.closure_code.inverse_characteristic_length(tape)
+        )
         # the other rates only have to be finite
         largest_move = h * maximum(largest_rate, max_abs(scale_vector(1e-30, mean)))
         program.add_formula("finish", 7, {"state": after, "move": [largest_move]})

@@ -60,8 +60,9 @@ class ScipyIntegrator(StickSlipIntegrator):
         self._end_time = first + step * len(times)
         instants = np.append(times, self._end_time)
         while self.next_instant < len(times) or self.offset < 0:
-            start_time = instants[self.next_instant] + self.offset
-            if not self._integrate_until(start_time, instants, state, rows, progress):
+            if not self._integrate_until(
+                instants[self.next_instant] + self.offset, instants, state, rows, progress
+            ):
                 break
             self.offset = self._rounded_offset(self.offset, step)
         return self.next_instant

@@ -88,8 +88,11 @@ class LinearizedDrive:
     def moving_mask(self, v_a: Array, include_shared: bool) -> Array:
         """(k + m,) whether states and signals belong to moving joints, or to none if shared."""
         assert self._valve_drive is not None
-        joints = self._valve_drive.circuit.joints
-        moving = {x for x, i in zip(joints, self._active_indices, strict=True) if v_a[i]}
+        moving = {
+            x
+            for x, i in zip(self._valve_drive.circuit.joints, self._active_indices, strict=True)
+            if v_a[i]
+        }
         initial_states = [
             self._joint_of_state[name] in moving
             if name in self._joint_of_state
@@ -262,8 +265,9 @@ class LinearizedDrive:
         forces = JointForces(machine)
         for column, force in zip(forces.circuit_friction_columns, circuit_friction, strict=True):
             i = machine.active.index(machine.joints[column])
-            sticks = column in forces.sticking
-            out[i] = force * friction_sign(forces.table[column].tolist(), v_a[i], sticks, False)
+            out[i] = force * friction_sign(
+                forces.table[column].tolist(), v_a[i], column in forces.sticking, False
+            )
         return out
 
     def evaluate(

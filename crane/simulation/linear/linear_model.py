@@ -128,8 +128,9 @@ class LinearModel(Result):
         frequencies = np.asarray(frequencies, dtype=np.float64)
         eye, found = np.eye(len(self.A)), []
         for frequency in frequencies:
-            resolvent = np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B)
-            found.append(self.C @ resolvent + self.D)
+            found.append(
+                self.C @ np.linalg.solve(2j * np.pi * frequency * eye - self.A, self.B) + self.D
+            )
         return np.array(found)
 
     def simulate(self, times: ArrayLike, start: ArrayLike, inputs: ArrayLike) -> Array:
@@ -146,8 +147,10 @@ class LinearModel(Result):
         start, u = as_sample(start, k, "start", self.states), as_sample(inputs, m, "inputs")
         whole = np.zeros((k + m, k + m))
         whole[:k, :k], whole[:k, k:] = self.A, self.B
-        first = np.concatenate([start, u])
-        rows = [expm(whole * time) @ first for time in np.asarray(times, dtype=np.float64)]
+        rows = [
+            expm(whole * time) @ np.concatenate([start, u])
+            for time in np.asarray(times, dtype=np.float64)
+        ]
         return np.array([self.C @ row[:k] + self.D @ u for row in rows])
 
     def dominant_state(self, mode: Mode) -> str:

@@ -123,8 +123,11 @@ class AdjointIntegrator:
         out = SimulationConstants(
             *(np.zeros((len(start), part.shape[-1])) for part in self._nominal_constants)
         )
-        ends = np.cumsum([len(which) for which in self._variable_indices])[:-1]
-        every = np.split(self._gradient, ends, axis=1)
+        every = np.split(
+            self._gradient,
+            np.cumsum([len(which) for which in self._variable_indices])[:-1],
+            axis=1,
+        )
         for part, which, found in zip(out[:4], self._variable_indices, every, strict=True):
             part[:, which] = found
         return out._replace(initial_state=start)
@@ -271,8 +274,11 @@ class AdjointIntegrator:
         np.maximum(of_lambda, np.abs(step_adjoints).max(axis=0), out=of_lambda)
         least = MIN_RELATIVE_CHANGE * (of_lambda * largest).max(axis=1, keepdims=True)
         np.maximum(of_lambda, least / largest, out=of_lambda)
-        gathered = self._gradient + np.cumsum(contributions[::-1], axis=0)
-        np.maximum(of_total, np.abs(gathered).max(axis=0), out=of_total)
+        np.maximum(
+            of_total,
+            np.abs(self._gradient + np.cumsum(contributions[::-1], axis=0)).max(axis=0),
+            out=of_total,
+        )
         np.maximum(of_total, least / self._change_sizes, out=of_total)
 
     def _needs_refinement(

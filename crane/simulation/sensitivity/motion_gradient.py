@@ -153,8 +153,9 @@ def gradient(
         del directions_by_name[name]
     if not directions_by_name:
         raise InputError("no number is named that changes anything, give `by`")
-    sizes = {name: directions.typical_change(name) for name in directions_by_name}
-    changes = _largest_changes(directions_by_name, sizes)
+    changes = _largest_changes(
+        directions_by_name, {name: directions.typical_change(name) for name in directions_by_name}
+    )
     integrator = AdjointIntegrator(
         track, problem.outputs, directions.nominal_constants(track.time), changes
     )
@@ -233,8 +234,13 @@ def _output_values(
     for name in outputs:
         joint = name.removesuffix(VELOCITY_SUFFIX)
         if name not in columns and joint in machine.joints:
-            rows = machine.closure.gamma(parts.q)[:, machine.joints.index(joint)]
-            found.append(np.einsum("ni,ni->n", rows, parts.v_a))
+            found.append(
+                np.einsum(
+                    "ni,ni->n",
+                    machine.closure.gamma(parts.q)[:, machine.joints.index(joint)],
+                    parts.v_a,
+                )
+            )
         else:
             found.append(read_simulation(machine, recording, [name])[:, 0])
     return np.column_stack(found)

@@ -80,8 +80,9 @@ class SensitivityProblem(NamedTuple):
         control = resolve_controller(controller, machine)
         count = count_steps(control, duration, step)
         start = initial_motion(machine, initial, control)
-        is_sampled = isinstance(control, ValveDrive) and control.period
-        if is_sampled or not isinstance(control, TracedController):
+        if (isinstance(control, ValveDrive) and control.period) or not isinstance(
+            control, TracedController
+        ):
             raise InputError(
                 "a controller in Python has no formulas, write it as a crane.control.ControlLaw"
             )

@@ -59,8 +59,7 @@ class ForwardDerivatives(RateProgram):
         ]
         references = np.zeros((count, m + p, self._reference_columns))
         references[:, m:] = np.swapaxes(directions.references, 0, 1)
-        width = self._program.formula_outputs("tangent").size
-        out = np.empty((count, m + p, width))
+        out = np.empty((count, m + p, self._program.formula_outputs("tangent").size))
         self._call(
             "along",
             has_joints_at_rest,
@@ -108,8 +107,10 @@ class ForwardDerivatives(RateProgram):
         seed(0, is_variable[0])
         changed = [tape.load_vector(11, part * n, n) for part in range(2)]
         gap_changes = directional_derivative([row.phi for row in dynamics.loops.rows], seeds)
-        joints = dynamics.loops.active_joints
-        active_rows = {joint: [change] for joint, change in zip(joints, changed[0], strict=True)}
+        active_rows = {
+            joint: [change]
+            for joint, change in zip(dynamics.loops.active_joints, changed[0], strict=True)
+        }
         moving, _ = dynamics.loops.solve_passive(active_rows, [[-1.0 * x] for x in gap_changes])
         seeds |= {operation_index(dynamics.q[i - 1]): change for i, (change,) in moving.items()}
         seeds |= dict(zip(map(operation_index, dynamics.v_a), changed[1], strict=True))
@@ -227,10 +228,12 @@ class ReverseDerivatives(RateProgram):
         if loops.rows:
             # q_P depends linearly on the gaps of the loops; their values cancel
             gaps = [tape.load(7, r) for r in range(len(loops.rows))]
-            active_rows: dict[int, list[Scalar]] = {joint: [0.0] for joint in loops.active_joints}
-            moving, _ = loops.solve_passive(active_rows, [[-1.0 * x] for x in gaps])
-            passive_directions = [moving[i][0] for i in loops.passive_joints]
-            z = weighted_gradient(passive_directions, found[len(numbers) :], gaps)
+            moving, _ = loops.solve_passive(
+                {joint: [0.0] for joint in loops.active_joints}, [[-1.0 * x] for x in gaps]
+            )
+            z = weighted_gradient(
+                [moving[i][0] for i in loops.passive_joints], found[len(numbers) :], gaps
+            )
             by_loops = weighted_gradient([row.phi for row in loops.rows], z, numbers)
             out = [one + other for one, other in zip(out, by_loops, strict=True)]
         program.add_formula("cotangent" + suffix, 7, out)

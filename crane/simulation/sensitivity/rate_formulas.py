@@ -263,8 +263,9 @@ class RateProgram:
             )
         place = links.index(observed_frame(user_machine, name))
         body = self._frames[place][1]
-        numbers = tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
-        return _frame_output(name, machine, body, numbers)
+        return _frame_output(
+            name, machine, body, tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
+        )
 
 
 @contextmanager
@@ -296,8 +297,10 @@ def _frame_output(
         return matvec(back, subtract_vectors(place, kinematics.origin[0]))[
             "xyz".index(name[-1])
         ], 1.0
-    axis = matvec(kinematics.rotation[body], frame_constants[3:])
-    height = dot(axis, [row[2] for row in kinematics.rotation[0]])
+    height = dot(
+        matvec(kinematics.rotation[body], frame_constants[3:]),
+        [row[2] for row in kinematics.rotation[0]],
+    )
     flat = apply_function("sqrt", 1.0 - height * height)
     if not name.endswith(VELOCITY_SUFFIX):
         return height, 1.0 / flat
@@ -332,9 +335,9 @@ def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str,
     for name in outputs:
         if name in tips or name.startswith(INCLINATION_PREFIX):
             link = observed_frame(machine, name)
-            frame = machine.model.frames[machine.frame(link)]
-            joint = int(frame.parentJoint)
-            found[link] = machine.coordinates.body_of_joint[joint]
+            found[link] = machine.coordinates.body_of_joint[
+                int(machine.model.frames[machine.frame(link)].parentJoint)
+            ]
     return list(found.items())
 
 

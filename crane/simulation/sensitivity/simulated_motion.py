@@ -305,8 +305,7 @@ class SimulatedMotion:
 
     def _interpolation_positions(self, times: Array) -> tuple[Indices, Array]:
         before = np.clip(np.searchsorted(self.time, times) - 1, 0, len(self.time) - 2)
-        share = (times - self.time[before]) / (self.time[before + 1] - self.time[before])
-        return before, share
+        return before, (times - self.time[before]) / (self.time[before + 1] - self.time[before])
 
     def constants_at(
         self, constants: SimulationConstants, nodes: MotionNodes

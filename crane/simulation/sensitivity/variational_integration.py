@@ -343,8 +343,9 @@ class _VariationalIntegrator:
                 self._refine_step(nodes, step_sensitivities, depth)
                 self._refine_step(nodes, step_sensitivities, depth)
             else:
-                begin = step_sensitivities[-1]
-                step_sensitivities += [one[:, :m] @ begin + one[:, m:] for one in (first, pair)]
+                step_sensitivities += [
+                    one[:, :m] @ step_sensitivities[-1] + one[:, m:] for one in (first, pair)
+                ]
         if paired < count:
             self._refine_step(nodes, step_sensitivities, depth)
         return np.array(step_sensitivities), output_jacobian
