@@ -31,7 +31,7 @@ from crane.machine.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.machine_code_stepper import MachineCodeStepper
 from crane.simulation.integration.machine_formulas import reference_samples, wrap_rotations
-from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepCode, StepLoop, StepWriter
+from crane.simulation.integration.step_loop import MIN_STEP_RATIO, StepLoop, StepWriter
 
 MAX_REFERENCE_SPACING = 5e-4  # largest interval between the samples of references [s]
 MIN_SCALE = 0.1  # least scale of states: rad, characteristic lengths, per characteristic time
@@ -322,7 +322,7 @@ class ErrorControlledStepper(MachineCodeStepper):
         """
 
     @abstractmethod
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """Writers of a step up to `finish`, and of `dense` after a step."""
 
     def _add_run(self, program: Program) -> None:
@@ -421,7 +421,7 @@ class DormandPrinceStepper(ErrorControlledStepper):
             parts += scale_vector(h, weighted_sum(tape, 1, size, weights))
         program.add_formula("dense", 4, parts)
 
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
         r, size, method = step.routine, self.state_layout.size, _scipy_method()
         # rates have further outputs, which the next rate overwrites

@@ -25,7 +25,7 @@ from crane.simulation.integration.error_controlled_stepper import (
     error_tolerances,
 )
 from crane.simulation.integration.radau_linear_system import EigenvalueShift, RadauLinearSystem
-from crane.simulation.integration.step_loop import StepCode, StepWriter
+from crane.simulation.integration.step_loop import StepLoop, StepWriter
 
 RADAU_TOLERANCE = 1e-9  # error of a step, relative to the size of the state
 _ROOT_OF_SIX = np.sqrt(6.0)
@@ -272,7 +272,7 @@ class RadauStepper(ErrorControlledStepper):
         )
         program.add_formula("dense", 1, [x for row in coefficients for x in row])
 
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
         writer = _RadauStepCode(
             program, step, self.state_layout.size, self._mobility, self._controller_state_count
@@ -285,7 +285,7 @@ class _RadauStepCode:
 
     Args:
         program: The program with its formulas.
-        step: See `StepCode`.
+        step: See `StepLoop`.
         size: Length of the state.
         mobility: Number of active coordinates.
         controller_state_count: Number of states of the controller.
@@ -294,7 +294,7 @@ class _RadauStepCode:
     def __init__(
         self,
         program: Program,
-        step: StepCode,
+        step: StepLoop,
         size: int,
         mobility: int,
         controller_state_count: int,

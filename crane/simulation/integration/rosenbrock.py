@@ -29,7 +29,7 @@ from crane.simulation.integration.error_controlled_stepper import (
     characteristic_energy,
     weighted_sum,
 )
-from crane.simulation.integration.step_loop import StepCode, StepWriter
+from crane.simulation.integration.step_loop import StepLoop, StepWriter
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -274,7 +274,7 @@ class RosenbrockStepper(ErrorControlledStepper):
         ]
         program.add_formula(f"solve{stage}{suffix}", 4, outputs)
 
-    def _write_step(self, program: Program, step: StepCode) -> tuple[StepWriter, StepWriter]:
+    def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
         r, size = step.routine, self.state_layout.size
         u, stage = r.local_array("u", STAGES * size), r.local_array("stage", size)
