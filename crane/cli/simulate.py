@@ -368,7 +368,7 @@ def modes(
     ] = None,
 ) -> None:
     """Compute frequencies, damping and shapes of modes."""
-    from crane.simulation.linear import linear_models, linearize
+    from crane.simulation.linear.linearization import linear_models, linearize
 
     axes = parse_grids(vary)
     loaded = options.load(machine)
@@ -395,7 +395,7 @@ def sensitivities(
     outputs: Outputs = None,
 ) -> None:
     """Compute derivatives of a motion by parameters."""
-    from crane.simulation.sensitivity import sensitivities as run
+    from crane.simulation.sensitivity.motion_sensitivities import sensitivities as run
 
     loaded = add_task_loads(options.load(machine), task)
     control = task_control(loaded, task, controller)

@@ -35,13 +35,17 @@ from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.recording_summary import tipping_message
-from crane.simulation.integration.chart_switching import ChartIntegrator, ChartSwitchingIntegrator
+from crane.simulation.integration.chart_switching import ChartSwitchingIntegrator
 from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.error_controlled_stepper import (
     DormandPrinceStepper,
     ErrorControlledStepper,
 )
-from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.integrators import (
+    ErrorControlledIntegrator,
+    FixedStepIntegrator,
+    StickSlipIntegrator,
+)
 from crane.simulation.integration.python_stepper import IntegrationHaltError, explain_halt
 from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import RosenbrockStepper
@@ -324,7 +328,7 @@ def integrator_factory(
     controller_state_count: int,
     requested_method: str | None,
     tolerance: float | None,
-) -> Callable[[Chart], ChartIntegrator]:
+) -> Callable[[Chart], StickSlipIntegrator]:
     """Function that creates the integrator of a method in a chart.
 
     Args:
@@ -368,7 +372,7 @@ def integrator_factory(
         _COMPILED_METHODS.get(method) if not valves or method == "rosenbrock" else None
     )
 
-    def make(chart: Chart) -> ChartIntegrator:
+    def make(chart: Chart) -> StickSlipIntegrator:
         """A compiled integrator, or one of scipy where the formulas cannot be compiled."""
         compiled = stepper_factory is not None and chart.dynamics.backend == "compiled"
         if compiled and isinstance(control, TracedController):

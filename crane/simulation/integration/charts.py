@@ -38,7 +38,7 @@ from crane.machine.machine import Machine
 from crane.simulation.integration.stick_slip_modes import StickSlipModes
 
 MAX_GAMMA_ENTRY = 5.0  # entry of gamma in coordinate units from which another chart is sought
-_MIN_IMPROVEMENT = 3.0  # least ratio of the condition numbers of the present and a new chart
+MIN_IMPROVEMENT = 3.0  # least ratio of the condition numbers of the present and a new chart
 _SINGULAR_DETERMINANT_SHARE = 1e-2  # share of the determinant at home near the end of a branch
 _RANK_TOLERANCE = 1e-12  # share of the largest singular value that counts as zero
 
@@ -188,7 +188,7 @@ class Chart:
         return float(np.abs(shares[closure.passive]).max(initial=0.0))
 
     def find_better_chart(
-        self, q: Array, min_improvement: float = _MIN_IMPROVEMENT
+        self, q: Array, min_improvement: float = MIN_IMPROVEMENT
     ) -> "Chart | None":
         """A chart at a closed configuration (nq,) whose condition number is smaller by a factor.
 

@@ -116,10 +116,10 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._steps_end_at_outputs = isinstance(control, ValveDrive)
         super().__init__(chart, control, controller_state_count, method, fold_settings)
         self.tolerance = np.ascontiguousarray(tolerance)
-        self._step_state = np.zeros(6)  # see `StepLoop`
+        self._step_state = np.zeros(6)
         self._break_times = np.append(break_times(chart.machine, control), np.inf)
 
-    def reset_step_size(self) -> None:
+    def restart(self) -> None:
         """Start the next run with a short step."""
         self._step_state[0] = 0.0
 
@@ -195,11 +195,6 @@ class ErrorControlledStepper(MachineCodeStepper):
         grid[[0, -1]] += _TIME_TOLERANCE * (grid[1] - start_time) * np.array([1.0, -1.0])
         return reference_samples(self._chart.machine, self._control, grid)
 
-    @property
-    def event(self) -> float:
-        """Whether a stick-slip transition is at the state."""
-        return float(self._step_state[5])
-
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
             machine, inputs, tau, _ = self._trace_controlled_machine(Tape())
@@ -231,7 +226,10 @@ class ErrorControlledStepper(MachineCodeStepper):
         self._add_event_formulas(program, len(event_distances))
         self._add_method(program)
         self._add_interpolation(program)
-        self._add_run(program)
+        functions = ("close",) if self.external_callback is None else ("close", "callback")
+        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
+        with program.add_routine("run", counts=("steps",), functions=functions, arrays=names) as r:
+            StepLoop(self, program, r, self._steps_end_at_outputs).write(self._write_step)
 
     def _add_interpolation(self, program: Program) -> None:
         """reference(rows, s), interpolate(state, dense, x), wrap(state)."""
@@ -324,12 +322,6 @@ class ErrorControlledStepper(MachineCodeStepper):
     @abstractmethod
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """Writers of a step up to `finish`, and of `dense` after a step."""
-
-    def _add_run(self, program: Program) -> None:
-        functions = ("close",) if self.external_callback is None else ("close", "callback")
-        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
-        with program.add_routine("run", counts=("steps",), functions=functions, arrays=names) as r:
-            StepLoop(self, program, r, self._steps_end_at_outputs).write(self._write_step)
 
 
 def break_times(machine: Machine, control: TracedController) -> Array:

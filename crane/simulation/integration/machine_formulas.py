@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from crane.closure.compiled_closure import CompiledClosure
 from crane.closure.kinematics_formulas import FormulaConstants
 from crane.closure.spatial_vectors import wrap_rotation_vector
 from crane.codegen import (
@@ -68,7 +67,7 @@ class MachineFormulas:
         states = self.q_a, self.v_a, self.state_parts.controller
         if not self.chart.has_user_coordinates:
             return ControllerInputs(
-                *states, settings, reference, _raise_undetermined, _raise_undetermined
+                *states, settings, reference, raise_undetermined, raise_undetermined
             )
         dynamics = self.dynamics_formulas
         return ControllerInputs(
@@ -117,7 +116,9 @@ class MachineFormulas:
             *accelerations.a_a,
             *self.external_forces.state_rates,
             *controller_rate,
-            *self._powers(tau),
+            dot(tau, self.v_a),
+            *self.external_forces.powers,
+            self.dynamics_formulas.dissipated_power,
         ]
         return rate, accelerations.transition_margin
 
@@ -185,17 +186,16 @@ class MachineFormulas:
             *(add_vectors(one, other) for one, other in passive),
         ]
 
-    def _powers(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """Power of the controller, of each external force, and dissipated power [W]."""
-        return [
-            dot(tau, self.v_a),
-            *self.external_forces.powers,
-            self.dynamics_formulas.dissipated_power,
-        ]
+
+class UndeterminedMotionError(InputError):
+    """Inverse dynamics of coordinates that do not determine the motion."""
 
 
-def _raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
-    raise InputError("inverse dynamics of coordinates that do not determine the motion")
+def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
+    """Inverse dynamics and gravity of a controller that must not ask for them."""
+    raise UndeterminedMotionError(
+        "inverse dynamics of coordinates that do not determine the motion"
+    )
 
 
 def trace_machine(
@@ -306,13 +306,9 @@ def controller_formula_key(
 
 
 def machine_program(
-    machine: Machine,
-    control: TracedController,
-    compiled_closure: CompiledClosure,
-    key: tuple,
-    build: Callable[[Program], None],
+    machine: Machine, control: TracedController, key: tuple, build: Callable[[Program], None]
 ) -> Program:
-    """Machine code of a machine with its controller.
+    """Machine code of a machine with its controller, kept by the loops of the machine.
 
     It is cached only if controller and external forces are classes of this package: the code of a
     class of the user may depend on more than the key.
@@ -320,19 +316,22 @@ def machine_program(
     Args:
         machine: The machine.
         control: The controller.
-        compiled_closure: The compiled closure of the machine.
         key: Properties on which the code depends, with `controller_formula_key`.
         build: Function that adds formulas and routines.
 
     Raises:
         FormulaTooLongError: The formulas are too long to be compiled.
     """
-    parts: list[object] = [control, *machine.external_forces]
-    if isinstance(control, ValveDrive):
-        parts.append(control.command)
-    if all(type(part).__module__.startswith("crane.") for part in parts):
-        return compiled_closure.cached_program(key, build)
-    return Program.from_cache(None, build)
+    closure = machine.closure.compiled_closure
+    if key not in closure.programs:
+        parts: list[object] = [control, *machine.external_forces]
+        if isinstance(control, ValveDrive):
+            parts.append(control.command)
+        if all(type(part).__module__.startswith("crane.") for part in parts):
+            closure.programs[key] = closure.cached_program(key, build)
+        else:
+            closure.programs[key] = Program.from_cache(None, build)
+    return closure.programs[key]
 
 
 def controller_settings(

@@ -4,9 +4,11 @@ The method has three stages and an embedded method of order 3 (Hairer and Wanner
 Differential Equations II, IV.8, which has the coefficients).
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 
-from crane.codegen import Program, RoutineValue, Scalar, Tape, select
+from crane.codegen import Layout, Program, RoutineValue, Scalar, Tape, select
 from crane.codegen.intermediate_representation import ArrayPointer
 from crane.codegen.matrix_factorization import lu_factorize
 from crane.codegen.symbolic import (
@@ -285,7 +287,7 @@ class _RadauStepCode:
 
     Args:
         program: The program with its formulas.
-        step: See `StepLoop`.
+        step: The loop over steps.
         size: Length of the state.
         mobility: Number of active coordinates.
         controller_state_count: Number of states of the controller.
@@ -300,54 +302,54 @@ class _RadauStepCode:
         controller_state_count: int,
     ):
         r = self._r = step.routine
-        self._step, self._mobility = step, mobility
+        self._step, self._mobility, self._size = step, mobility, size
         m = self._direction_count = mobility + controller_state_count
-        self._size = size
         # rates have further outputs, which the next rate overwrites
         further = program.formula_outputs("rate").size - size
-        self._velocity_directions = r.local_array("velocity_directions", m * size)
-        self._coordinate_directions = r.local_array(
-            "coordinate_directions", max(1, mobility * size)
-        )
-        self._velocity_rates = r.local_array("velocity_rates", m * size + further)
-        self._coordinate_rates = r.local_array("coordinate_rates", m * size + further)
-        self._mass = r.local_array("mass", mobility * mobility + mobility)
-        self._stage = r.local_array("stage", size)
-        self._jacobian = r.local_array("jacobian", program.formula_outputs("jacobian"))
-        self._real_factors = r.local_array("real", m * m)
-        self._complex_factors = r.local_array("pair", 4 * m * m)
-        self._stage_rates = r.local_array("rates", STAGES * size + further)
-        self._error_rate = r.local_array("slope", size + further)
-        self._iterate = r.local_array("iterate", program.formula_outputs("newton"))
-        self._previous_stages = r.local_array("previous_stages", STAGES * size)
-        self._ratio = r.local_array("ratio", 1)
-        self._error_estimate = r.local_array("error_estimate", size)
+        sizes: dict[str, Layout | int] = {
+            "velocity_directions": m * size,
+            "coordinate_directions": max(1, mobility * size),
+            "velocity_rates": m * size + further,
+            "coordinate_rates": m * size + further,
+            "mass": mobility * mobility + mobility,
+            "stage": size,
+            "jacobian": program.formula_outputs("jacobian"),
+            "real_factors": m * m,
+            "complex_factors": 4 * m * m,
+            "rates": STAGES * size + further,
+            "error_rate": size + further,
+            "iterate": program.formula_outputs("newton"),
+            "previous_stages": STAGES * size,
+            "ratio": 1,
+            "error_estimate": size,
+        }
+        self._arrays = SimpleNamespace(**{x: r.local_array(x, n) for x, n in sizes.items()})
         self._jacobian_time = r.new_variable(-np.inf)
         self._convergence_rate = r.new_variable(1.0)
         self._previous_length = r.new_variable(0.0)
-        r.call("velocity_directions", r.tol, self._velocity_directions)
+        r.call("velocity_directions", r.tol, self._arrays.velocity_directions)
         with r.loop(r.new_variable(STAGES * size)) as i:
-            r.store(self._previous_stages, i, 0.0)
+            r.store(self._arrays.previous_stages, i, 0.0)
 
     def write_attempt(self, t: RoutineValue, length: RoutineValue) -> None:
         """Write an attempt of a step from a time on, up to `finish`."""
-        r, step, jacobian = self._r, self._step, self._jacobian
+        r, step, arrays, result = self._r, self._step, self._arrays, self._step.step_result
         with r.if_then(
             (t > self._jacobian_time) & (self._convergence_rate > _MAX_CONVERGENCE_RATE)
         ):
             self._update_jacobian(t)
-        r.call("real_factors", jacobian, step.length, self._real_factors)
-        r.call("complex_factors", jacobian, step.length, self._complex_factors)
+        r.call("real_factors", arrays.jacobian, step.length, arrays.real_factors)
+        r.call("complex_factors", arrays.jacobian, step.length, arrays.complex_factors)
         ratio = select(self._previous_length > 0.0, length / self._previous_length, 0.0)
-        r.store(self._ratio, 0, ratio)
-        r.call("predict", r.state, self._previous_stages, self._ratio, self._iterate)
+        r.store(arrays.ratio, 0, ratio)
+        r.call("predict", r.state, arrays.previous_stages, arrays.ratio, arrays.iterate)
         converged = self._iterate_newton(t, length)
-        Z, result = self._iterate.element_pointer("Z"), step.step_result
+        Z = arrays.iterate.element_pointer("Z")
         self._estimate_error(step.start_rate, Z)
         with r.if_then(result["error"] > 1.0):
-            r.call("displaced", r.state, self._error_estimate, self._stage)
-            step.call("rate", t, self._stage, self._error_rate)
-            self._estimate_error(self._error_rate, Z)
+            r.call("displaced", r.state, arrays.error_estimate, arrays.stage)
+            step.call("rate", t, arrays.stage, arrays.error_rate)
+            self._estimate_error(arrays.error_rate, Z)
         with r.if_then(converged < 1):
             r.store(result.element_pointer("error"), 0, 2.0)
             r.store(result.element_pointer("change"), 0, 0.25)
@@ -355,60 +357,53 @@ class _RadauStepCode:
             is_old = self._jacobian_time < t
             r.assign(self._jacobian_time, select(is_old, -np.inf, self._jacobian_time))
         with r.if_else():
-            r.copy(self._previous_stages, Z, STAGES * self._size)
+            r.copy(arrays.previous_stages, Z, STAGES * self._size)
             r.assign(self._previous_length, select(result["error"] <= 1.0, length, 0.0))
 
     def write_interpolation(self, t: RoutineValue, length: RoutineValue) -> None:
         """Write the dense output behind a step."""
-        self._r.call("dense", self._iterate.element_pointer("Z"), self._step.dense_output)
+        Z = self._arrays.iterate.element_pointer("Z")
+        self._r.call("dense", Z, self._step.dense_output)
 
     def _update_jacobian(self, t: RoutineValue) -> None:
-        r, step = self._r, self._step
-        step.call("mass", t, r.state, self._mass)
-        self._write_rates(
-            t, self._direction_count, self._velocity_directions, self._velocity_rates
-        )
+        r, step, a = self._r, self._step, self._arrays
+        step.call("mass", t, r.state, a.mass)
+        self._write_rates(t, self._direction_count, a.velocity_directions, a.velocity_rates)
         r.call(
-            "coordinate_directions", step.start_rate, self._velocity_rates, r.tol,
-            self._coordinate_directions,
+            "coordinate_directions", step.start_rate, a.velocity_rates, r.tol,
+            a.coordinate_directions,
         )  # fmt: skip
-        self._write_rates(t, self._mobility, self._coordinate_directions, self._coordinate_rates)
-        r.call(
-            "jacobian", step.start_rate, self._velocity_rates, self._coordinate_rates, self._mass,
-            r.tol, self._jacobian,
-        )  # fmt: skip
+        self._write_rates(t, self._mobility, a.coordinate_directions, a.coordinate_rates)
+        rates = step.start_rate, a.velocity_rates, a.coordinate_rates
+        r.call("jacobian", *rates, a.mass, r.tol, a.jacobian)
         r.assign(self._jacobian_time, t)
 
     def _write_rates(
         self, t: RoutineValue, count: int, directions: ArrayPointer, rates: ArrayPointer
     ) -> None:
         """Rates at states that are displaced along some directions."""
-        r, size = self._r, self._size
+        r, stage, size = self._r, self._arrays.stage, self._size
         with r.loop(r.new_variable(count)) as i:
-            r.call("displaced", r.state, directions.row_pointer(i, size), self._stage)
-            self._step.call("rate", t, self._stage, rates.row_pointer(i, size))
+            r.call("displaced", r.state, directions.row_pointer(i, size), stage)
+            self._step.call("rate", t, stage, rates.row_pointer(i, size))
 
     def _iterate_newton(self, t: RoutineValue, length: RoutineValue) -> RoutineValue:
         """Iterations of Newton's method; returns 1 if it converges."""
-        r, step, iterate = self._r, self._step, self._iterate
+        r, step, a = self._r, self._step, self._arrays
         tries, converged, norm = r.new_variable(0), r.new_variable(0), r.new_variable(0.0)
         rate = self._convergence_rate
         with r.loop_forever():
             for i in range(STAGES):
-                stage = iterate.element_pointer("stages").element_pointer(i * self._size)
-                step.call(
-                    "rate",
-                    t + length * float(NODES[i]),
-                    stage,
-                    self._stage_rates.element_pointer(i * self._size),
-                )
+                stage = a.iterate.element_pointer("stages").element_pointer(i * self._size)
+                stage_rate = a.rates.element_pointer(i * self._size)
+                step.call("rate", t + length * float(NODES[i]), stage, stage_rate)
             r.call(
-                "newton", r.state, self._jacobian, self._real_factors, self._complex_factors,
-                self._stage_rates, iterate.element_pointer("W"), step.length, r.tol, iterate,
+                "newton", r.state, a.jacobian, a.real_factors, a.complex_factors, a.rates,
+                a.iterate.element_pointer("W"), step.length, r.tol, a.iterate,
             )  # fmt: skip
             r.assign(tries, tries + 1)
             previous_norm = r.new_variable(norm)
-            r.assign(norm, iterate["norm"])
+            r.assign(norm, a.iterate["norm"])
             with r.if_then(tries > 1):
                 r.assign(rate, norm / previous_norm)
                 with r.if_then(rate * norm < (rate * -1.0 + 1.0) * _NEWTON_TOLERANCE):
@@ -424,12 +419,11 @@ class _RadauStepCode:
 
     def _estimate_error(self, rate: ArrayPointer, Z: ArrayPointer) -> None:
         """Estimate of the error with a rate at the start of the step, and `finish`."""
-        r, step = self._r, self._step
-        estimate = self._error_estimate
-        r.call("estimate", self._jacobian, self._real_factors, rate, Z, step.length, estimate)
+        r, step, a = self._r, self._step, self._arrays
+        r.call("estimate", a.jacobian, a.real_factors, rate, Z, step.length, a.error_estimate)
         r.call(
-            "finish", r.geometry, r.state, Z, estimate, step.start_rate, step.length, r.tol,
-            step.step_result,
+            "finish", r.geometry, r.state, Z, a.error_estimate, step.start_rate, step.length,
+            r.tol, step.step_result,
         )  # fmt: skip
 
 
@@ -453,6 +447,4 @@ def _sum_of_squares(values: list[Scalar], scales: list[Scalar]) -> Scalar:
 
 def _combine_rows(weights: Array, rows: list[list[Scalar]]) -> list[list[Scalar]]:
     """Linear combinations of rows by rows of weights."""
-    return [
-        [dot(row, column) for column in list(zip(*rows, strict=True))] for row in weights.tolist()
-    ]
+    return [[dot(row, column) for column in zip(*rows, strict=True)] for row in weights.tolist()]

@@ -44,40 +44,26 @@ class ScipyIntegrator(StickSlipIntegrator):
         self._tolerance = tolerance
         super().__init__(chart, control, controller_state_count, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
-        self._end_time = 0.0
 
-    def run(
-        self, times: Array, state: Array, step: float, rows: Array, progress: StepProgress = None
-    ) -> int:
-        """See `FixedStepIntegrator.run`.
+    def _advance(
+        self,
+        first: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+        progress: StepProgress,
+    ) -> bool:
+        """See `StickSlipIntegrator._advance`; integrates to the last instant if there is no event.
 
         Raises:
             IntegrationHaltError: The method fails, or the loops do not close.
         """
-        first = times[0] if len(times) else self._end_time
-        self.done = self.next_instant = 0
-        self._prepare_modes(first + self.offset, state)
-        self._end_time = first + step * len(times)
-        instants = np.append(times, self._end_time)
-        while self.next_instant < len(times) or self.offset < 0:
-            if not self._integrate_until(
-                instants[self.next_instant] + self.offset, instants, state, rows, progress
-            ):
-                break
-            self.offset = self._rounded_offset(self.offset, step)
-        return self.next_instant
-
-    def _integrate_until(
-        self, start_time: float, instants: Array, state: Array, rows: Array, progress: StepProgress
-    ) -> bool:
-        """Integrate to the last instant, or to a stick-slip transition.
-
-        Returns:
-            False where another chart is needed.
-        """
         from scipy import integrate
 
-        closure, end = self._closure, instants[-1]
+        closure, end = self._closure, first + step * len(times)
+        instants = np.append(times, end)
+        start_time = instants[self.next_instant] + self.offset
         units, characteristic_time, view = (
             closure.units,
             closure.characteristic_time,
@@ -136,15 +122,8 @@ class ScipyIntegrator(StickSlipIntegrator):
                 self.next_instant = self.done
                 self.offset = until - instants[self.next_instant]
                 return True
-            before = after
-            if (
-                min(
-                    self.python_stepper.chart_limits[0]
-                    - self._chart.largest_gamma_entry(view(solver.y).q),
-                    1.0,
-                )
-                < 0
-            ):
+            before, q = after, view(solver.y).q
+            if self._chart.largest_gamma_entry(q) > self.python_stepper.chart_limits[0]:
                 return False
         return True
 

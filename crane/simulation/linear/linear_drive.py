@@ -18,7 +18,7 @@ from crane.dynamics.joint_forces import JointForces
 from crane.hydraulics.circuit_states import BALANCE_UNITS
 from crane.machine.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
-from crane.simulation.integration.machine_formulas import controller_settings
+from crane.simulation.integration.machine_formulas import controller_settings, raise_undetermined
 
 _MIN_OPENING = 1e-6  # share of the spool stroke beyond the dead band
 
@@ -228,8 +228,8 @@ class LinearizedDrive:
             [*states, *integrals],
             settings,
             initial_inputs,
-            _unavailable_dynamics,
-            _unavailable_dynamics,
+            raise_undetermined,
+            raise_undetermined,
         )
         tau, rates = control.trace(inputs)
         output_units = [*control.channel_values(inputs), *(tau[i] for i in self._active_indices)]
@@ -285,7 +285,3 @@ class LinearizedDrive:
         self._program.call("formula", np.concatenate([q_a, v_a, states, inputs]), settings, out)
         values, jacobian = out[layout["values"]], out[layout["slopes"]]
         return values, jacobian.reshape(len(values), -1)
-
-
-def _unavailable_dynamics(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
-    raise AssertionError("signals that are given do not ask for forces")

@@ -145,11 +145,7 @@ class RateProgram:
                 )
             ),
         )
-        if key not in self._compiled_closure.programs:
-            self._compiled_closure.programs[key] = machine_program(
-                machine, control, self._compiled_closure, key, self._build
-            )
-        self._program = self._compiled_closure.programs[key]
+        self._program = machine_program(machine, control, key, self._build)
 
     def evaluate_rate(
         self, constants: SimulationConstants, state: Array, has_joints_at_rest: bool
