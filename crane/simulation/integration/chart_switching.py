@@ -6,6 +6,7 @@ from contextlib import suppress
 import numpy as np
 
 from crane.codegen import Tape
+from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.threads import single_threaded_blas
 from crane.control.control_law import Controller, ControllerInputs, TracedController
@@ -362,7 +363,7 @@ class ChartSwitchingIntegrator:
         values = (tape.load_vector(i, 0, size) for i, size in enumerate(sizes))
         try:
             control.trace(ControllerInputs(*values, raise_undetermined, raise_undetermined))
-        except UndeterminedMotionError:
+        except InputError:
             return True
         return False
 

@@ -187,13 +187,9 @@ class MachineFormulas:
         ]
 
 
-class UndeterminedMotionError(InputError):
-    """Inverse dynamics of coordinates that do not determine the motion."""
-
-
 def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
     """Inverse dynamics and gravity of a controller that must not ask for them."""
-    raise UndeterminedMotionError(
+    raise InputError(
         "inverse dynamics of coordinates that do not determine the motion"
     )
 
