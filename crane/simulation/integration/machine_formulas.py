@@ -189,9 +189,7 @@ class MachineFormulas:
 
 def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
     """Inverse dynamics and gravity of a controller that must not ask for them."""
-    raise InputError(
-        "inverse dynamics of coordinates that do not determine the motion"
-    )
+    raise InputError("inverse dynamics of coordinates that do not determine the motion")
 
 
 def trace_machine(

@@ -159,9 +159,8 @@ def gradient(
     integrator = AdjointIntegrator(
         track, problem.outputs, directions.nominal_constants(track.time), changes
     )
-    parts = track.layout.view(track.rows[::2])
-    recording = problem.record_motion(track.time[::2], parts)
-    observed = _output_values(track.chart.machine, recording, parts, problem.outputs)
+    recording = problem.record_motion(track)
+    observed = _output_values(track.chart.machine, recording, track.parts, problem.outputs)
     total, weights = _functional_and_weights(functional, recording.time, observed)
     gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
     # no parameter changes the references of the controller

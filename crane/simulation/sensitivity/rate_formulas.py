@@ -1,7 +1,6 @@
 """State rate of a simulated machine as formulas of its state and of all its constants."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,8 +80,7 @@ class RateProgram:
         outputs: Names of the outputs.
 
     Raises:
-        FormulaTooLongError: The formulas are too long to be compiled.
-        InputError: An output is unknown.
+        InputError: An output is unknown, or the formulas are too long.
     """
 
     def __init__(
@@ -97,31 +95,24 @@ class RateProgram:
         self._chart, self._control, self.outputs = chart, control, tuple(outputs)
         self._stiff_state_count, self._variable_constants = stiff_state_count, variable_constants
         machine = chart.machine
-        self._compiled_closure, self._mobility = (
-            machine.closure.compiled_closure,
-            len(machine.active),
-        )
-        self._state_layout, self.state_size = (
-            state_layout(machine, controller_state_count),
-            2 * self._mobility + stiff_state_count,
-        )
+        self._mobility = len(machine.active)
+        self._state_layout = state_layout(machine, controller_state_count)
+        self.state_size = 2 * self._mobility + stiff_state_count
         self._controller_columns = reference_count(control)
         self._reference_columns = self._controller_columns + sum(
             reference_counts(machine.external_forces)
         )
         self._frames = observed_frames(machine, outputs)
-        self._folded_constants = (
-            np.where(
-                variable_constants.geometry != 0, np.nan, self._compiled_closure.geometry.constants
-            ),
-            np.where(
-                variable_constants.dynamics_constants != 0, np.nan, chart.dynamics.constant_pattern
-            ),
-        )
         # zeros among the settings are features that a circuit does not have
-        self._folded_settings = np.where(
-            variable_constants.settings != 0, np.nan, control.settings
+        constants = (
+            machine.closure.compiled_closure.geometry.constants, chart.dynamics.constant_pattern,
+            control.settings,
+        )  # fmt: skip
+        geometry, dynamics_constants, self._folded_settings = (
+            np.where(is_variable != 0, np.nan, part)
+            for is_variable, part in zip(variable_constants, constants, strict=False)
         )
+        self._folded_constants = geometry, dynamics_constants
         form = controller_formula_key(
             control, self._controller_columns, chart, controller_state_count, True
         )
@@ -134,18 +125,14 @@ class RateProgram:
             self.outputs,
             *self._frames,
             *map(folding_pattern, (*self._folded_constants, self._folded_settings)),
-            *(
-                np.asarray(part != 0).tobytes()
-                for part in (
-                    variable_constants.geometry,
-                    variable_constants.dynamics_constants,
-                    variable_constants.settings,
-                    variable_constants.references,
-                    variable_constants.frames,
-                )
-            ),
+            *(np.asarray(part != 0).tobytes() for part in variable_constants[:5]),
         )
-        self._program = machine_program(machine, control, key, self._build)
+        try:
+            self._program = machine_program(machine, control, key, self._build)
+        except FormulaTooLongError:
+            raise InputError(
+                f"the formulas of '{machine.name}' are too long to differentiate: lock joints"
+            ) from None
 
     def evaluate_rate(
         self, constants: SimulationConstants, state: Array, has_joints_at_rest: bool
@@ -161,18 +148,39 @@ class RateProgram:
         out = np.empty(self.state_size)
         self._program.call(
             "rate" + AT_REST_SUFFIX * has_joints_at_rest,
-            constants.geometry,
-            constants.dynamics_constants,
-            constants.settings,
-            constants.frames,
-            constants.references,
+            *constants[:5],
             state,
             out,
         )
         return out
 
-    def _call(self, routine: str, has_joints_at_rest: bool, *arguments: "int | Array") -> None:
-        self._program.call(routine + AT_REST_SUFFIX * has_joints_at_rest, *arguments)
+    def _add_routine(
+        self, program: Program, name: str, formula: str, widths: Mapping[str, tuple[str, int]]
+    ) -> None:
+        """Add a routine that calls a formula several times for each of some states.
+
+        Args:
+            program: The program.
+            name: Name of the routine.
+            formula: Name of the formula; its first arguments are constants, references, state.
+            widths: Length of the rows of each further array, and what has a row: the "repetition",
+                or "both" that and the state.
+        """
+        constants = ("geometry", "constants", "settings", "frames")
+        widths = {
+            "references": ("state", self._reference_columns),
+            "states": ("state", self._state_layout.size),
+        } | dict(widths)
+        arrays = (*constants, *widths)
+        with program.add_routine(name, counts=("count", "repetitions"), arrays=arrays) as r:
+            with r.loop(r.count) as i, r.loop(r.repetitions) as j:
+                rows = {"state": i, "repetition": j, "both": i * r.repetitions + j}
+                r.call(
+                    formula,
+                    *(getattr(r, x) for x in constants),
+                    *(getattr(r, x).row_pointer(rows[y], n) for x, (y, n) in widths.items()),
+                )
+            r.return_value(r.count)
 
     def _add_derivatives(
         self, program: Program, suffix: str, formulas: DifferentiatedFormulas
@@ -203,13 +211,10 @@ class RateProgram:
             self._control.channel_values(inputs) if isinstance(self._control, ValveDrive) else []
         )
         machine = machine.with_circuit_friction(self._control, inputs)
-        accelerations, dynamics_formulas = (
-            machine.accelerations(tau, with_joints_at_rest),
-            machine.dynamics_formulas,
-        )
-        active = self._chart.machine.closure.active
+        accelerations = machine.accelerations(tau, with_joints_at_rest)
+        coordinate_rates = machine.dynamics_formulas.coordinate_derivatives
         rate = [
-            *(dynamics_formulas.coordinate_derivatives[i] for i in active),
+            *(coordinate_rates[i] for i in self._chart.machine.closure.active),
             *accelerations.a_a,
             *controller_rate[: self._stiff_state_count],
         ]
@@ -249,34 +254,16 @@ class RateProgram:
                 return channel_formulas[channels.index(name)], 1.0
         if name in ("kinetic", "potential"):
             return getattr(dynamics, name), 1.0
-        links = [link for link, _ in self._frames]
-        if (
-            not name.startswith((INCLINATION_PREFIX, "tip_"))
-            or observed_frame(user_machine, name) not in links
-        ):
+        links, link = [link for link, _ in self._frames], observed_frame(user_machine, name)
+        if not name.startswith((INCLINATION_PREFIX, "tip_")) or link not in links:
             raise InputError(
                 f"'{name}' is no output of '{user_machine.name}': take joints, forces, channels"
             )
-        place = links.index(observed_frame(user_machine, name))
+        place = links.index(link)
         body = self._frames[place][1]
         return _frame_output(
             name, machine, body, tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
         )
-
-
-@contextmanager
-def report_long_formulas(machine: Machine) -> Iterator[None]:
-    """Report formulas that are too long.
-
-    Raises:
-        InputError: The formulas are too long.
-    """
-    try:
-        yield
-    except FormulaTooLongError:
-        raise InputError(
-            f"the formulas of '{machine.name}' are too long to differentiate: lock joints"
-        ) from None
 
 
 def _frame_output(
@@ -312,12 +299,8 @@ def _frame_output(
 
 def observed_frame(machine: Machine, name: str) -> str:
     """The link of an output that is a position or inclination."""
-    inclined = name.startswith(INCLINATION_PREFIX)
-    return (
-        name.removeprefix(INCLINATION_PREFIX).removesuffix(VELOCITY_SUFFIX)
-        if inclined
-        else str(machine.tip)
-    )
+    link = name.removeprefix(INCLINATION_PREFIX)
+    return str(machine.tip) if link == name else link.removesuffix(VELOCITY_SUFFIX)
 
 
 def observed_frames(machine: Machine, outputs: Sequence[str]) -> list[tuple[str, int]]:

@@ -134,7 +134,7 @@ class SimulatedMotion:
         stiff_state_count: Number of the first ones, on which the rates depend.
         time: (2 N + 1,) instants and the middles between them [s].
         rows: (2 N + 1, .) rows at these times, see `integrate`.
-        layout: Layout of a row.
+        parts: Parts of the rows at the instants.
         notes: Notes for the user about the motion.
         largest_states: (m,) largest values of the minimal state, at least in coordinate units; 1
             for states that are always 0.
@@ -189,9 +189,10 @@ class SimulatedMotion:
             if isinstance(control, ValveDrive)
             else self.controller_state_count
         )
-        self.layout = row_layout(machine, control, self.controller_state_count)
-        self.rows = np.hstack([getattr(parts, name) for name in self.layout.parts])
-        self._states = self.rows[:, : self.layout.start_index("tau")]
+        layout = row_layout(machine, control, self.controller_state_count)
+        self.rows = np.hstack([getattr(parts, name) for name in layout.parts])
+        self.parts = layout.view(self.rows[::2])
+        self._states = self.rows[:, : layout.start_index("tau")]
         make = integrator_factory(
             dynamics, control, self.controller_state_count, motion.method, motion.tolerance
         )
