@@ -127,7 +127,10 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         if self._phase_index < 0:
             self._begin_phase(0, time, positions)
         self._check_arrivals(time, positions)
-        targets = self._lever_targets()
+        targets = np.zeros(len(self._joints))
+        if self._phase_index < len(self._phases):
+            levers, pending = self._phases[self._phase_index].levers, self._pending_joints
+            targets = np.array([levers[x] if x in pending else 0.0 for x in self._joints])
         max_change = _SAMPLING_PERIOD / self._ramp if self._ramp else np.inf
         self.is_finished = self._phase_index == len(self._phases) and not self._levers.any()
         self._levers = self._levers + np.clip(targets - self._levers, -max_change, max_change)
@@ -135,7 +138,10 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         signals = [float(lever_signals(spool, np.asarray(lever))) for spool, lever in pairs]
         self._last_time = time
         self._sample_times.append(time + _SAMPLING_PERIOD)
-        self._sample_rows.append(np.append(signals, self._phase_clock(positions)))
+        shares = (self._completed_share(x, positions) for x in self._pending_joints)
+        # the clock never decreases
+        clock = max(self._phase_index + min(shares, default=0.0), float(self._sample_rows[-1][-1]))
+        self._sample_rows.append(np.append(signals, clock))
 
     def _begin_phase(self, index: int, time: float, positions: Mapping[str, float]) -> None:
         """Start a phase."""
@@ -153,20 +159,19 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
                 for joint in self._pending_joints
                 if phase.levers[joint] * (phase.until[joint] - positions[joint]) > 0
             }
+            if self._pending_joints and time - self._phase_start_time > phase.within:
+                shares = {x: self._completed_share(x, positions) for x in self._pending_joints}
+                joint = min(shares, key=lambda x: shares[x])
+                at, unit = positions[joint], self._units[joint]
+                raise SimulationError(
+                    f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
+                    f"{phase.within:g} s, '{joint}' is at {at:.4g} {unit} on its way from "
+                    f"{self._phase_start[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
+                    + self._remedy_text(phase, positions)
+                )
             if self._pending_joints:
                 break
             self._begin_phase(self._phase_index + 1, time, positions)
-        else:
-            return
-        if time - self._phase_start_time > phase.within:
-            joint = min(self._pending_joints, key=lambda x: self._completed_share(x, positions))
-            unit = self._units[joint]
-            raise SimulationError(
-                f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
-                f"{phase.within:g} s, '{joint}' is at {positions[joint]:.4g} {unit} on its way "
-                f"from {self._phase_start[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
-                + self._remedy_text(phase, positions)
-            )
 
     def _remedy_text(self, phase: Phase, positions: Mapping[str, float]) -> str:
         """Remedy for a phase that does not end; names a dead centre before the positions."""
@@ -180,24 +185,10 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
             return f"a dead centre is in between ({error}), give a position before it"
         return "give it more time or lever, or a position that it reaches"
 
-    def _lever_targets(self) -> Array:
-        """Target positions of the levers (m,)."""
-        if self._phase_index == len(self._phases):
-            return np.zeros(len(self._joints))
-        levers = self._phases[self._phase_index].levers
-        return np.array([levers[x] if x in self._pending_joints else 0.0 for x in self._joints])
-
     def _completed_share(self, joint: str, positions: Mapping[str, float]) -> float:
         """Share of its way in the phase that a joint has moved."""
         start, end = self._phase_start[joint], self._phases[self._phase_index].until[joint]
         return max((positions[joint] - start) / (end - start), 0.0)
-
-    def _phase_clock(self, positions: Mapping[str, float]) -> float:
-        """The clock, which never decreases."""
-        share = min(
-            (self._completed_share(x, positions) for x in self._pending_joints), default=0.0
-        )
-        return max(self._phase_index + share, float(self._sample_rows[-1][-1]))
 
     def references(self, times: Array) -> Array:
         """See `ValveCommand`: the signals, then the clock."""

@@ -1,8 +1,9 @@
-"""Equations of a circuit: pressures of its nodes, flows between them, and their balances."""
+"""Equations of a circuit: pressures of its nodes, flows between them, balances and powers."""
 
 from collections.abc import Sequence
 
-from crane.codegen.symbolic import Scalar, maximum
+from crane.codegen import SymbolicExpression
+from crane.codegen.symbolic import Scalar, dot, maximum
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.circuit_states import CircuitStates
 from crane.hydraulics.flow_equations import (
@@ -117,7 +118,15 @@ class CircuitValues:
         }
         openings = {cylinder.joint: cylinder.inlet_openings for cylinder in self._cylinders}
         elements = circuit.hydraulics.elements
-        loads = merged_load_pressures(elements.values(), self._load_pressures(), tank, openings)
+        pumps = circuit.hydraulics.pumps
+        # of the pumps whose regulator or valves use them
+        loads = {
+            name: largest_of([x.sensed_load_pressure(tank) for x in cylinders])
+            for name, cylinders in self._cylinders_by_supply.items()
+            if any(x.valve.sharing for x in cylinders)
+            or (cylinders and name in pumps and pumps[name].control == "load-sensing")
+        }
+        loads = merged_load_pressures(elements.values(), loads, tank, openings)
         for name, element in elements.items():
             self._balance.add_flows(
                 [
@@ -136,8 +145,19 @@ class CircuitValues:
         for name in self._constants.accumulators:
             self._add_accumulator(name)
         if circuit.engine is not None:
-            self._add_engine()
-        self._add_integrals()
+            engine = self._constants.engine
+            pump_torque = sum((pump.torque for pump in self.pumps.values()), 0.0)
+            droop = (1.0 + engine["droop"] - self.engine_speed_ratio) * engine["per_droop"]
+            torque = engine["torque"] * clip(droop, 0.0, 1.0) - pump_torque / engine["speed"]
+            self.state_rates.append(torque * engine["per_inertia"])
+        self.state_rates += [
+            self._balance.pumped_flow,
+            self._balance.returned_flow,
+            self._oil_rate,
+            self._balance.pump_power - tank * self._balance.returned_flow,
+            self._balance.lost_power + self._heat,
+            sum(self.stored_power.values(), 0.0),
+        ]  # of `BALANCE_UNITS`
 
     def _cylinder_equations(
         self,
@@ -172,16 +192,6 @@ class CircuitValues:
             self.pressures |= cylinders[i].pressures_by_node
         return cylinders
 
-    def _load_pressures(self) -> dict[str, Scalar]:
-        """Highest load pressure of the valves of each pump whose regulator or valves use it."""
-        pumps = self._circuit.hydraulics.pumps
-        return {
-            name: largest_of([x.sensed_load_pressure(self.tank_pressure) for x in cylinders])
-            for name, cylinders in self._cylinders_by_supply.items()
-            if any(x.valve.sharing for x in cylinders)
-            or (cylinders and name in pumps and pumps[name].control == "load-sensing")
-        }
-
     def _add_cylinder(
         self,
         cylinder: ValveCylinderEquations,
@@ -194,13 +204,16 @@ class CircuitValues:
             Its chambers.
         """
         valve, tank, balance = cylinder.valve, self.tank_pressure, self._balance
+        supply = self.pressures[valve.supply]
+        shortages = [
+            x.relative_shortage(supply, tank)
+            for x in self._cylinders_by_supply[valve.supply]
+            if x.valve.priority and not valve.priority
+        ]
+        priority_share = clip(1.0 - largest_of(shortages), 0.0, 1.0) if shortages else 1.0
         return_pressures = [self.pressures[valve.return_a], self.pressures[valve.return_b]]
-        flows = cylinder.flows(
-            self.pressures[valve.supply],
-            return_pressures,
-            loads.get(valve.supply, tank),
-            self._priority_share(cylinder),
-        )
+        load = loads.get(valve.supply, tank)
+        flows = cylinder.flows(supply, return_pressures, load, priority_share)
         flows += cylinder.leak_and_relief_flows(tank)
         balance.add_flows(flows)
         nodes = list(cylinder.pressures_by_node)
@@ -221,16 +234,6 @@ class CircuitValues:
     def _store(self, name: str, power: Scalar, flow: Scalar) -> None:
         """Add power [W] and oil [m3/s] that a node or spring stores."""
         self.stored_power[name], self._oil_rate = power, self._oil_rate + flow
-
-    def _priority_share(self, cylinder: ValveCylinderEquations) -> Scalar:
-        """Share of the flow that priority valves leave to a valve; see `Valve`."""
-        name, tank = cylinder.valve.supply, self.tank_pressure
-        shortages = [
-            x.relative_shortage(self.pressures[name], tank)
-            for x in self._cylinders_by_supply[name]
-            if x.valve.priority and not cylinder.valve.priority
-        ]
-        return clip(1.0 - largest_of(shortages), 0.0, 1.0) if shortages else 1.0
 
     def _add_pumps(self, loads: dict[str, Scalar]) -> dict[str, PumpEquations]:
         """Add flows of all pumps.
@@ -268,15 +271,10 @@ class CircuitValues:
         names = pumps[name].summed or (name,)
         if len(names) == 1:
             return self.pressures[names[0]]
-        total: Scalar = 0.0
-        weighted: Scalar = 0.0
-        for pump in names:
-            power: Scalar = pumps[pump].power
-            if pump in self._constants.pumps:  # else its pressure is measured
-                power = self._constants.pumps[pump]["power"]
-            total = total + power
-            weighted = weighted + power * self.pressures[pump]
-        return weighted / total
+        # the pressure of a pump without constants is measured
+        limited = self._constants.pumps
+        powers = [limited[x]["power"] if x in limited else pumps[x].power for x in names]
+        return dot(powers, [self.pressures[x] for x in names]) / sum(powers, 0.0)
 
     def _add_line(self, name: str) -> None:
         """Add the state rates of a line or of a pump with its line."""
@@ -302,24 +300,69 @@ class CircuitValues:
         self._store(name, p * net - cooling_power, net)
         self._heat = self._heat + cooling_power
 
-    def _add_engine(self) -> None:
-        """Add the state rate of the engine."""
-        engine = self._constants.engine
-        pump_torque = sum((pump.torque for pump in self.pumps.values()), 0.0)
-        share = clip(
-            (1.0 + engine["droop"] - self.engine_speed_ratio) * engine["per_droop"], 0.0, 1.0
-        )
-        torque = engine["torque"] * share - pump_torque / engine["speed"]
-        self.state_rates.append(torque * engine["per_inertia"])
 
-    def _add_integrals(self) -> None:
-        """Add the rates of `BALANCE_UNITS`."""
-        balance = self._balance
-        self.state_rates += [
-            balance.pumped_flow,
-            balance.returned_flow,
-            self._oil_rate,
-            balance.pump_power - self.tank_pressure * balance.returned_flow,
-            balance.lost_power + self._heat,
-            sum(self.stored_power.values(), 0.0),
-        ]
+SHAFT_POWER, ROD_POWER = "shaft", "rod"
+STORED_POWERS = ("stored", "spring")
+_MERGED_PATHS = {"piston": "leak", "cross": "relief"}  # flows that are added to others
+
+
+def component_powers(
+    circuit: CircuitEquations, values: CircuitValues, v: Sequence[Scalar]
+) -> dict[str, Scalar]:
+    """Power [W] of every component as `COMPONENT.KIND`, see `PowerBalance`.
+
+    With Q the flow from a node of pressure p_1 to one of p_2, and F the force of a cylinder, the
+    powers are
+
+        throttles Q (p_1 - p_2),    nodes p_i sum of their Q,    rods F v.
+
+    The tank is a node like the others. The power of the shafts is the sum of all other powers.
+
+    Args:
+        circuit: The circuit.
+        values: Its values at the instant.
+        v: (m,) velocities of its joints [m/s], [rad/s].
+    """
+    powers: dict[str, Scalar] = {}
+    p, parts = values.pressures, circuit.hydraulics
+    joints = {f"{joint}.{side}": joint for joint in circuit.joints for side in "ab"}
+
+    def add(owner: str, what: str, power: Scalar) -> None:
+        if isinstance(power, SymbolicExpression) or power != 0:
+            name = f"{owner}.{what}"
+            powers[name] = powers.get(name, 0.0) + power
+
+    for name, pump in values.pumps.items():
+        add(name, SHAFT_POWER, pump.shaft_power)
+        add(name, "friction", pump.lost_power)
+    for flow in values.flows:
+        lost = flow.rate * (p[flow.source] - p[flow.target])
+        element = parts.elements.get(flow.path)
+        if flow.path == "pump":
+            if flow.target not in values.pumps:
+                add(flow.target, SHAFT_POWER, -1.0 * lost)
+        elif element and (element.source, element.target) == flow[:2]:
+            add(flow.path, "element", lost)
+        else:
+            owner = joints.get(flow.target) or joints.get(flow.source) or flow.source
+            if flow.metering_drop is not None:
+                metering_power = flow.rate * flow.metering_drop
+                add(owner, "compensator", lost - metering_power)
+                lost = metering_power
+            add(owner, _MERGED_PATHS.get(flow.path, flow.path), lost)
+    for name, damped in values.damper_power.items():
+        add(name, "damper", damped)
+    for name, force, speed in zip(circuit.joints, values.forces, v, strict=True):
+        add(name, ROD_POWER, force * speed)
+    net_inflows = net_inflows_of(values.flows, p)
+    for name, power in values.stored_power.items():
+        if name in joints:
+            add(joints[name], "stored", power)
+        elif name.endswith(".spring"):
+            add(name.removesuffix(".spring"), "spring", power)
+        else:
+            add(name, "stored", power)
+        if name in parts.accumulators:
+            add(name, "cooling", p[name] * net_inflows[name] - power)
+    add(TANK_NODE, "stored", p[TANK_NODE] * net_inflows[TANK_NODE])
+    return powers

@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.codegen import Scalar
 from crane.common.samples import Array
-from crane.hydraulics.circuit_elements import MAIN_PUMP, Accumulator, Engine, Supply
+from crane.hydraulics.circuit_elements import MAIN_PUMP
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.hydraulics.valve_cylinder_equations import (
@@ -183,12 +183,23 @@ class CircuitStates:
         for _, valve, _ in self.cylinders_and_valves:
             yield spool_constants(valve.spool_b) if valve.spool_b else ()
         for pump in self.pumps.values():
-            yield _pump_constants(pump, oil.bulk_modulus)
+            yield (
+                pump.pressure, pump.flow, 1.0 / pump.droop, pump.volume / oil.bulk_modulus,
+                pump.margin, pump.standby, pump.signal, pump.throttle, pump.least,
+                _inverse(pump.response), _inverse(pump.sensing_time), pump.power, pump.relief,
+                pump.relief_gain, pump.slip, pump.friction, pump.drag,
+            )  # fmt: skip
         yield [pump.pressure for pump in self._unlimited_pumps.values()]
-        yield _engine_constants(self.engine) if self.engine else ()
+        if (engine := self.engine) is not None:
+            relative_droop, inertia = (
+                engine.speed_droop / engine.speed,
+                engine.inertia * engine.speed,
+            )
+            yield engine.speed, engine.torque, 1.0 / relative_droop, relative_droop, 1.0 / inertia
         yield [line.volume / oil.bulk_modulus for line in self.hydraulics.lines.values()]
-        for accumulator in self.hydraulics.accumulators.values():
-            yield _accumulator_constants(accumulator, oil.bulk_modulus)
+        for gas in self.hydraulics.accumulators.values():
+            line, per_time = gas.line / oil.bulk_modulus, _inverse(gas.time_constant)
+            yield line, gas.volume, gas.precharge, gas.exponent, per_time
         for element in self.hydraulics.elements.values():
             yield element.coefficient, element.gain, element.pressure
 
@@ -271,24 +282,3 @@ class CircuitStates:
 def _inverse(value: float) -> float:
     """One over a value, 0 for 0."""
     return 1.0 / value if value else 0.0
-
-
-def _pump_constants(pump: Supply, bulk_modulus: float) -> list[float]:
-    return [
-        pump.pressure, pump.flow, 1.0 / pump.droop, pump.volume / bulk_modulus, pump.margin,
-        pump.standby, pump.signal, pump.throttle, pump.least, _inverse(pump.response),
-        _inverse(pump.sensing_time), pump.power, pump.relief, pump.relief_gain, pump.slip,
-        pump.friction, pump.drag,
-    ]  # fmt: skip
-
-
-def _engine_constants(engine: Engine) -> list[float]:
-    relative_droop, inertia = engine.speed_droop / engine.speed, engine.inertia * engine.speed
-    return [engine.speed, engine.torque, 1.0 / relative_droop, relative_droop, 1.0 / inertia]
-
-
-def _accumulator_constants(item: Accumulator, bulk_modulus: float) -> list[float]:
-    return [
-        item.line / bulk_modulus, item.volume, item.precharge, item.exponent,
-        _inverse(item.time_constant),
-    ]  # fmt: skip

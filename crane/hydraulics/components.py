@@ -13,7 +13,6 @@ from crane.hydraulics.circuit_elements import (
     check_conditions,
     check_parameters,
     positive_field,
-    positive_field_with_default,
     signed_field,
 )
 from crane.hydraulics.flow_equations import clip
@@ -138,15 +137,15 @@ class Cylinder:
     leakage_a: float = 0.0
     leakage_b: float = 0.0
     relief: float = 0.0
-    relief_gain: float = positive_field_with_default(1.0e-9)
+    relief_gain: float = positive_field(1.0e-9)
     refill: float = 0.0
     cushion: float = 0.0
-    cushion_coefficient: float = positive_field_with_default(1.0e-7)
+    cushion_coefficient: float = positive_field(1.0e-7)
     stiffness: float = 0.0
-    damping: float = positive_field_with_default(1.0e5)
+    damping: float = positive_field(1.0e5)
     seal_friction: float = 0.0
     brake: float = 0.0
-    brake_release: float = positive_field_with_default(0.05)
+    brake_release: float = positive_field(0.05)
     counterbalance_a: CounterbalanceValve | None = None
     counterbalance_b: CounterbalanceValve | None = None
     cross_relief: float = 0.0
@@ -212,7 +211,7 @@ class Spool:
     full: float = signed_field(1.0)
     dead_band: float = 0.0
     bandwidth: float = 0.0
-    damping: float = positive_field_with_default(1.0)
+    damping: float = positive_field(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
     delay: float = 0.0
@@ -296,7 +295,7 @@ class Valve:
     full: float = signed_field(1.0)
     dead_band: float = 0.0
     bandwidth: float = 0.0
-    damping: float = positive_field_with_default(1.0)
+    damping: float = positive_field(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
     delay: float = 0.0

@@ -18,7 +18,7 @@ from crane.hydraulics.circuit_elements import (
     check_parameters,
     check_pump_pressures,
     check_summed_pumps,
-    positive_field_with_default,
+    positive_field,
 )
 from crane.hydraulics.components import Cylinder, Spool, Valve
 
@@ -37,11 +37,11 @@ class Oil:
         air: Volume of free air at 1e5 Pa, as a share of the volume of the oil.
     """
 
-    bulk_modulus: float = positive_field_with_default(1.65e9)
+    bulk_modulus: float = positive_field(1.65e9)
     hose_modulus: float = 0.0
     steel_modulus: float = 0.0
     vapour_pressure: float = 1.0e3
-    gas_exponent: float = positive_field_with_default(1.4)
+    gas_exponent: float = positive_field(1.4)
     air: float = 0.0
 
     def __post_init__(self) -> None:

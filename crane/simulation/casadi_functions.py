@@ -173,7 +173,7 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
     inputs = formulas.controller_inputs(
         controller_settings(drive, tape, 2, True), tape.load_vector(3, 0, m)
     )
-    tau, rates = drive.trace(inputs)
+    tau, rates = drive.law(inputs)
     formulas = formulas.with_circuit_friction(drive, inputs)
     accelerations, stiff_state_count = (
         formulas.accelerations(tau, with_joints_at_rest=False),

@@ -315,7 +315,9 @@ def _initial_motion(
     machine: Machine, table: Table, time: Array, signals: list[Array]
 ) -> tuple[Array, Array]:
     """Initial active coordinates and velocities."""
-    for text in locked_joint_conflicts(machine, _table_columns(table), table.units):
+    for text in locked_joint_conflicts(
+        machine, dict(zip(table.units, table.values.T, strict=True)), table.units
+    ):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)
@@ -345,10 +347,6 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 CraneWarning,
                 stacklevel=5,
             )
-
-
-def _table_columns(table: Table) -> dict[str, Array]:
-    return dict(zip(table.units, table.values.T, strict=True))
 
 
 def _steady_duration(time: Array, signals: list[Array]) -> float:

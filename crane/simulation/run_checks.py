@@ -243,14 +243,12 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
     columns = list(smoothings)
     if not columns:
         return ""
-    dissipated_energy = rows.dissipated[:, 0]
-    dissipated_per_step, energy_tolerance = (
-        np.diff(dissipated_energy),
-        1e-6 * float(np.diff(dissipated_energy).max()),
-    )
+    dissipated_per_step = np.diff(rows.dissipated[:, 0])
+    energy_tolerance = 1e-6 * float(dissipated_per_step.max())
     friction = np.einsum("ni,ni->n", rows.friction, rows.v_a)
+    expected = 0.5 * (friction[1:] + friction[:-1]) * step
     suspect_steps = np.flatnonzero(
-        _energies_differ(dissipated_per_step, _midpoint_means(friction) * step, energy_tolerance)
+        _energies_differ(dissipated_per_step, expected, energy_tolerance)
     )
     forces, max_slow_velocities = (
         JointForces(machine),
@@ -292,11 +290,6 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
         f"{len(time)} samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not "
         "follow its smoothing, leave that out, so that it sticks, or shorten the step"
     )
-
-
-def _midpoint_means(values: Array) -> Array:
-    """Means (N - 1,) of neighbouring values."""
-    return 0.5 * (values[1:] + values[:-1])
 
 
 def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:

@@ -19,11 +19,10 @@ from crane.common.errors import (
     suggest_names,
 )
 from crane.common.progress import progress_reporter
-from crane.common.samples import Array, as_number
+from crane.common.samples import as_number
 from crane.control.control_law import (
     ControlLaw,
     Controller,
-    TracedController,
     controller_reference,
 )
 from crane.control.valve_commands import ValveCommand
@@ -184,13 +183,10 @@ def simulate(
         if interrupted and (text := passed_limits_text(machine, run.time, run.rows.q)):
             warnings.warn(text, CraneWarning, stacklevel=2)
         raise stop_with_recording(machine, control, run, label, steps * step)
-    every_step = has_fixed_steps(dynamics, control, method)
-    for text in run_warnings(
-        machine, run.time, run.rows, step, every_step, formulation == "exact"
-    ):
-        warnings.warn(text, CraneWarning, stacklevel=2)
     recording = record_run(machine, control, run.time, run.rows, label, start_text=run.start_text)
-    if text := tipping_message(recording):
+    every_step, is_exact = has_fixed_steps(dynamics, control, method), formulation == "exact"
+    texts = run_warnings(machine, run.time, run.rows, step, every_step, is_exact)
+    for text in filter(None, [*texts, tipping_message(recording)]):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recording
 
@@ -237,7 +233,10 @@ def integrate(
     try:
         # from home, so that a run does not depend on earlier solutions
         configuration = machine.closure.solve(q_a, initial_guess=machine.home)
-        controller_state = _initial_controller_state(control, dynamics, configuration)
+        if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
+            controller_state = control.start_closed(dynamics, configuration)
+        else:
+            controller_state = control.start(configuration[machine.closure.active])
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     if text := buried_contact_text(machine, configuration):
@@ -266,7 +265,8 @@ def integrate(
             scratch_arrays.release_pages()
         if progress is not None:
             progress(done / (step_count + 1))
-        if ends_with_command and done and _is_command_finished(control):
+        is_finished = isinstance(control, ValveDrive) and control.command.is_finished
+        if ends_with_command and done and is_finished:
             raise _CommandFinishedError
 
     run = IntegrationResult(times, rows, layout, integrator.notes, start_text)
@@ -295,10 +295,6 @@ def integrate(
     return run
 
 
-def _is_command_finished(control: Controller) -> bool:
-    return isinstance(control, ValveDrive) and control.command.is_finished
-
-
 def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None) -> bool:
     """Whether the steps of a method are the output intervals."""
     return (method or _default_method(dynamics, control)) == "rk4"
@@ -309,17 +305,8 @@ def _default_method(dynamics: Dynamics, control: Controller) -> str:
     if isinstance(control, ValveDrive):
         return "rosenbrock"
     return (
-        "DOP853"
-        if (dynamics.backend == "compiled" and isinstance(control, TracedController))
-        else "rk4"
+        "DOP853" if (dynamics.backend == "compiled" and isinstance(control, ControlLaw)) else "rk4"
     )
-
-
-def _initial_controller_state(control: Controller, dynamics: Dynamics, q: Array) -> Array:
-    """Initial states of a controller at a closed configuration."""
-    if isinstance(control, ControlLaw) and dynamics.formulation == "exact":
-        return control.start_closed(dynamics, q)
-    return control.start(q[dynamics.machine.closure.active])
 
 
 def integrator_factory(
@@ -346,8 +333,8 @@ def integrator_factory(
         requested_method or _default_method(dynamics, control),
     )
     if method not in ("rk4", "rosenbrock", *SCIPY_METHODS):
-        methods_text = suggest_names(("rk4", "rosenbrock", *SCIPY_METHODS), method)
-        raise InputError(f"method '{method}' is unknown, {methods_text}")
+        hint = suggest_names(("rk4", "rosenbrock", *SCIPY_METHODS), method)
+        raise InputError(f"method '{method}' is unknown, {hint}")
     if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
@@ -375,7 +362,7 @@ def integrator_factory(
     def make(chart: Chart) -> StickSlipIntegrator:
         """A compiled integrator, or one of scipy where the formulas cannot be compiled."""
         compiled = stepper_factory is not None and chart.dynamics.backend == "compiled"
-        if compiled and isinstance(control, TracedController):
+        if compiled and isinstance(control, ControlLaw):
             assert stepper_factory is not None
             with suppress(FormulaTooLongError):
                 return ErrorControlledIntegrator(
@@ -387,7 +374,7 @@ def integrator_factory(
             return FixedStepIntegrator(chart, control, controller_state_count)
         if chart.machine.coordinates.floating_base_columns:
             raise InputError("scipy's methods do not go round with a body that floats, take rk4")
-        scipys = "BDF" if method == "rosenbrock" else method
-        return ScipyIntegrator(chart, control, controller_state_count, scipys, **options)
+        name = "BDF" if method == "rosenbrock" else method
+        return ScipyIntegrator(chart, control, controller_state_count, name, **options)
 
     return make

@@ -9,7 +9,7 @@ from crane.codegen import Tape
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.threads import single_threaded_blas
-from crane.control.control_law import Controller, ControllerInputs, TracedController
+from crane.control.control_law import ControlLaw, Controller, ControllerInputs
 from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.branch_crossing import (
     MAX_MOTION_PER_STEP,
@@ -356,13 +356,13 @@ class ChartSwitchingIntegrator:
     def _uses_inverse_dynamics(self) -> bool:
         """Whether the controller uses inverse dynamics or gravity in coordinates of the user."""
         control, n, tape = self._control, len(self._chart.user_columns), Tape()
-        if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
+        if isinstance(control, ValveDrive) or not isinstance(control, ControlLaw):
             return False
         columns = control.references(np.zeros(1)).shape[1]
         sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
         values = (tape.load_vector(i, 0, size) for i, size in enumerate(sizes))
         try:
-            control.trace(ControllerInputs(*values, raise_undetermined, raise_undetermined))
+            control.law(ControllerInputs(*values, raise_undetermined, raise_undetermined))
         except InputError:
             return True
         return False

@@ -24,7 +24,7 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.machine.machine import Machine
@@ -107,7 +107,7 @@ class ErrorControlledStepper(MachineCodeStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         method: tuple[Hashable, ...],
         fold_settings: bool,
@@ -324,7 +324,7 @@ class ErrorControlledStepper(MachineCodeStepper):
         """Writers of a step up to `finish`, and of `dense` after a step."""
 
 
-def break_times(machine: Machine, control: TracedController) -> Array:
+def break_times(machine: Machine, control: ControlLaw) -> Array:
     """Break times (k,) [s] of a controller, or its reference, and of external forces, in order."""
     sources: list[Any] = [control, getattr(control, "reference", None)]
     sources = [*machine.external_forces, *[x for x in sources if hasattr(x, "breaks")][:1]]
@@ -357,7 +357,7 @@ class DormandPrinceStepper(ErrorControlledStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         tolerance: float = DORMAND_PRINCE_TOLERANCE,
     ):

@@ -9,7 +9,7 @@ import numpy as np
 from crane.codegen import FormulaTooLongError
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.control.control_law import Controller, TracedController
+from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_drive import ValveDrive
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
@@ -254,11 +254,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
     def __init__(self, chart: Chart, control: Controller, controller_state_count: int):
         self._compiled_stepper: RungeKuttaStepper | None = None
         compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
-        if (
-            compiled
-            and chart.machine.has_traceable_forces
-            and isinstance(control, TracedController)
-        ):
+        if compiled and chart.machine.has_traceable_forces and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
                 self._compiled_stepper = RungeKuttaStepper(chart, control, controller_state_count)
         super().__init__(chart, control, controller_state_count, self._compiled_stepper)
@@ -369,7 +365,7 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         stepper_factory: Callable[..., ErrorControlledStepper],
     ):

@@ -9,7 +9,7 @@ from crane.codegen import Program, RoutineValue, Scalar, Tape, max_abs, maximum
 from crane.codegen.intermediate_representation import ArrayPointer, Routine
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
-from crane.control.control_law import ControllerInputs, TracedController
+from crane.control.control_law import ControlLaw, ControllerInputs
 from crane.dynamics import external_forces
 from crane.simulation.integration.charts import Chart, output_layout, state_layout
 from crane.simulation.integration.machine_formulas import (
@@ -69,7 +69,7 @@ class MachineCodeStepper:
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         method: tuple,
         fold_settings: bool,
@@ -118,7 +118,7 @@ class MachineCodeStepper:
         machine = trace_machine(self._chart, tape, self.state_layout, 4, external_references)
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
         inputs = machine.controller_inputs(settings, references[: self.controller_columns])
-        tau, rates = self._control.trace(inputs)
+        tau, rates = self._control.law(inputs)
         return machine.with_circuit_friction(self._control, inputs), inputs, tau, rates
 
     @property
@@ -198,7 +198,7 @@ class RungeKuttaStepper(MachineCodeStepper):
         FormulaTooLongError: The formulas are too long to be compiled.
     """
 
-    def __init__(self, chart: Chart, control: TracedController, controller_state_count: int):
+    def __init__(self, chart: Chart, control: ControlLaw, controller_state_count: int):
         self._step_state = np.zeros(3)
         super().__init__(chart, control, controller_state_count, ("rk4",), fold_settings=False)
 

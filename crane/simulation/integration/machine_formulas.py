@@ -19,7 +19,7 @@ from crane.codegen.differentiation import differentiate
 from crane.codegen.symbolic import add_vectors, dot, subtract_vectors
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import ControllerInputs, TracedController
+from crane.control.control_law import ControlLaw, ControllerInputs
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics import external_forces
 from crane.dynamics.dynamics_formulas import DynamicsFormulas, StickSlipAccelerations
@@ -29,13 +29,13 @@ from crane.simulation.integration.charts import Chart
 AT_REST_SUFFIX = "_rest"  # of formulas for machines with joints at rest
 
 
-def reference_samples(machine: Machine, control: TracedController, times: Array) -> Array:
+def reference_samples(machine: Machine, control: ControlLaw, times: Array) -> Array:
     """References (N, c), which depend on time alone: of the controller, then of loads."""
     external_samples = external_forces.reference_samples(machine.external_forces, times)
     return np.ascontiguousarray(np.hstack([control.references(times), external_samples]))
 
 
-def reference_count(control: TracedController) -> int:
+def reference_count(control: ControlLaw) -> int:
     """Number of references of a controller."""
     return control.references(np.zeros(1)).shape[1]
 
@@ -79,7 +79,7 @@ class MachineFormulas:
         )
 
     def with_circuit_friction(
-        self, control: TracedController, inputs: ControllerInputs
+        self, control: ControlLaw, inputs: ControllerInputs
     ) -> "MachineFormulas":
         """The machine with the Coulomb friction of seals and brakes of a circuit."""
         dynamics = self.dynamics_formulas
@@ -243,7 +243,7 @@ def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:
 
 
 def controller_formula_key(
-    control: TracedController,
+    control: ControlLaw,
     reference_columns: int,
     chart: Chart,
     controller_state_count: int,
@@ -281,7 +281,7 @@ def controller_formula_key(
         inverse=inverse,
         gravity=lambda: tape.load_vector(6, 0, n),
     )
-    tau, rates = control.trace(inputs)
+    tau, rates = control.law(inputs)
     if (len(tau), len(rates)) != (n, controller_state_count):
         raise InputError(
             f"the law of {type(control).__name__} gives {len(tau)} forces and {len(rates)} rates, "
@@ -300,7 +300,7 @@ def controller_formula_key(
 
 
 def machine_program(
-    machine: Machine, control: TracedController, key: tuple, build: Callable[[Program], None]
+    machine: Machine, control: ControlLaw, key: tuple, build: Callable[[Program], None]
 ) -> Program:
     """Machine code of a machine with its controller, kept by the loops of the machine.
 
@@ -329,7 +329,7 @@ def machine_program(
 
 
 def controller_settings(
-    control: TracedController, tape: Tape, argument: int, fold_settings: bool
+    control: ControlLaw, tape: Tape, argument: int, fold_settings: bool
 ) -> list[Scalar]:
     """Settings of a controller, read from an argument."""
     size = len(control.settings)

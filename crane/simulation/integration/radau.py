@@ -20,7 +20,7 @@ from crane.codegen.symbolic import (
     subtract_vectors,
 )
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.error_controlled_stepper import (
     ErrorControlledStepper,
@@ -88,7 +88,7 @@ class RadauStepper(ErrorControlledStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         tolerance: float = RADAU_TOLERANCE,
     ):

@@ -18,7 +18,7 @@ from crane.codegen.symbolic import (
     scale_vector,
     subtract_vectors,
 )
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.external_forces import state_count
 from crane.simulation.integration.charts import Chart
@@ -99,7 +99,7 @@ class RosenbrockStepper(ErrorControlledStepper):
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         tolerance: float = ROSENBROCK_TOLERANCE,
     ):

@@ -14,7 +14,7 @@ from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import display_unit
-from crane.control.control_law import Controller, TracedController
+from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_commands import ValveCommand
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import (
@@ -80,7 +80,7 @@ class SensitivityProblem(NamedTuple):
         count = count_steps(control, duration, step)
         start = initial_motion(machine, initial, control)
         if (isinstance(control, ValveDrive) and control.period) or not isinstance(
-            control, TracedController
+            control, ControlLaw
         ):
             raise InputError(
                 "a controller in Python has no formulas, write it as a crane.control.ControlLaw"

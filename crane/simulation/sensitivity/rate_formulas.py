@@ -19,7 +19,7 @@ from crane.codegen.symbolic import (
 )
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import FORCE_SUFFIX, INCLINATION_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.external_forces import reference_counts
@@ -86,7 +86,7 @@ class RateProgram:
     def __init__(
         self,
         chart: Chart,
-        control: TracedController,
+        control: ControlLaw,
         controller_state_count: int,
         stiff_state_count: int,
         outputs: Sequence[str],
@@ -206,7 +206,7 @@ class RateProgram:
             0, len(self._folded_settings)
         )
         inputs = machine.controller_inputs(settings, references[: self._controller_columns])
-        tau, controller_rate = self._control.trace(inputs)
+        tau, controller_rate = self._control.law(inputs)
         channels = (
             self._control.channel_values(inputs) if isinstance(self._control, ValveDrive) else []
         )

@@ -8,7 +8,7 @@ import numpy as np
 from crane.closure.constraint_structure import Indices
 from crane.common.errors import InputError, SimulationError
 from crane.common.samples import Array
-from crane.control.control_law import TracedController
+from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import state_count
@@ -39,7 +39,7 @@ class SimulationProblem(NamedTuple):
     """
 
     dynamics: Dynamics
-    control: TracedController
+    control: ControlLaw
     initial: tuple[Array, Array]
     step_count: int
     step: float
@@ -159,7 +159,7 @@ class SimulatedMotion:
             control,
         )
         compiled = dynamics.backend == "compiled" and machine.has_traceable_forces
-        if not compiled or not isinstance(control, TracedController):
+        if not compiled or not isinstance(control, ControlLaw):
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
