@@ -9,8 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import Scalar
-from crane.codegen.symbolic import subtract_vectors
+from crane.codegen.symbolic import Scalar, subtract_vectors
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number, as_sample
@@ -116,8 +115,9 @@ class ControlLaw(OneLineRepr):
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
         # compiling does not pay for a single configuration
-        dynamics = Dynamics(self.machine, backend="pinocchio")
-        return self.start_closed(dynamics, self.machine.closure.solve(q_a))
+        return self.start_closed(
+            Dynamics(self.machine, backend="pinocchio"), self.machine.closure.solve(q_a)
+        )
 
     def start_closed(self, dynamics: Dynamics, q: Array) -> Array:
         """`start` at a closed configuration (nq,), with exact dynamics."""
@@ -269,8 +269,9 @@ class PI(ControlLaw):
         """See `ControlLaw`; the states are the integrals of the errors."""
         error = self._error(inputs)
         kp, ki = self._gains(inputs)
-        forces = [p * e + i * z for p, i, e, z in zip(kp, ki, error, inputs.state, strict=True)]
-        return self.expand_driven(forces), error
+        return self.expand_driven(
+            [p * e + i * z for p, i, e, z in zip(kp, ki, error, inputs.state, strict=True)]
+        ), error
 
     def _error(self, inputs: ControllerInputs) -> list[Scalar]:
         return subtract_vectors(inputs.reference, self.select_driven(inputs.q_a))

@@ -100,8 +100,12 @@ class TipVelocity(SampledCommand):
             drop = min(supply.pressure - pressure, valve.margin or np.inf)
             size = areas[0] * abs(v[i]) / (inlet * np.sqrt(max(drop, _MIN_PRESSURE_DROP)))
             if force * v[i] < 0:
-                load = max(abs(force) / areas[1], _MIN_PRESSURE_DROP)
-                size = min(size, areas[1] * abs(v[i]) / (outlet * np.sqrt(load)))
+                size = min(
+                    size,
+                    areas[1]
+                    * abs(v[i])
+                    / (outlet * np.sqrt(max(abs(force) / areas[1], _MIN_PRESSURE_DROP))),
+                )
             opening[i] = np.copysign(size, v[i]) if v[i] else 0.0
         opening /= max(1.0, np.abs(opening).max())
         openings = dict(zip(self._circuit.joints, opening, strict=True))

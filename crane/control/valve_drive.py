@@ -131,8 +131,9 @@ class ValveDrive(ControlLaw):
             reference = inputs.reference
             if self._signal_source is not self.command:
                 reference = self.command.references(np.zeros(1))[0].tolist()
-            settings = self.command.settings.tolist()
-            signals = self.command.signals(inputs._replace(settings=settings, reference=reference))
+            signals = self.command.signals(
+                inputs._replace(settings=self.command.settings.tolist(), reference=reference)
+            )
         tank = hydraulics.supply.tank
         if self.command.has_measured_pressures:
             tank = float(np.array(inputs.reference[-1], dtype=np.float64))

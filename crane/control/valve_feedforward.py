@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.codegen import Scalar
-from crane.codegen.symbolic import add_vectors, apply_function
+from crane.codegen.symbolic import Scalar, add_vectors, apply_function
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
@@ -326,8 +325,9 @@ class ValveFeedforward(ValvePD):
         """Times (N,), and openings (N, m) that the trajectory requires."""
         from scipy.interpolate import make_interp_spline  # slow to import
 
-        count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
-        time = np.linspace(0.0, reference.duration, count)
+        time = np.linspace(
+            0.0, reference.duration, int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
+        )
         q_a, v_a, _ = reference(time)
         lower, upper = machine.lower[self._active_indices], machine.upper[self._active_indices]
         forces = make_interp_spline(self._knot_times, force)(time)
@@ -402,9 +402,10 @@ class ValveFeedforward(ValvePD):
         for i in range(m):
             speed = sum(gains[i * f + k] * theta[k] for k in range(f))
             mean = 0.5 * (positive_openings[i] + negative_openings[i])
-            half = 0.5 * (positive_openings[i] - negative_openings[i])
             direction = apply_function("tanh", speed * mean * (1.0 / _REVERSAL_SMOOTHING))
-            openings.append((mean + half * direction) * speed)
+            openings.append(
+                (mean + (0.5 * (positive_openings[i] - negative_openings[i])) * direction) * speed
+            )
         return openings
 
 

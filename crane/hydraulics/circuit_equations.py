@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from crane.codegen import SymbolicExpression
-from crane.codegen.symbolic import Scalar, dot, maximum
+from crane.codegen.symbolic import Scalar, SymbolicExpression, dot, maximum
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.circuit_states import CircuitStates
 from crane.hydraulics.flow_equations import (
@@ -212,8 +211,9 @@ class CircuitValues:
         ]
         priority_share = clip(1.0 - largest_of(shortages), 0.0, 1.0) if shortages else 1.0
         return_pressures = [self.pressures[valve.return_a], self.pressures[valve.return_b]]
-        load = loads.get(valve.supply, tank)
-        flows = cylinder.flows(supply, return_pressures, load, priority_share)
+        flows = cylinder.flows(
+            supply, return_pressures, loads.get(valve.supply, tank), priority_share
+        )
         flows += cylinder.leak_and_relief_flows(tank)
         balance.add_flows(flows)
         nodes = list(cylinder.pressures_by_node)

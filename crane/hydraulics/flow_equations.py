@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from typing import NamedTuple
 
-from crane.codegen import SymbolicExpression
 from crane.codegen.symbolic import (
     Scalar,
+    SymbolicExpression,
     apply_function,
     copysign,
     maximum,

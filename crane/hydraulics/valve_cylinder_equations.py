@@ -109,8 +109,9 @@ class ValveCylinderEquations:
             dict(zip(_COUNTERBALANCE_CONSTANTS, constants[count + side * width :], strict=False))
             for side in range(2)
         ]
-        vapour = oil_constants["vapour"]
-        self.pressures = [vapour + maximum(states[side], 0.0) for side in range(2)]
+        self.pressures = [
+            oil_constants["vapour"] + maximum(states[side], 0.0) for side in range(2)
+        ]
         self._areas = [named["area_a"], named["area_b"]]
         self.force = self._areas[0] * self.pressures[0] - self._areas[1] * self.pressures[1]
         self.spring_rate: list[Scalar] = []
@@ -155,13 +156,19 @@ class ValveCylinderEquations:
 
     def sensed_load_pressure(self, tank: Scalar) -> Scalar:
         """Load pressure that its valve reports; the tank pressure while it is closed [Pa]."""
-        shares = zip(self._sensing_shares, self.pressures, strict=True)
-        return tank + maximum(*(share * (p - tank) for share, p in shares))
+        return tank + maximum(
+            *(
+                share * (p - tank)
+                for share, p in zip(self._sensing_shares, self.pressures, strict=True)
+            )
+        )
 
     def relative_shortage(self, supply: Scalar, tank: Scalar) -> Scalar:
         """Missing pressure of the pump, relative to the range of `Valve.priority`."""
-        share = largest_of(self._sensing_shares)
-        required_pressure = self.sensed_load_pressure(tank) + share * self._constants["margin"]
+        required_pressure = (
+            self.sensed_load_pressure(tank)
+            + largest_of(self._sensing_shares) * self._constants["margin"]
+        )
         return (required_pressure - supply) / (_PRIORITY_MARGIN_SHARE * self._constants["margin"])
 
     def open_centre_coefficient(self) -> Scalar:
@@ -318,8 +325,9 @@ class ValveCylinderEquations:
         elif self.valve.margin > 0:
             drop = clip(supply - p, 0.0, margin)
         else:
-            outflow = series_coefficient(inlet, *self._outflow_restrictions(side))
-            return directional_flow(supply - p, inlet, outflow), None
+            return directional_flow(
+                supply - p, inlet, series_coefficient(inlet, *self._outflow_restrictions(side))
+            ), None
         return inlet * signed_square_root(drop), drop
 
     def _has_rupture_valve(self, side: int) -> bool:

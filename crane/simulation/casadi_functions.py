@@ -6,9 +6,15 @@ from typing import Any
 
 from crane.closure.kinematics_formulas import FormulaConstants, PositionKinematics
 from crane.closure.loop_formulas import LoopFormulas
-from crane.codegen import Scalar, Tape
 from crane.codegen.casadi_expressions import casadi_expressions
-from crane.codegen.symbolic import add_vectors, matvec, subtract_vectors, transpose
+from crane.codegen.symbolic import (
+    Scalar,
+    Tape,
+    add_vectors,
+    matvec,
+    subtract_vectors,
+    transpose,
+)
 from crane.common.errors import InputError, MechanismError, suggest_names
 from crane.common.optional_libraries import import_optional_library
 from crane.control.valve_commands import ValveSignals
@@ -89,8 +95,10 @@ def casadi_function(
         sizes, arguments, outputs = _dynamics_quantity(machine, quantity, friction)
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     flat = [x for formulas, _ in outputs.values() for x in formulas]
-    inputs = [_casadi_argument(ca, symbols, one) for one in arguments]
-    values, results = casadi_expressions(flat, inputs), []
+    values, results = (
+        casadi_expressions(flat, [_casadi_argument(ca, symbols, one) for one in arguments]),
+        [],
+    )
     for formulas, shape in outputs.values():
         part = ca.vertcat(*values[: len(formulas)]) if formulas else ca.SX(0, 1)
         values = values[len(formulas) :]
@@ -125,11 +133,13 @@ def _dynamics_quantity(
     formulas = QUANTITIES[quantity.replace("_", " ") + WITH_FRICTION * friction](
         dynamics_formulas, x
     )
-    zeros = [0.0] * n
     arguments = [geometry, ("q",), dynamics.formula_constants, *((name,) for name in names)]
-    arguments += [zeros] * (2 - len(names))
-    sizes = {"q": len(q)} | dict.fromkeys(names, n)
-    return sizes, arguments, {quantity: (formulas, dynamics.result_shape(quantity))}
+    arguments += [[0.0] * n] * (2 - len(names))
+    return (
+        {"q": len(q)} | dict.fromkeys(names, n),
+        arguments,
+        {quantity: (formulas, dynamics.result_shape(quantity))},
+    )
 
 
 def _kinematic_quantity(

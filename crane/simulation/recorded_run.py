@@ -245,8 +245,9 @@ def _stability_columns(machine: Machine, rows: LayoutView) -> Iterator[ChannelCo
             columns += [margins.moments, margins.smallest_ratio[:, None]]
         return np.hstack(columns)
 
-    found = scratch_arrays.compute_in_blocks(stand, len(rows.q))
-    for (name, unit), values in zip(titles, found.T, strict=True):
+    for (name, unit), values in zip(
+        titles, scratch_arrays.compute_in_blocks(stand, len(rows.q)).T, strict=True
+    ):
         yield name, values, unit
 
 

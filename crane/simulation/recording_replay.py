@@ -157,9 +157,8 @@ def replay(
     steps = int(time[-1] / step + 1e-9)
     if steps < 1:
         raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
-    label = Path(path).stem
     recording = simulate(
-        machine, drive, initial, steps * step, step, label=label, progress=progress
+        machine, drive, initial, steps * step, step, label=Path(path).stem, progress=progress
     )
     try:
         return recording, compare_channels(machine, table, recording)
@@ -353,8 +352,11 @@ def _steady_duration(time: Array, signals: list[Array]) -> float:
     """Time until a valve moves [s], within bounds."""
     has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
     first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
-    min_duration = float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1])
-    return max(min(first, _MAX_REST_DURATION), _START_FIT_DURATION, min_duration)
+    return max(
+        min(first, _MAX_REST_DURATION),
+        _START_FIT_DURATION,
+        float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]),
+    )
 
 
 def _start_of_joint(

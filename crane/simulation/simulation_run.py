@@ -265,8 +265,11 @@ def integrate(
             scratch_arrays.release_pages()
         if progress is not None:
             progress(done / (step_count + 1))
-        is_finished = isinstance(control, ValveDrive) and control.command.is_finished
-        if ends_with_command and done and is_finished:
+        if (
+            ends_with_command
+            and done
+            and (isinstance(control, ValveDrive) and control.command.is_finished)
+        ):
             raise _CommandFinishedError
 
     run = IntegrationResult(times, rows, layout, integrator.notes, start_text)

@@ -90,8 +90,9 @@ class ChartSwitchingIntegrator:
                 finally:  # also after an interrupt
                     self.done = i + self._integrator.done
                     first_recent = i + max(steps_made - _MAX_RECENT_STATES, 0)
-                    last = rows[first_recent : i + steps_made, : len(state)]
-                    recent_states = np.vstack([self._recent_states, last])
+                    recent_states = np.vstack(
+                        [self._recent_states, rows[first_recent : i + steps_made, : len(state)]]
+                    )
                     self._recent_states = recent_states[-_MAX_RECENT_STATES:]
                     self._to_user_coordinates(times[i : self.done], rows[i : self.done])
                 i += steps_made
@@ -129,8 +130,9 @@ class ChartSwitchingIntegrator:
         """Change to a better chart and transform the state; returns whether there is one."""
         at = self._row_layout.view(np.resize(state, self._row_layout.size))
         chart, nq = self._chart, self._chart.machine.model.nv
-        improvement = MIN_IMPROVEMENT if halt is None else _HALT_IMPROVEMENT
-        better_chart = chart.find_better_chart(at.q, improvement)
+        better_chart = chart.find_better_chart(
+            at.q, MIN_IMPROVEMENT if halt is None else _HALT_IMPROVEMENT
+        )
         if better_chart is None:
             return False
         if self._uses_inverse_dynamics:

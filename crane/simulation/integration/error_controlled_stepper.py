@@ -417,8 +417,11 @@ class DormandPrinceStepper(ErrorControlledStepper):
         """See `ErrorControlledStepper`."""
         r, size, method = step.routine, self.state_layout.size, _scipy_method()
         # rates have further outputs, which the next rate overwrites
-        further = program.formula_outputs("rate").size - size
-        k = r.local_array("k", (STAGES + 1 + INTERPOLATION_STAGES) * size + further)
+        k = r.local_array(
+            "k",
+            (STAGES + 1 + INTERPOLATION_STAGES) * size
+            + (program.formula_outputs("rate").size - size),
+        )
         stage = r.local_array("stage", size)
 
         def attempt(t: RoutineValue, length: RoutineValue) -> None:

@@ -419,8 +419,7 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         if self._stepper.event:
             self._count_transition(time, state, step)
             # references are those after a jump, as for steps that start there
-            delay = _TIME_TOLERANCE * min(step, MAX_REFERENCE_SPACING)
-            self._find_modes(time + delay, state)
+            self._find_modes(time + (_TIME_TOLERANCE * min(step, MAX_REFERENCE_SPACING)), state)
         elif count < len(chunk) or self.offset < 0:
             if not self.python_stepper.exceeds_chart_limits(state):
                 raise self.python_stepper.halt_error(time, state)
@@ -431,8 +430,7 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         """Sample the valve command."""
         at = self.python_stepper.state_layout.view(state)
         try:
-            v_a = self._chart.user_velocities(at.q, at.v_a)
-            drive.update(time, at.q, v_a, at.controller)
+            drive.update(time, at.q, self._chart.user_velocities(at.q, at.v_a), at.controller)
         except ClosureError as error:
             raise IntegrationHaltError(
                 time, self.python_stepper.user_coordinates(state), f": {error}"

@@ -5,8 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from crane.closure.kinematics_formulas import largest_scaled_value
-from crane.codegen import Program, RoutineValue, Scalar, Tape, max_abs, maximum
-from crane.codegen.intermediate_representation import ArrayPointer, Routine
+from crane.codegen import (
+    ArrayPointer,
+    Program,
+    Routine,
+    RoutineValue,
+    Scalar,
+    Tape,
+    max_abs,
+    maximum,
+)
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, ControllerInputs
@@ -114,8 +122,9 @@ class MachineCodeStepper:
         References and state are the arguments 3 and 4.
         """
         references = tape.load_vector(3, 0, self.reference_columns)
-        external_references = references[self.controller_columns :]
-        machine = trace_machine(self._chart, tape, self.state_layout, 4, external_references)
+        machine = trace_machine(
+            self._chart, tape, self.state_layout, 4, references[self.controller_columns :]
+        )
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
         inputs = machine.controller_inputs(settings, references[: self.controller_columns])
         tau, rates = self._control.law(inputs)

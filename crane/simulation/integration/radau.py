@@ -8,8 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from crane.codegen import Layout, Program, RoutineValue, Scalar, Tape, select
-from crane.codegen.intermediate_representation import ArrayPointer
+from crane.codegen import ArrayPointer, Layout, Program, RoutineValue, Scalar, Tape, select
 from crane.codegen.matrix_factorization import lu_factorize
 from crane.codegen.symbolic import (
     add_vectors,
@@ -340,8 +339,11 @@ class _RadauStepCode:
             self._update_jacobian(t)
         r.call("real_factors", arrays.jacobian, step.length, arrays.real_factors)
         r.call("complex_factors", arrays.jacobian, step.length, arrays.complex_factors)
-        ratio = select(self._previous_length > 0.0, length / self._previous_length, 0.0)
-        r.store(arrays.ratio, 0, ratio)
+        r.store(
+            arrays.ratio,
+            0,
+            select(self._previous_length > 0.0, length / self._previous_length, 0.0),
+        )
         r.call("predict", r.state, arrays.previous_stages, arrays.ratio, arrays.iterate)
         converged = self._iterate_newton(t, length)
         Z = arrays.iterate.element_pointer("Z")
@@ -362,8 +364,7 @@ class _RadauStepCode:
 
     def write_interpolation(self, t: RoutineValue, length: RoutineValue) -> None:
         """Write the dense output behind a step."""
-        Z = self._arrays.iterate.element_pointer("Z")
-        self._r.call("dense", Z, self._step.dense_output)
+        self._r.call("dense", self._arrays.iterate.element_pointer("Z"), self._step.dense_output)
 
     def _update_jacobian(self, t: RoutineValue) -> None:
         r, step, a = self._r, self._step, self._arrays
@@ -374,8 +375,13 @@ class _RadauStepCode:
             a.coordinate_directions,
         )  # fmt: skip
         self._write_rates(t, self._mobility, a.coordinate_directions, a.coordinate_rates)
-        rates = step.start_rate, a.velocity_rates, a.coordinate_rates
-        r.call("jacobian", *rates, a.mass, r.tol, a.jacobian)
+        r.call(
+            "jacobian",
+            *(step.start_rate, a.velocity_rates, a.coordinate_rates),
+            a.mass,
+            r.tol,
+            a.jacobian,
+        )
         r.assign(self._jacobian_time, t)
 
     def _write_rates(
@@ -395,8 +401,12 @@ class _RadauStepCode:
         with r.loop_forever():
             for i in range(STAGES):
                 stage = a.iterate.element_pointer("stages").element_pointer(i * self._size)
-                stage_rate = a.rates.element_pointer(i * self._size)
-                step.call("rate", t + length * float(NODES[i]), stage, stage_rate)
+                step.call(
+                    "rate",
+                    t + length * float(NODES[i]),
+                    stage,
+                    a.rates.element_pointer(i * self._size),
+                )
             r.call(
                 "newton", r.state, a.jacobian, a.real_factors, a.complex_factors, a.rates,
                 a.iterate.element_pointer("W"), step.length, r.tol, a.iterate,

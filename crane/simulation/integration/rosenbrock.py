@@ -134,8 +134,11 @@ class RosenbrockStepper(ErrorControlledStepper):
         for i in range(1, STAGES):
             tape = Tape()
             state = tape.load_vector(0, 0, size)
-            stage = add_vectors(state, weighted_sum(tape, 1, size, _STAGE_COEFFICIENTS[i]))
-            program.add_formula(f"combine{i}", 2, stage)
+            program.add_formula(
+                f"combine{i}",
+                2,
+                add_vectors(state, weighted_sum(tape, 1, size, _STAGE_COEFFICIENTS[i])),
+            )
         self._add_finish(program)
         # dense output: the cubic through both ends and their slopes
         tape = Tape()
@@ -161,8 +164,9 @@ class RosenbrockStepper(ErrorControlledStepper):
         tolerance = tape.load(3, energies)
 
         def share(i: int, inverse_accuracy: int, relative: Scalar) -> Scalar:
-            absolute = 1.0 / tape.load(3, inverse_accuracy)
-            return errors[i] / (absolute + relative * apply_function("abs", after[i]))
+            return errors[i] / (
+                (1.0 / tape.load(3, inverse_accuracy)) + relative * apply_function("abs", after[i])
+            )
 
         shares = [share(i, i, tolerance) for i in range(checked_count)]
         if not self._steps_end_at_outputs:

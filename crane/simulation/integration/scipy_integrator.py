@@ -139,8 +139,7 @@ class ScipyIntegrator(StickSlipIntegrator):
             rates = closure.gamma(at.q)[closure.passive] @ at.v_a / closure.units[closure.passive]
             speed = closure.characteristic_time * float(np.abs(rates).max(initial=0.0))
         if not speed < _MAX_PASSIVE_VELOCITY:
-            characteristic_time = closure.characteristic_time
-            velocity_limit = _MAX_PASSIVE_VELOCITY / characteristic_time
+            velocity_limit = _MAX_PASSIVE_VELOCITY / closure.characteristic_time
             fastest = (
                 f"{velocity_limit:.3g} rad/s or "
                 f"{velocity_limit * closure.characteristic_length:.3g} m/s"

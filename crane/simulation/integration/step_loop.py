@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from crane.codegen import Program, RoutineValue, select
-from crane.codegen.intermediate_representation import ArrayPointer, Routine
+from crane.codegen import ArrayPointer, Program, Routine, RoutineValue, select
 from crane.simulation.integration.machine_code_stepper import (
     HELD_INDEX,
     MachineCodeStepper,
@@ -288,8 +287,9 @@ class StepLoop:
         """Move the interpolated references to those around a time."""
         r, spacing = self.routine, self._reference_spacing
         with r.loop_forever():
-            has_next = start_time + spacing * 1.5 < self._end_time
-            with r.if_then(~((time >= start_time + spacing) & has_next)):
+            with r.if_then(
+                ~((time >= start_time + spacing) & (start_time + spacing * 1.5 < self._end_time))
+            ):
                 r.break_loop()
             r.assign(index, index + 1)
             r.assign(start_time, start_time + spacing)
@@ -301,12 +301,19 @@ class StepLoop:
             index, start = map(r.new_variable, (self._reference_index, self._reference_time))
             self._advance_references(index, start, time)
             r.store(self._relative_time, 0, (time - start) / self._reference_spacing)
-            row = r.refs.row_pointer(index, 2 * self._columns)
-            r.call("reference", row, self._relative_time, self._reference)
+            r.call(
+                "reference",
+                r.refs.row_pointer(index, 2 * self._columns),
+                self._relative_time,
+                self._reference,
+            )
         if self._stepper.external_callback is not None:
             r.call("callback_inputs", *self._machine_arguments, arrays[0], self._callback_inputs)
-            results = self._reference.element_pointer(self._stepper.controller_columns)
-            r.call("callback", self._callback_inputs, results)
+            r.call(
+                "callback",
+                self._callback_inputs,
+                self._reference.element_pointer(self._stepper.controller_columns),
+            )
         self._stepper.call_formula(r, formula, *self._machine_arguments, *arrays)
 
     def _write_return(self) -> None:

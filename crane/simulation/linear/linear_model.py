@@ -118,8 +118,13 @@ class LinearModel(Result):
             largest = moved[at] / units[at]
             if abs(largest) > 1e-12 * np.abs(vector).max():
                 moved = moved / largest
-            damping = (0.0 - pole.real) / size if size else 0.0
-            mode = Mode(complex(pole), size / (2 * np.pi), float(damping), moved, vector)
+            mode = Mode(
+                complex(pole),
+                size / (2 * np.pi),
+                float((0.0 - pole.real) / size if size else 0.0),
+                moved,
+                vector,
+            )
             found.append(mode)
         return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
@@ -244,8 +249,9 @@ class LinearModel(Result):
         """
         control = import_optional_library("control", "to_control")
         names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
-        lists = {key: list(value) for key, value in names.items()}
-        return control.StateSpace(self.A, self.B, self.C, self.D, **lists)
+        return control.StateSpace(
+            self.A, self.B, self.C, self.D, **{key: list(value) for key, value in names.items()}
+        )
 
     def save(self, path: str | Path) -> Path:
         """Write matrices, names and operating point as .mat (MATLAB, Octave) or .npz.

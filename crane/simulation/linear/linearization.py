@@ -271,8 +271,7 @@ def _select_outputs(
         for column, joint in enumerate(machine.joints)
     }
     for i, joint in enumerate(machine.active):
-        velocity = eye[n + i], motion[1][i], machine.unit(joint) + "/s"
-        outputs[f"{joint}_velocity"] = velocity
+        outputs[f"{joint}_velocity"] = (eye[n + i], motion[1][i], machine.unit(joint) + "/s")
     default_names = list(machine.active)
     if machine.tip is not None:
         kinematics = Kinematics(machine)
@@ -295,8 +294,7 @@ def _select_outputs(
             raise InputError(f"output '{name}' is unknown, {suggest_names(outputs, name)}")
     matrix = np.array([outputs[name][0] for name in names]).reshape(len(names), -1)
     y = np.array([outputs[name][1] for name in names], dtype=np.float64)
-    units = {name: outputs[name][2] for name in names}
-    return matrix[:, :size], matrix[:, size:], y, units
+    return matrix[:, :size], matrix[:, size:], y, {name: outputs[name][2] for name in names}
 
 
 def _values_by_joint(

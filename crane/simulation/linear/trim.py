@@ -160,8 +160,9 @@ class _TrimEquations:
             residual, jacobian = self.residual(z)
             if np.abs(residual).max() < _RESIDUAL_TOLERANCE:
                 return z
-            rows = (jacobian * self._variable_scales)[:, free]
-            step = np.linalg.lstsq(rows, residual, rcond=1e-10)[0]
+            step = np.linalg.lstsq(
+                (jacobian * self._variable_scales)[:, free], residual, rcond=1e-10
+            )[0]
             if not np.isfinite(step).all():
                 return None
             direction = np.zeros(len(z))
@@ -189,8 +190,9 @@ class _TrimEquations:
             return self.residual(z + directions @ x)[1] @ directions
 
         scales = 1.0 / (np.abs(directions) / self._variable_scales[:, None]).max(axis=0)
-        start = np.zeros(len(lower))
-        solution = least_squares(residual, start, derivatives, (lower, upper), x_scale=scales)
+        solution = least_squares(
+            residual, np.zeros(len(lower)), derivatives, (lower, upper), x_scale=scales
+        )
         return z + directions @ solution.x
 
 

@@ -282,8 +282,10 @@ class AdjointIntegrator:
         for curve, scale in zip(
             (adjoints @ interpolation_errors, by_number), self._largest_values, strict=True
         ):
-            error = np.abs(curve) * nodes.step_sizes[: 2 * count : 2, None, None]
-            rough |= (error > self._accuracy * scale).any(axis=(1, 2))
+            rough |= (
+                (np.abs(curve) * nodes.step_sizes[: 2 * count : 2, None, None])
+                > self._accuracy * scale
+            ).any(axis=(1, 2))
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:

@@ -71,8 +71,9 @@ class Gradient(OneLineRepr):
     def to_text(self, max_rows: int = 20) -> str:
         """A table in Markdown: the parameters with the largest effects of a change by 1 % on J."""
         slopes, total = np.atleast_2d(self.derivatives), np.atleast_1d(self.functional_value)
-        effects = np.abs(slopes * 0.01 * self.values)
-        order = np.argsort(-effects.max(axis=0), kind="stable")[:max_rows].tolist()
+        order = np.argsort(-np.abs(slopes * 0.01 * self.values).max(axis=0), kind="stable")[
+            :max_rows
+        ].tolist()
         heads = (
             ["J"] if self.functional_value.ndim == 0 else [f"J{i + 1}" for i in range(len(total))]
         )

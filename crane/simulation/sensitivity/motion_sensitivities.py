@@ -88,8 +88,10 @@ class SensitivityProblem(NamedTuple):
         dynamics = Dynamics(machine)
         if outputs is None:
             joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
-            pressures = [f"pressure_{joint}_{side}" for joint in joints for side in "ab"]
-            outputs = [*machine.active, *pressures]
+            outputs = [
+                *machine.active,
+                *[f"pressure_{joint}_{side}" for joint in joints for side in "ab"],
+            ]
         names = tuple(outputs)
         links = [link for link, _ in observed_frames(machine, names)]
         motion = SimulationProblem(dynamics, control, start, count, step, method, tolerance)

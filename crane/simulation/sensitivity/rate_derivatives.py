@@ -72,8 +72,7 @@ class ForwardDerivatives(RateProgram):
             formulas.machine.dynamics_formulas.loops,
         )
         # the margin of transitions depends on time by the references
-        varying_references = variable.references + bool(self._chart.stick_slip.columns)
-        is_variable = [*variable[:4], varying_references]
+        is_variable = [*variable[:4], variable.references + bool(self._chart.stick_slip.columns)]
         seeds: dict[int, Scalar] = {}
 
         def seed(array: int) -> None:

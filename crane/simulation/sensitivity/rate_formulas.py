@@ -171,8 +171,9 @@ class RateProgram:
             "references": ("state", self._reference_columns),
             "states": ("state", self._state_layout.size),
         } | dict(widths)
-        arrays = (*constants, *widths)
-        with program.add_routine(name, counts=("count", "repetitions"), arrays=arrays) as r:
+        with program.add_routine(
+            name, counts=("count", "repetitions"), arrays=((*constants, *widths))
+        ) as r:
             with r.loop(r.count) as i, r.loop(r.repetitions) as j:
                 rows = {"state": i, "repetition": j, "both": i * r.repetitions + j}
                 r.call(
@@ -260,9 +261,11 @@ class RateProgram:
                 f"'{name}' is no output of '{user_machine.name}': take joints, forces, channels"
             )
         place = links.index(link)
-        body = self._frames[place][1]
         return _frame_output(
-            name, machine, body, tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE)
+            name,
+            machine,
+            self._frames[place][1],
+            tape.load_vector(3, FRAME_SIZE * place, FRAME_SIZE),
         )
 
 

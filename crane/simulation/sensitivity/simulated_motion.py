@@ -158,8 +158,9 @@ class SimulatedMotion:
             Chart.from_dynamics(dynamics),
             control,
         )
-        compiled = dynamics.backend == "compiled" and machine.has_traceable_forces
-        if not compiled or not isinstance(control, ControlLaw):
+        if not (dynamics.backend == "compiled" and machine.has_traceable_forces) or not isinstance(
+            control, ControlLaw
+        ):
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
@@ -218,11 +219,13 @@ class SimulatedMotion:
         while first < count:
             last = min(first + _STEPS_PER_SEGMENT, count)
             if transition_index < len(transitions):
-                at = int(
-                    (transitions[transition_index].time - self.time[0]) / self._step
-                    + _TIME_TOLERANCE
+                last = min(
+                    last,
+                    int(
+                        (transitions[transition_index].time - self.time[0]) / self._step
+                        + _TIME_TOLERANCE
+                    ),
                 )
-                last = min(last, at)
             if last > first:
                 segments_found.append(RecordedSegment(transition_index, first, last))
                 first = last

@@ -48,9 +48,11 @@ def interpolation_errors(values: Array) -> Array:
 
     Fourth differences over 15 of values (4 n + 1, .) at the nodes.
     """
-    count = len(values) - 4
     return sum(
-        (share * values[i : count + i : 4] for i, share in enumerate(FOURTH_DIFFERENCE_WEIGHTS)),
+        (
+            share * values[i : (len(values) - 4) + i : 4]
+            for i, share in enumerate(FOURTH_DIFFERENCE_WEIGHTS)
+        ),
         np.zeros(()),
     )
 
@@ -196,8 +198,9 @@ def integrate_sensitivities(
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
     track = SimulatedMotion(motion, progress)
-    constants = make_constants(track.time)
-    integrator = _VariationalIntegrator(track, outputs, *constants, typical_changes, accuracy)
+    integrator = _VariationalIntegrator(
+        track, outputs, *make_constants(track.time), typical_changes, accuracy
+    )
     return track, integrator.integrate()
 
 
