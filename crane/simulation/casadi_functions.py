@@ -95,22 +95,17 @@ def casadi_function(
         sizes, arguments, outputs = _dynamics_quantity(machine, quantity, friction)
     symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     flat = [x for formulas, _ in outputs.values() for x in formulas]
-    values, results = (
-        casadi_expressions(flat, [_casadi_argument(ca, symbols, one) for one in arguments]),
-        [],
-    )
+    # arguments of the tape: numbers, or the symbols named in a tuple
+    inputs = [
+        [x for name in one for x in ca.vertsplit(symbols[name])] if isinstance(one, tuple) else one
+        for one in arguments
+    ]
+    values, results = casadi_expressions(flat, inputs), []
     for formulas, shape in outputs.values():
         part = ca.vertcat(*values[: len(formulas)]) if formulas else ca.SX(0, 1)
         values = values[len(formulas) :]
         results.append(ca.reshape(part, shape[1], shape[0]).T if len(shape) == 2 else part)
     return ca.Function(quantity, list(symbols.values()), results, list(sizes), list(outputs))
-
-
-def _casadi_argument(ca: Any, symbols: dict[str, Any], argument: Any) -> Any:
-    """An argument of the tape: numbers, or the symbols named in a tuple."""
-    if not isinstance(argument, tuple):
-        return argument
-    return [x for name in argument for x in ca.vertsplit(symbols[name])]
 
 
 def _dynamics_quantity(

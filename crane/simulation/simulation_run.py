@@ -104,7 +104,7 @@ def simulate(
 
     At a dead centre of the active coordinates the run continues in other coordinates, with the
     forces of the same drives. Where branches of motion cross, it continues on its own branch. Both
-    give a warning (see `crane.simulation.integration.charts` and `branch_crossing`).
+    give a warning (see `crane.simulation.integration.charts`).
 
     Args:
         machine: The machine, or an argument of `crane.load`.

@@ -11,18 +11,20 @@ from crane.common.samples import Array
 from crane.common.threads import single_threaded_blas
 from crane.control.control_law import ControlLaw, Controller, ControllerInputs
 from crane.control.valve_drive import ValveDrive
-from crane.simulation.integration.branch_crossing import (
+from crane.simulation.integration.charts import (
     MAX_MOTION_PER_STEP,
     MAX_RELATIVE_RANK,
+    MIN_IMPROVEMENT,
     NODES_BEFORE,
     STEPS_BEFORE,
     STEPS_BEHIND,
+    Chart,
     CrossingPolynomial,
     correct_polynomial,
     extrapolate_states,
     relative_rank,
+    row_layout,
 )
-from crane.simulation.integration.charts import MIN_IMPROVEMENT, Chart, row_layout
 from crane.simulation.integration.integrators import StickSlipIntegrator
 from crane.simulation.integration.machine_formulas import raise_undetermined
 from crane.simulation.integration.python_stepper import IntegrationHaltError, StepProgress
@@ -140,7 +142,16 @@ class ChartSwitchingIntegrator:
                 halt is not None
                 and chart.find_better_chart(at.q, _DEAD_CENTRE_IMPROVEMENT) is not None
             ):
-                raise self._dead_centre_error(time, at.q, better_chart)
+                active = better_chart.machine.closure.active
+                left = np.setdiff1d(chart.machine.closure.active, active)
+                names = " and ".join(f"'{chart.machine.joints[i]}'" for i in left)
+                raise IntegrationHaltError(
+                    time,
+                    at.q[chart.user_columns],
+                    f": {names} {'come' if len(left) > 1 else 'comes'} to a dead centre, where "
+                    "inverse dynamics has no answer",
+                    ": keep the reference away from there, or drive other joints",
+                )
             return False
         orientation = self._orientation * self._orientation_at(at.q)
         self._enter_chart(self._find_integrator(better_chart, at.q), self._integrator.offset)
@@ -368,18 +379,3 @@ class ChartSwitchingIntegrator:
         except InputError:
             return True
         return False
-
-    def _dead_centre_error(
-        self, time: float, q: Array, better_chart: Chart
-    ) -> IntegrationHaltError:
-        """Halt at a dead centre of coordinates that the controller requires."""
-        machine = self._chart.machine
-        left_columns = np.setdiff1d(machine.closure.active, better_chart.machine.closure.active)
-        names = " and ".join(f"'{machine.joints[i]}'" for i in left_columns)
-        verb = "come" if len(left_columns) > 1 else "comes"
-        return IntegrationHaltError(
-            time,
-            q[self._chart.user_columns],
-            f": {names} {verb} to a dead centre, where inverse dynamics has no answer",
-            ": keep the reference away from there, or drive other joints",
-        )

@@ -133,7 +133,7 @@ class ErrorControlledStepper(MachineCodeStepper):
             state: State, replaced by the final one.
             offset: Time of the state after the first instant; at least minus one interval [s].
             step: Interval of the output instants [s].
-            rows: (N, row_size) in any memory order, filled; empty to integrate to the next
+            rows: (N, row size) in any memory order, filled; empty to integrate to the next
                 instant.
 
         Returns:
@@ -334,13 +334,6 @@ def break_times(machine: Machine, control: ControlLaw) -> Array:
     )
 
 
-def _scipy_method() -> Any:
-    """The coefficients of the method, needed only where the program is not cached."""
-    from scipy.integrate import DOP853  # slow to import
-
-    return DOP853
-
-
 class DormandPrinceStepper(ErrorControlledStepper):
     """Compiled steps of the method of Dormand and Prince of order 8.
 
@@ -366,19 +359,22 @@ class DormandPrinceStepper(ErrorControlledStepper):
 
     def _add_method(self, program: Program) -> None:
         """stage1(s, k, h) to stage11, extra0 to extra2; finish(constants, s, k, h, tol); dense."""
-        size, method = self.state_layout.size, _scipy_method()
-        stages = {f"stage{i}": method.A[i] for i in range(1, STAGES)}
-        stages |= {f"extra{i}": row for i, row in enumerate(method.A_EXTRA)}
+        # slow to import, and needed only where the program is not cached
+        from scipy.integrate import DOP853
+
+        size = self.state_layout.size
+        stages = {f"stage{i}": DOP853.A[i] for i in range(1, STAGES)}
+        stages |= {f"extra{i}": row for i, row in enumerate(DOP853.A_EXTRA)}
         for name, weights in stages.items():
             tape = Tape()
             displaced = scale_vector(tape.load(2, 0), weighted_sum(tape, 1, size, weights))
             program.add_formula(name, 3, add_vectors(tape.load_vector(0, 0, size), displaced))
         tape = Tape()
         state, h = tape.load_vector(1, 0, size), tape.load(3, 0)
-        after = add_vectors(state, scale_vector(h, weighted_sum(tape, 2, size, method.B)))
+        after = add_vectors(state, scale_vector(h, weighted_sum(tape, 2, size, DOP853.B)))
         fifth: Scalar = 0.0
         third: Scalar = 0.0
-        errors = weighted_sum(tape, 2, size, method.E5), weighted_sum(tape, 2, size, method.E3)
+        errors = weighted_sum(tape, 2, size, DOP853.E5), weighted_sum(tape, 2, size, DOP853.E3)
         for error5, error3, scale in zip(
             *errors, self._inverse_error_scales(tape, 4, state, after), strict=True
         ):
@@ -409,13 +405,15 @@ class DormandPrinceStepper(ErrorControlledStepper):
                 scale_vector(2.0, displacement), scale_vector(h, add_vectors(first, last))
             ),
         ]
-        for weights in method.D:
+        for weights in DOP853.D:
             parts += scale_vector(h, weighted_sum(tape, 1, size, weights))
         program.add_formula("dense", 4, parts)
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
-        r, size, method = step.routine, self.state_layout.size, _scipy_method()
+        from scipy.integrate import DOP853  # slow to import
+
+        r, size = step.routine, self.state_layout.size
         # rates have further outputs, which the next rate overwrites
         k = r.local_array(
             "k",
@@ -429,7 +427,7 @@ class DormandPrinceStepper(ErrorControlledStepper):
             for i in range(1, STAGES):
                 r.call(f"stage{i}", r.state, k, step.length, stage)
                 step.call(
-                    "rate", t + length * float(method.C[i]), stage, k.element_pointer(i * size)
+                    "rate", t + length * float(DOP853.C[i]), stage, k.element_pointer(i * size)
                 )
             r.call("finish", r.geometry, r.state, k, step.length, r.tol, step.step_result)
 
@@ -439,7 +437,7 @@ class DormandPrinceStepper(ErrorControlledStepper):
                 r.call(f"extra{i}", r.state, k, step.length, stage)
                 step.call(
                     "rate",
-                    t + length * float(method.C_EXTRA[i]),
+                    t + length * float(DOP853.C_EXTRA[i]),
                     stage,
                     k.element_pointer((STAGES + 1 + i) * size),
                 )

@@ -11,7 +11,7 @@ from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw, Controller
 from crane.control.valve_drive import ValveDrive
-from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.charts import Chart, row_layout
 from crane.simulation.integration.error_controlled_stepper import (
     MAX_REFERENCE_SPACING,
     ErrorControlledStepper,
@@ -257,6 +257,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
         if compiled and chart.machine.has_traceable_forces and isinstance(control, ControlLaw):
             with suppress(FormulaTooLongError):
                 self._compiled_stepper = RungeKuttaStepper(chart, control, controller_state_count)
+        self._row_size = row_layout(chart.machine, control, controller_state_count).size
         super().__init__(chart, control, controller_state_count, self._compiled_stepper)
 
     def _advance(
@@ -308,7 +309,7 @@ class FixedStepIntegrator(StickSlipIntegrator):
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
         """See `StickSlipIntegrator._make_step`."""
         if self._compiled_stepper is not None:
-            after, row = state.copy(), np.empty((1, self._compiled_stepper.row_size))
+            after, row = state.copy(), np.empty((1, self._row_size))
             if self._compiled_stepper.run(np.array([time]), after, length, row):
                 return after, self._compiled_stepper.observe(time + length, after)[1]
         rate, _ = self.python_stepper.observe(time, state)

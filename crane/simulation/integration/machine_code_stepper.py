@@ -140,11 +140,6 @@ class MachineCodeStepper:
         """Whether a body floats."""
         return bool(self._chart.machine.coordinates.floating_base_columns)
 
-    @property
-    def row_size(self) -> int:
-        """Length of a row."""
-        return self.state_layout.size + self.output_layout.size
-
     def adopt_modes(self) -> None:
         """Adopt the stick-slip modes of the chart."""
         if self.has_stick_slip:
@@ -273,7 +268,7 @@ class RungeKuttaStepper(MachineCodeStepper):
             times: (steps,) at equal intervals [s].
             state: State at the first time, replaced by that after the last step.
             step: Step size [s].
-            rows: (steps, row_size) in any memory order, filled with state and outputs.
+            rows: (steps, row size) in any memory order, filled with state and outputs.
 
         Returns:
             Number of steps. Fewer than all are made where a step fails, another chart is needed,

@@ -184,7 +184,13 @@ class SimulatedMotion:
             step,
             False,
         )
-        _check_dead_centres(self.chart, time, parts.q)
+        stride = max(1, len(time) // _MAX_CHECKED_SAMPLES)
+        for at, configuration in zip(time[::stride], parts.q[::stride], strict=True):
+            if self.chart.largest_gamma_entry(configuration) > self.chart.chart_limits[0]:
+                raise SimulationError(
+                    f"at t = {at:.4g} s the active coordinates come near a dead centre, where "
+                    "nothing depends on them smoothly: drive other joints, or end before"
+                )
         self.stiff_state_count = (
             control.circuit.stiff_state_count
             if isinstance(control, ValveDrive)
@@ -363,14 +369,3 @@ class SimulatedMotion:
             nodes.states[1].copy(),
             self.has_joints_at_rest,
         )
-
-
-def _check_dead_centres(chart: Chart, time: Array, q: Array) -> None:
-    """Check that configurations (N, nq) are not near dead centres."""
-    stride = max(1, len(q) // _MAX_CHECKED_SAMPLES)
-    for at, configuration in zip(time[::stride], q[::stride], strict=True):
-        if chart.largest_gamma_entry(configuration) > chart.chart_limits[0]:
-            raise SimulationError(
-                f"at t = {at:.4g} s the active coordinates come near a dead centre, where nothing "
-                "depends on them smoothly: drive other joints, or end before"
-            )
