@@ -271,6 +271,8 @@ class ValveFeedforward(ValvePD):
         gains: Mapping[str, PDGains] | None = None,
         sway: float = 0.0,
     ):
+        from scipy.interpolate import make_interp_spline  # slow to import
+
         damping = as_number(sway, "the damping ratio of sway", "", max_magnitude=1.0)
         if damping < 0:
             raise InputError(f"the damping ratio of sway is {damping:g}, give 0 to 1")
@@ -289,8 +291,21 @@ class ValveFeedforward(ValvePD):
         self._knot_times = np.linspace(0.0, reference.duration, count)
         q_a, v_a, a_a = reference(self._knot_times)
         forces = Dynamics(machine).inverse(q_a, v_a, a_a)[:, self._active_indices]
-        forces += self._friction(machine, circuit, v_a[:, self._active_indices])
-        self._opening_times, opening = self._feedforward_openings(machine, reference, forces)
+        for i, joint in enumerate(circuit.joints):
+            if (law := machine.friction.get(joint)) is not None:  # reversals are smoothed
+                valve, v = circuit.valves[joint], v_a[:, self._active_indices[i]]
+                max_flow = valve.c1 * np.sqrt(valve.margin or circuit.supply.pressure)
+                flow = v * circuit.cylinders[joint].area_a
+                direction = np.tanh(flow / (_REVERSAL_SMOOTHING * max_flow))
+                forces[:, i] += law.viscous * v + law.coulomb * direction + law.coulomb_offset
+        count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
+        self._opening_times = np.linspace(0.0, reference.duration, count)
+        q, v, _ = (x[:, self._active_indices] for x in reference(self._opening_times))
+        lower, upper = machine.lower[self._active_indices], machine.upper[self._active_indices]
+        force = make_interp_spline(self._knot_times, forces)(self._opening_times)
+        opening = required_openings(
+            circuit, self._opening_times, q - lower, v, force, upper - lower
+        )
         self._opening_table = opening + np.array(lags) * np.gradient(
             opening, self._opening_times, axis=0
         )
@@ -305,37 +320,6 @@ class ValveFeedforward(ValvePD):
             self._gain_table = np.column_stack(
                 columns + self._sway_feedback_gains(machine, q_a, damping)
             )
-
-    def _friction(self, machine: Machine, circuit: Hydraulics, v: Array) -> Array:
-        """Friction (N, m) of the joints of cylinders, with smoothed Coulomb friction."""
-        friction = np.zeros_like(v)
-        for i, joint in enumerate(circuit.joints):
-            if (law := machine.friction.get(joint)) is not None:
-                valve, cylinder = circuit.valves[joint], circuit.cylinders[joint]
-                max_flow = valve.c1 * np.sqrt(valve.margin or circuit.supply.pressure)
-                direction = np.tanh(v[:, i] * cylinder.area_a / (_REVERSAL_SMOOTHING * max_flow))
-                friction[:, i] = (
-                    law.viscous * v[:, i] + law.coulomb * direction + law.coulomb_offset
-                )
-        return friction
-
-    def _feedforward_openings(
-        self, machine: Machine, reference: Trajectory, force: Array
-    ) -> tuple[Array, Array]:
-        """Times (N,), and openings (N, m) that the trajectory requires."""
-        from scipy.interpolate import make_interp_spline  # slow to import
-
-        time = np.linspace(
-            0.0, reference.duration, int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
-        )
-        q_a, v_a, _ = reference(time)
-        lower, upper = machine.lower[self._active_indices], machine.upper[self._active_indices]
-        forces = make_interp_spline(self._knot_times, force)(time)
-        x = q_a[:, self._active_indices] - lower
-        circuit = require_circuit(machine)
-        return time, required_openings(
-            circuit, time, x, v_a[:, self._active_indices], forces, upper - lower
-        )
 
     def _sway_feedback_gains(self, machine: Machine, q_a: Array, damping: float) -> list[Array]:
         """Elements of K (m, f), then of E (f, m), as columns (N,)."""

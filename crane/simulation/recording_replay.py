@@ -320,7 +320,11 @@ def _initial_motion(
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)
-    steady = time <= _steady_duration(time, signals)
+    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    # at rest until a valve moves, within bounds
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
+    fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
+    steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
     states = []
     for i, joint in enumerate(machine.active):
         has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
@@ -346,17 +350,6 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 CraneWarning,
                 stacklevel=5,
             )
-
-
-def _steady_duration(time: Array, signals: list[Array]) -> float:
-    """Time until a valve moves [s], within bounds."""
-    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
-    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
-    return max(
-        min(first, _MAX_REST_DURATION),
-        _START_FIT_DURATION,
-        float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]),
-    )
 
 
 def _start_of_joint(

@@ -60,11 +60,9 @@ def find_invalid_motion(
     than it took. For the arguments see `run_warnings`.
     """
     departure = find_piston_outside_cylinder(machine, time, rows.q)
-    return departure or (
-        find_stop_energy_gain(machine, time, rows, step, _energy_imbalance(rows))
-        if is_exact
-        else None
-    )
+    if departure is None and is_exact:
+        return find_stop_energy_gain(machine, time, rows, step, _energy_imbalance(rows))
+    return departure
 
 
 def passed_limits_text(machine: Machine, time: Array, q: Array) -> str:
@@ -122,20 +120,24 @@ def passed_strokes_text(machine: Machine, time: Array, q: Array) -> str:
     cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
     with_end_stop = {stop.joint for stop in machine.end_stops}
     words = []
-    for joint in cylinders:
+    for joint in (x for x in cylinders if x in with_end_stop):
         release_pages()
-        i = machine.column(joint)
-        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
-        depth = np.maximum(lower - q[:, i], q[:, i] - upper)
-        deepest, max_depth = int(depth.argmax()), _MAX_STROKE_EXCESS * (upper - lower)
-        if joint in with_end_stop and depth[deepest] > max_depth:
+        depth, stroke = _limit_excess(machine, joint, q)
+        deepest = int(depth.argmax())
+        if depth[deepest] > _MAX_STROKE_EXCESS * stroke:
             words.append(
                 f"the piston of '{joint}' is {depth[deepest]:.3g} m beyond its stroke at "
                 f"t = {time[deepest]:.4g} s"
             )
-    if not words:
-        return ""
-    return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
+    remedy = ": make end stops as stiff as steel is, or move slower"
+    return ", ".join(words) + remedy if words else ""
+
+
+def _limit_excess(machine: Machine, joint: str, q: Array) -> tuple[Array, float]:
+    """By how much a joint is beyond its limits (N,), and the distance between these."""
+    i = machine.column(joint)
+    lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+    return np.maximum(lower - q[:, i], q[:, i] - upper), upper - lower
 
 
 def find_piston_outside_cylinder(
@@ -210,9 +212,7 @@ def find_stop_energy_gain(
     if not np.ptp(energy_imbalance) > min_gain:
         return None
     for stop in machine.end_stops:
-        i = machine.column(stop.joint)
-        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
-        depth = np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper)
+        depth, _ = _limit_excess(machine, stop.joint, rows.q)
         for first, behind in (
             np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
             .reshape(-1, 2)

@@ -89,12 +89,11 @@ class Chart:
     def formula_key(self) -> tuple:
         """Properties on which the formulas of the chart depend, besides its loops."""
         dynamics = self.dynamics
-        outside = formula_key(self.machine)
         return (
             folding_pattern(dynamics.constant_pattern),
             dynamics.formula_structure,
             tuple(self.user_columns.tolist()),
-            outside,
+            formula_key(self.machine),
         )
 
     def check_free_joints(self, tau: Sequence[Scalar], when: str = "") -> None:
@@ -252,14 +251,12 @@ def state_layout(machine: Machine, controller_state_count: int) -> Layout:
     `contacts` are the states of external forces: tangential deformations of tyres. `work` is that
     of the active forces, then of each external force.
     """
-    n, work_count = len(machine.active), 1 + len(machine.external_forces)
-    contact_state_count = state_count(machine.external_forces)
     return Layout(
         q=machine.model.nv,
-        v_a=n,
-        contacts=contact_state_count,
+        v_a=len(machine.active),
+        contacts=state_count(machine.external_forces),
         controller=controller_state_count,
-        work=work_count,
+        work=1 + len(machine.external_forces),
         dissipated=1,
     )
 

@@ -90,10 +90,11 @@ class ScipyIntegrator(StickSlipIntegrator):
             with np.errstate(all="ignore"):  # the method fails by itself where a trial diverges
                 message = solver.step()
             if message is not None:
-                what = f" {self._method} gives up: {message.rstrip('.').lower()}"
-                user_coordinates = self.python_stepper.user_coordinates(solver.y)
                 raise IntegrationHaltError(
-                    float(solver.t), user_coordinates, what, ", try another method"
+                    float(solver.t),
+                    self.python_stepper.user_coordinates(solver.y),
+                    f" {self._method} gives up: {message.rstrip('.').lower()}",
+                    ", try another method",
                 )
             self._check_passive_velocities(solver.t, solver.y)
             dense_output, start = solver.dense_output(), float(solver.t_old)
@@ -139,15 +140,14 @@ class ScipyIntegrator(StickSlipIntegrator):
             rates = closure.gamma(at.q)[closure.passive] @ at.v_a / closure.units[closure.passive]
             speed = closure.characteristic_time * float(np.abs(rates).max(initial=0.0))
         if not speed < _MAX_PASSIVE_VELOCITY:
-            velocity_limit = _MAX_PASSIVE_VELOCITY / closure.characteristic_time
-            fastest = (
-                f"{velocity_limit:.3g} rad/s or "
-                f"{velocity_limit * closure.characteristic_length:.3g} m/s"
-            )
-            what = f" the motion explodes (a passive joint exceeds {fastest})"
-            user_coordinates = self.python_stepper.user_coordinates(state)
+            limit = _MAX_PASSIVE_VELOCITY / closure.characteristic_time
+            length = closure.characteristic_length
             raise IntegrationHaltError(
-                time, user_coordinates, what, ": look at its forces and gains"
+                time,
+                self.python_stepper.user_coordinates(state),
+                f" the motion explodes (a passive joint exceeds {limit:.3g} rad/s or "
+                f"{limit * length:.3g} m/s)",
+                ": look at its forces and gains",
             )
 
     def _record(
