@@ -18,7 +18,6 @@ from crane.hydraulics.flow_equations import (
 )
 from crane.hydraulics.pump_equations import PumpEquations
 from crane.hydraulics.valve_cylinder_equations import (
-    CYLINDER_CONSTANTS,
     INTERNAL_FLOWS,
     ChamberValues,
     ValveCylinderEquations,
@@ -127,13 +126,9 @@ class CircuitValues:
         }
         loads = merged_load_pressures(elements.values(), loads, tank, openings)
         for name, element in elements.items():
-            self._balance.add_flows(
-                [
-                    element_flow(
-                        name, element, self._constants.elements[name], self.pressures, openings
-                    )
-                ]
-            )
+            constants_of_element = self._constants.elements[name]
+            flow = element_flow(name, element, constants_of_element, self.pressures, openings)
+            self._balance.add_flows([flow])
         self.chambers = [
             self._add_cylinder(cylinder, rates, loads)
             for cylinder, rates in zip(self._cylinders, self._spool_rates, strict=True)
@@ -169,14 +164,10 @@ class CircuitValues:
         cylinders: list[ValveCylinderEquations] = []
         circuit, remaining_signals = self._circuit, iter(signals)
         for i, (cylinder, valve, _) in enumerate(circuit.cylinders_and_valves):
-            constants, second_spool = (
-                self._constants.cylinders[i],
-                self._constants.second_spools[i],
-            )
-            spool_constants = dict(zip(CYLINDER_CONSTANTS, constants, strict=False)), second_spool
+            constants = self._constants.cylinders[i], self._constants.second_spools[i]
             spools = [
                 spool_equations(name, spool, part, self._states, next(remaining_signals))
-                for part, (name, spool) in zip(spool_constants, valve.spools.items(), strict=False)
+                for part, (name, spool) in zip(constants, valve.spools.items(), strict=False)
             ]
             positions = [u for u, _ in spools]
             self.spool_positions += positions
@@ -184,7 +175,7 @@ class CircuitValues:
             own_states = slice(circuit.cylinder_state_starts[i], circuit.cylinder_state_ends[i])
             cylinders.append(
                 ValveCylinderEquations(
-                    self._constants.common, constants, cylinder, valve, positions, second_spool,
+                    self._constants.common, constants[0], cylinder, valve, positions, constants[1],
                     x[i], v[i], state[own_states],
                 )
             )  # fmt: skip
