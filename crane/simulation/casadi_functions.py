@@ -173,17 +173,11 @@ def _simulation_quantity(machine: Machine) -> tuple[dict[str, int], list[Any], F
         state_layout(machine, drive.circuit.state_count),
     )
     tape, m = Tape(), len(drive.circuit.spools)
-    formulas = trace_machine(chart, tape, layout, 4, [])
     # zeros among the settings are features that the circuit does not have
-    inputs = formulas.controller_inputs(
-        controller_settings(drive, tape, 2, True), tape.load_vector(3, 0, m)
-    )
-    tau, rates = drive.law(inputs)
-    formulas = formulas.with_circuit_friction(drive, inputs)
-    accelerations, stiff_state_count = (
-        formulas.accelerations(tau, with_joints_at_rest=False),
-        drive.circuit.stiff_state_count,
-    )
+    settings = controller_settings(drive, tape, 2, True)
+    formulas = trace_machine(chart, drive, tape, layout, 4, tape.load_vector(3, 0, m), settings)
+    rates, stiff_state_count = formulas.controller_rate, drive.circuit.stiff_state_count
+    accelerations = formulas.accelerations(with_joints_at_rest=False)
     numbers = (
         machine.closure.compiled_closure.geometry.constants,
         chart.dynamics.formula_constants,

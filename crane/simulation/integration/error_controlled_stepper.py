@@ -197,14 +197,14 @@ class ErrorControlledStepper(MachineCodeStepper):
 
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
-            machine, inputs, tau, _ = self._trace_controlled_machine(Tape())
-            outputs = machine.outputs(tau, with_joints_at_rest)
+            machine = self._trace_controlled_machine(Tape())
+            outputs = machine.outputs(with_joints_at_rest)
             if isinstance(self._control, ValveDrive):
-                outputs += self._control.channel_values(inputs)
-            margin = machine.accelerations(tau, with_joints_at_rest).transition_margin
+                outputs += self._control.channel_values(machine.inputs)
+            margin = machine.accelerations(with_joints_at_rest).transition_margin
             program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
-            machine, _, tau, controller_rate = self._trace_controlled_machine(Tape())
-            rate, margin = machine.state_rate(tau, controller_rate, with_joints_at_rest)
+            machine = self._trace_controlled_machine(Tape())
+            rate, margin = machine.state_rate(with_joints_at_rest)
             closure = self._chart.machine.closure
             event_distances = machine.dynamics_formulas.end_stop_distances(
                 closure.units.tolist(), closure.characteristic_length

@@ -1,7 +1,5 @@
 """Compiled methods: base class, and the classical Runge-Kutta method."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from crane.closure.kinematics_formulas import largest_scaled_value
@@ -17,7 +15,7 @@ from crane.codegen import (
 )
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
-from crane.control.control_law import ControlLaw, ControllerInputs
+from crane.control.control_law import ControlLaw
 from crane.dynamics import external_forces
 from crane.simulation.integration.charts import Chart, output_layout, state_layout
 from crane.simulation.integration.machine_formulas import (
@@ -114,21 +112,13 @@ class MachineCodeStepper:
         """Add formulas and routines."""
         raise NotImplementedError
 
-    def _trace_controlled_machine(
-        self, tape: Tape
-    ) -> tuple[MachineFormulas, ControllerInputs, Sequence[Scalar], Sequence[Scalar]]:
-        """Formulas of the machine, inputs, forces and state rates of the controller.
-
-        References and state are the arguments 3 and 4.
-        """
+    def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:
+        """The machine with its controller; references and state are the arguments 3 and 4."""
         references = tape.load_vector(3, 0, self.reference_columns)
-        machine = trace_machine(
-            self._chart, tape, self.state_layout, 4, references[self.controller_columns :]
-        )
         settings = controller_settings(self._control, tape, 2, self._fold_settings)
-        inputs = machine.controller_inputs(settings, references[: self.controller_columns])
-        tau, rates = self._control.law(inputs)
-        return machine.with_circuit_friction(self._control, inputs), inputs, tau, rates
+        return trace_machine(
+            self._chart, self._control, tape, self.state_layout, 4, references, settings
+        )
 
     @property
     def event(self) -> float:
@@ -209,11 +199,11 @@ class RungeKuttaStepper(MachineCodeStepper):
     def _build(self, program: Program) -> None:
         for suffix, with_joints_at_rest in self._rest_variants:
             for name in ("observe", "rate"):
-                machine, _, tau, controller_rate = self._trace_controlled_machine(Tape())
-                rate, margin = machine.state_rate(tau, controller_rate, with_joints_at_rest)
+                machine = self._trace_controlled_machine(Tape())
+                rate, margin = machine.state_rate(with_joints_at_rest)
                 parts: dict[str, list[Scalar]] = {"rate": rate}
                 if name == "observe":
-                    parts["outputs"] = machine.outputs(tau, with_joints_at_rest)
+                    parts["outputs"] = machine.outputs(with_joints_at_rest)
                     parts["margin"] = [margin]
                 program.add_formula(name + suffix, 5, parts)
         self._add_sum_formulas(program)

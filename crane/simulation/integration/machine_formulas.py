@@ -1,7 +1,7 @@
 """Formulas of a machine with its controller, and their machine code."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,15 +42,18 @@ def reference_count(control: ControlLaw) -> int:
 
 @dataclass(frozen=True)
 class MachineFormulas:
-    """Formulas of a machine at a state.
+    """Formulas of a machine with its controller at a state.
 
     Attributes:
         chart: Chart of the state.
-        dynamics_formulas: Dynamics of the machine.
+        dynamics_formulas: Dynamics of the machine, with the friction of a circuit.
         state_parts: Parts of the state.
         q_a: (n,) active coordinates of the user.
         v_a: (n,) their velocities.
         external_forces: External forces.
+        inputs: Inputs of the controller.
+        tau: (n,) its forces.
+        controller_rate: (k,) rates of its states.
     """
 
     chart: Chart
@@ -59,79 +62,41 @@ class MachineFormulas:
     q_a: list[Scalar]
     v_a: list[Scalar]
     external_forces: external_forces.ExternalForceFormulas
+    inputs: ControllerInputs
+    tau: Sequence[Scalar]
+    controller_rate: Sequence[Scalar]
 
-    def controller_inputs(
-        self, settings: list[Scalar], reference: list[Scalar]
-    ) -> ControllerInputs:
-        """Inputs of a controller."""
-        states = self.q_a, self.v_a, self.state_parts.controller
-        if not self.chart.has_user_coordinates:
-            return ControllerInputs(
-                *states, settings, reference, raise_undetermined, raise_undetermined
-            )
-        dynamics = self.dynamics_formulas
-        return ControllerInputs(
-            *states,
-            settings,
-            reference,
-            dynamics.inverse_dynamics,
-            lambda: list(dynamics.gravity_force),
-        )
-
-    def with_circuit_friction(
-        self, control: ControlLaw, inputs: ControllerInputs
-    ) -> "MachineFormulas":
-        """The machine with the Coulomb friction of seals and brakes of a circuit."""
-        dynamics = self.dynamics_formulas
-        if not bool(dynamics.formula_structure.circuit_friction_columns) or not isinstance(
-            control, ValveDrive
-        ):
-            return self
-        return replace(
-            self,
-            dynamics_formulas=dynamics.with_circuit_friction(control.circuit_friction(inputs)),
-        )
-
-    def accelerations(
-        self, tau: Sequence[Scalar], with_joints_at_rest: bool
-    ) -> StickSlipAccelerations:
-        """Accelerations under the forces of a controller, with or without joints at rest."""
+    def accelerations(self, with_joints_at_rest: bool) -> StickSlipAccelerations:
+        """Accelerations under the forces of the controller, with or without joints at rest."""
         return self.dynamics_formulas.accelerations_with_stick_slip(
-            self._applied_forces(tau), with_joints_at_rest
+            self._applied_forces, with_joints_at_rest
         )
 
-    def state_rate(
-        self, tau: Sequence[Scalar], controller_rate: Sequence[Scalar], with_joints_at_rest: bool
-    ) -> tuple[list[Scalar], Scalar]:
-        """Rate of the state, and the margin of stick-slip transitions.
-
-        Args:
-            tau: (n,) forces of the controller.
-            controller_rate: (k,) rates of its states.
-            with_joints_at_rest: Whether joints can be at rest.
-        """
-        accelerations = self.accelerations(tau, with_joints_at_rest)
+    def state_rate(self, with_joints_at_rest: bool) -> tuple[list[Scalar], Scalar]:
+        """Rate of the state, and the margin of stick-slip transitions."""
+        accelerations = self.accelerations(with_joints_at_rest)
         rate = [
             *self.dynamics_formulas.coordinate_derivatives,
             *accelerations.a_a,
             *self.external_forces.state_rates,
-            *controller_rate,
-            dot(tau, self.v_a),
+            *self.controller_rate,
+            dot(self.tau, self.v_a),
             *self.external_forces.powers,
             self.dynamics_formulas.dissipated_power,
         ]
         return rate, accelerations.transition_margin
 
-    def _applied_forces(self, tau: Sequence[Scalar]) -> list[Scalar]:
-        """Forces of a controller and external forces along the coordinates of the chart."""
+    @property
+    def _applied_forces(self) -> list[Scalar]:
+        """Forces of the controller and external forces along the coordinates of the chart."""
         return add_vectors(
-            self.chart.trace_chart_forces(self.dynamics_formulas.gamma, tau),
+            self.chart.trace_chart_forces(self.dynamics_formulas.gamma, self.tau),
             self.external_forces.active_forces,
         )
 
-    def outputs(self, tau: Sequence[Scalar], with_joints_at_rest: bool) -> list[Scalar]:
+    def outputs(self, with_joints_at_rest: bool) -> list[Scalar]:
         """Outputs without the channels of circuits; see `output_layout`."""
-        accelerations = self.accelerations(tau, with_joints_at_rest)
+        accelerations = self.accelerations(with_joints_at_rest)
         dynamics = self.dynamics_formulas
         a: list[Scalar] = []
         if self.chart.machine.supports:
@@ -140,7 +105,7 @@ class MachineFormulas:
                 for i, row in sorted(dynamics.gamma.items())
             ]
         return [
-            *tau,
+            *self.tau,
             *accelerations.active_friction,
             dynamics.kinetic,
             dynamics.potential,
@@ -149,42 +114,35 @@ class MachineFormulas:
             *a,
         ]
 
-    def forces_without_gravity(self, tau: Sequence[Scalar]) -> list[Scalar]:
+    def forces_without_gravity(self) -> list[Scalar]:
         """All forces along the coordinates of the chart except for inertia and gravity."""
         return subtract_vectors(
-            add_vectors(self._applied_forces(tau), self.dynamics_formulas.passive_force),
+            add_vectors(self._applied_forces, self.dynamics_formulas.passive_force),
             self.dynamics_formulas.friction_force,
         )
 
-    def stiffness(
-        self, controller_rate: Sequence[Scalar], tau: Sequence[Scalar]
-    ) -> list[list[Scalar]]:
-        """Derivatives of controller rates and forces by the coordinates q_B of the chart.
+    def stiffness(self, state_count: int) -> list[list[Scalar]]:
+        """Derivatives of rates and forces of the controller by the coordinates q_B of the chart.
 
         They are taken at constant gamma, without gravity and velocity-dependent forces.
 
         Args:
-            controller_rate: (k,) rates of the states of the controller.
-            tau: (n,) forces of the controller.
+            state_count: Number k of the first states of the controller, whose rates are taken.
 
         Returns:
             (k + n, n).
         """
         gamma = self.dynamics_formulas.gamma
         user_coordinates = [x for x in self.q_a if isinstance(x, SymbolicExpression)]
-        rows = differentiate(
-            [*controller_rate, *self.chart.trace_chart_forces(gamma, tau)], user_coordinates
-        )
+        forces = self.chart.trace_chart_forces(gamma, self.tau)
+        rows = differentiate([*self.controller_rate[:state_count], *forces], user_coordinates)
         if not self.chart.has_user_coordinates:
             columns = list(
                 zip(*(gamma[i + 1] for i in self.chart.user_columns.tolist()), strict=True)
             )
             rows = [[dot(row, column) for column in columns] for row in rows]
-        passive = zip(rows[len(controller_rate) :], self.dynamics_formulas.stiffness, strict=True)
-        return [
-            *rows[: len(controller_rate)],
-            *(add_vectors(one, other) for one, other in passive),
-        ]
+        passive = zip(rows[state_count:], self.dynamics_formulas.stiffness, strict=True)
+        return [*rows[:state_count], *(add_vectors(one, other) for one, other in passive)]
 
 
 def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> list[Scalar]:
@@ -194,44 +152,54 @@ def raise_undetermined(a_a: Sequence[Scalar] = (), friction: bool = False) -> li
 
 def trace_machine(
     chart: Chart,
+    control: ControlLaw,
     tape: Tape,
     layout: Layout,
     state_argument: int,
-    external_references: Sequence[Scalar],
+    references: list[Scalar],
+    settings: list[Scalar],
     folded_constants: tuple[Array, Array] | None = None,
 ) -> MachineFormulas:
-    """Trace the formulas of a machine.
+    """Trace the formulas of a machine with its controller.
 
     Args:
         chart: The machine in a chart.
+        control: Its controller.
         tape: The tape; its arguments 0 and 1 are geometry and constants of the dynamics.
         layout: Layout of the state.
         state_argument: Number of the argument that holds the state.
-        external_references: References of the external forces.
+        references: References of the controller, then of the external forces.
+        settings: Settings of the controller.
         folded_constants: Geometry and constants that become part of the formulas, with NaN for
             those that remain arguments; those of the machine if not given.
     """
-    dynamics, closure = chart.dynamics, chart.machine.closure
-    geometry, pattern = folded_constants or (None, dynamics.constant_pattern)
-    q, kinematics, loops = closure.compiled_closure.trace_kinematics(
+    geometry, pattern = folded_constants or (None, chart.dynamics.constant_pattern)
+    structure, columns = chart.dynamics.formula_structure, reference_count(control)
+    q, kinematics, loops = chart.machine.closure.compiled_closure.trace_kinematics(
         tape, 0, state_argument, geometry
     )
     parts = layout.view(tape.load_vector(state_argument, 0, layout.size))
-    constants = FormulaConstants(tape, 1, pattern)
-    dynamics_formulas = DynamicsFormulas(
-        kinematics, loops, constants, q, parts.v_a, dynamics.formula_structure, use_modes=True
-    )
-    v_a = (
-        parts.v_a
-        if chart.has_user_coordinates
-        else [dynamics_formulas.joint_velocities[i + 1] for i in chart.user_columns]
-    )
+    dynamics = DynamicsFormulas(
+        kinematics, loops, FormulaConstants(tape, 1, pattern), q, parts.v_a, structure,
+        use_modes=True,
+    )  # fmt: skip
+    q_a, v_a = [q[i] for i in chart.user_columns], parts.v_a
+    functions: tuple[Callable[..., list[Scalar]], ...] = (
+        dynamics.inverse_dynamics, lambda: list(dynamics.gravity_force),
+    )  # fmt: skip
+    if not chart.has_user_coordinates:
+        v_a = [dynamics.joint_velocities[i + 1] for i in chart.user_columns]
+        functions = raise_undetermined, raise_undetermined
     applied = external_forces.trace_external_forces(
-        chart.machine, dynamics_formulas, external_references, parts.contacts
+        chart.machine, dynamics, references[columns:], parts.contacts
     )
-    return MachineFormulas(
-        chart, dynamics_formulas, parts, [q[i] for i in chart.user_columns], v_a, applied
+    inputs = ControllerInputs(
+        q_a, v_a, parts.controller, settings, references[:columns], *functions
     )
+    tau, rates = control.law(inputs)
+    if isinstance(control, ValveDrive) and structure.circuit_friction_columns:
+        dynamics = dynamics.with_circuit_friction(control.circuit_friction(inputs))
+    return MachineFormulas(chart, dynamics, parts, q_a, v_a, applied, inputs, tau, rates)
 
 
 def wrap_rotations(chart: Chart, state: Sequence[Scalar]) -> list[Scalar]:

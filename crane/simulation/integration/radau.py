@@ -112,7 +112,7 @@ class RadauStepper(ErrorControlledStepper):
             self._chart.machine.closure.active.tolist(),
         )
         for suffix, with_joints_at_rest in self._rest_variants:
-            dynamics = self._trace_controlled_machine(Tape())[0].dynamics_formulas
+            dynamics = self._trace_controlled_machine(Tape()).dynamics_formulas
             mass = [x for row in dynamics.mass_matrix for x in row]
             free = (
                 dynamics.active_motion_factors if with_joints_at_rest else [1.0] * self._mobility

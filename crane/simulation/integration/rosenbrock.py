@@ -188,23 +188,22 @@ class RosenbrockStepper(ErrorControlledStepper):
         Gamma x = Gamma b.
         """
         tape = Tape()
-        machine, _, tau, controller_rate = self._trace_controlled_machine(tape)
+        machine = self._trace_controlled_machine(tape)
         dynamics, n = machine.dynamics_formulas, len(machine.state_parts.v_a)
         mass, k = dynamics.mass_matrix, self._stiff_state_count
         step_gamma = GAMMA * tape.load(5, 0)
-        rates = list(controller_rate[:k])
         parts = machine.state_parts
         variables = [
             x for x in (*parts.controller[:k], *parts.v_a) if isinstance(x, SymbolicExpression)
         ]
-        jacobian = differentiate([*rates, *machine.forces_without_gravity(tau)], variables)
+        jacobian = differentiate(
+            [*machine.controller_rate[:k], *machine.forces_without_gravity()], variables
+        )
         # the balances of oil and strokes stay exact where J has derivatives of neither
         by_coordinates: Matrix = [[0.0] * n for _ in range(k + n)]
         coordinate_directions: Matrix = [[0.0] * n for _ in machine.state_parts.q]
         if not self._steps_end_at_outputs:
-            by_coordinates = [
-                scale_vector(step_gamma, row) for row in machine.stiffness(rates, tau)
-            ]
+            by_coordinates = [scale_vector(step_gamma, row) for row in machine.stiffness(k)]
             coordinate_directions = [
                 scale_vector(step_gamma, row) for row in dynamics.rate_jacobian
             ]

@@ -199,29 +199,30 @@ class RateProgram:
     def _trace_formulas(self, with_joints_at_rest: bool) -> DifferentiatedFormulas:
         tape = Tape()
         references = tape.load_vector(4, 0, self._reference_columns)
-        force_references = references[self._controller_columns :]
+        constants = FormulaConstants(tape, 2, self._folded_settings)
         machine = trace_machine(
-            self._chart, tape, self._state_layout, 5, force_references, self._folded_constants
+            self._chart,
+            self._control,
+            tape,
+            self._state_layout,
+            5,
+            references,
+            constants.vector(0, len(self._folded_settings)),
+            self._folded_constants,
         )
-        settings = FormulaConstants(tape, 2, self._folded_settings).vector(
-            0, len(self._folded_settings)
-        )
-        inputs = machine.controller_inputs(settings, references[: self._controller_columns])
-        tau, controller_rate = self._control.law(inputs)
         channels = (
-            self._control.channel_values(inputs) if isinstance(self._control, ValveDrive) else []
+            self._control.channel_values(machine.inputs)
+            if isinstance(self._control, ValveDrive)
+            else []
         )
-        machine = machine.with_circuit_friction(self._control, inputs)
-        accelerations = machine.accelerations(tau, with_joints_at_rest)
+        accelerations = machine.accelerations(with_joints_at_rest)
         coordinate_rates = machine.dynamics_formulas.coordinate_derivatives
         rate = [
             *(coordinate_rates[i] for i in self._chart.machine.closure.active),
             *accelerations.a_a,
-            *controller_rate[: self._stiff_state_count],
+            *machine.controller_rate[: self._stiff_state_count],
         ]
-        observed = [
-            self._trace_output(name, machine, tape, tau, channels) for name in self.outputs
-        ]
+        observed = [self._trace_output(name, machine, tape, channels) for name in self.outputs]
         return DifferentiatedFormulas(
             tape, machine, rate, observed, accelerations.transition_margin
         )
@@ -231,7 +232,6 @@ class RateProgram:
         name: str,
         machine: MachineFormulas,
         tape: Tape,
-        tau: Sequence[Scalar],
         channel_formulas: Sequence[Scalar],
     ) -> tuple[Scalar, Scalar]:
         """An output and a factor of its derivative; for names see `sensitivities`."""
@@ -248,7 +248,7 @@ class RateProgram:
             return dynamics.joint_velocities[columns[joint] + 1], 1.0
         joint = name.removesuffix(FORCE_SUFFIX)
         if joint in user_machine.active:
-            return tau[user_machine.active.index(joint)], 1.0
+            return machine.tau[user_machine.active.index(joint)], 1.0
         if isinstance(control, ValveDrive):
             channels = [channel for channel, _ in control.channels]
             if name in channels:
