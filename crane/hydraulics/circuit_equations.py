@@ -99,11 +99,7 @@ class CircuitValues:
         self._cylinders = self._cylinder_equations(x, v, state, signals)
         self.forces = [cylinder.force for cylinder in self._cylinders]
         self.circuit_friction = [cylinder.circuit_friction(tank) for cylinder in self._cylinders]
-        self.damper_power = {
-            cylinder.joint: cylinder.damper_power
-            for cylinder in self._cylinders
-            if cylinder.spring_rate
-        }
+        self.damper_power = {x.joint: x.damper_power for x in self._cylinders if x.spring_rate}
         self.engine_speed_ratio = self._states.get("engine", 1.0)
         self._balance = FlowBalance(self.pressures)
         self.flows = self._balance.flows
@@ -115,8 +111,7 @@ class CircuitValues:
             name: [x for x in self._cylinders if x.valve.supply == name] for name in self.pressures
         }
         openings = {cylinder.joint: cylinder.inlet_openings for cylinder in self._cylinders}
-        elements = circuit.hydraulics.elements
-        pumps = circuit.hydraulics.pumps
+        elements, pumps = circuit.hydraulics.elements, circuit.hydraulics.pumps
         # of the pumps whose regulator or valves use them
         loads = {
             name: largest_of([x.sensed_load_pressure(tank) for x in cylinders])

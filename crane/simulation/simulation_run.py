@@ -241,10 +241,8 @@ def integrate(
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     if text := buried_contact_text(machine, configuration):
         raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
-    contact_states, energies = (
-        np.zeros(state_count(machine.external_forces)),
-        np.zeros(2 + len(machine.external_forces)),
-    )
+    contact_states = np.zeros(state_count(machine.external_forces))
+    energies = np.zeros(2 + len(machine.external_forces))
     state = np.concatenate([configuration, v_a, contact_states, controller_state, energies])
     make_integrator = integrator_factory(
         dynamics, control, len(controller_state), method, tolerance
@@ -253,9 +251,8 @@ def integrate(
     integrator = ChartSwitchingIntegrator(chart, control, len(controller_state), make_integrator)
     layout = row_layout(machine, control, len(controller_state))
     times = step * np.arange(step_count + 1, dtype=np.float64)
-    rows = scratch_arrays.empty_array(
-        step_count + 1, layout.size
-    )  # stored by columns, so that channels are views
+    # stored by columns, so that channels are views
+    rows = scratch_arrays.empty_array(step_count + 1, layout.size)
     released_until = 0  # instants whose memory pages are released
 
     def report(done: int) -> None:
@@ -291,9 +288,9 @@ def integrate(
         run.notes.extend(chart.stick_slip.notes)
         if progress is not None:
             progress(1.0)
-    if invalid_motion := find_invalid_motion(
-        machine, run.time, run.rows, step, dynamics.formulation == "exact"
-    ):
+    is_exact = dynamics.formulation == "exact"
+    invalid_motion = find_invalid_motion(machine, run.time, run.rows, step, is_exact)
+    if invalid_motion is not None:
         return run.first_instants(invalid_motion[0], SimulationError(invalid_motion[1]))
     return run
 

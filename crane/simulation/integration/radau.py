@@ -45,16 +45,10 @@ INVERSE_TRANSFORMATION = np.array([
 ERROR_WEIGHTS = np.array([-13.0 - 7.0 * _ROOT_OF_SIX, -13.0 + 7.0 * _ROOT_OF_SIX, -1.0]) / 3.0
 # coefficients of x, x^2, x^3 of the polynomial through the stages, by stage
 INTERPOLATION_WEIGHTS = np.array([
-    [
-        13.0 / 3.0 + 7.0 * _ROOT_OF_SIX / 3.0,
-        -23.0 / 3.0 - 22.0 * _ROOT_OF_SIX / 3.0,
-        10.0 / 3.0 + 5.0 * _ROOT_OF_SIX,
-    ],
-    [
-        13.0 / 3.0 - 7.0 * _ROOT_OF_SIX / 3.0,
-        -23.0 / 3.0 + 22.0 * _ROOT_OF_SIX / 3.0,
-        10.0 / 3.0 - 5.0 * _ROOT_OF_SIX,
-    ],
+    [13.0 / 3.0 + 7.0 * _ROOT_OF_SIX / 3.0, -23.0 / 3.0 - 22.0 * _ROOT_OF_SIX / 3.0,
+     10.0 / 3.0 + 5.0 * _ROOT_OF_SIX],
+    [13.0 / 3.0 - 7.0 * _ROOT_OF_SIX / 3.0, -23.0 / 3.0 + 22.0 * _ROOT_OF_SIX / 3.0,
+     10.0 / 3.0 - 5.0 * _ROOT_OF_SIX],
     [1.0 / 3.0, -8.0 / 3.0, 10.0 / 3.0],
 ])  # fmt: skip
 STAGES = 3
@@ -275,9 +269,8 @@ class RadauStepper(ErrorControlledStepper):
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
         """See `ErrorControlledStepper`."""
-        writer = _RadauStepCode(
-            program, step, self.state_layout.size, self._mobility, self._controller_state_count
-        )
+        sizes = self.state_layout.size, self._mobility, self._controller_state_count
+        writer = _RadauStepCode(program, step, *sizes)
         return writer.write_attempt, writer.write_interpolation
 
 
@@ -306,22 +299,14 @@ class _RadauStepCode:
         # rates have further outputs, which the next rate overwrites
         further = program.formula_outputs("rate").size - size
         sizes: dict[str, Layout | int] = {
-            "velocity_directions": m * size,
-            "coordinate_directions": max(1, mobility * size),
-            "velocity_rates": m * size + further,
-            "coordinate_rates": m * size + further,
-            "mass": mobility * mobility + mobility,
-            "stage": size,
-            "jacobian": program.formula_outputs("jacobian"),
-            "real_factors": m * m,
-            "complex_factors": 4 * m * m,
-            "rates": STAGES * size + further,
-            "error_rate": size + further,
-            "iterate": program.formula_outputs("newton"),
-            "previous_stages": STAGES * size,
-            "ratio": 1,
-            "error_estimate": size,
-        }
+            "velocity_directions": m * size, "coordinate_directions": max(1, mobility * size),
+            "velocity_rates": m * size + further, "coordinate_rates": m * size + further,
+            "mass": mobility * mobility + mobility, "stage": size,
+            "jacobian": program.formula_outputs("jacobian"), "real_factors": m * m,
+            "complex_factors": 4 * m * m, "rates": STAGES * size + further,
+            "error_rate": size + further, "iterate": program.formula_outputs("newton"),
+            "previous_stages": STAGES * size, "ratio": 1, "error_estimate": size,
+        }  # fmt: skip
         self._arrays = SimpleNamespace(**{x: r.local_array(x, n) for x, n in sizes.items()})
         self._jacobian_time = r.new_variable(-np.inf)
         self._convergence_rate = r.new_variable(1.0)
