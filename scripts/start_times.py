@@ -19,7 +19,8 @@ from crane.control import PI
 from crane.description import example_robots
 from crane.dynamics.compiled_dynamics import QUANTITIES
 from crane.motion.task_trajectories import task_trajectory
-from crane.simulation.integration import Chart, RungeKuttaStepper
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.machine_code_stepper import RungeKuttaStepper
 
 _MAIN = "import sys; sys.argv[0] = 'crane'; import crane.cli; crane.cli.main()"
 _FORWARD = (
