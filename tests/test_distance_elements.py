@@ -22,14 +22,15 @@ from crane.description import ForceElement, Rope
 from crane.dynamics.compiled_dynamics import QUANTITIES, STICK_SLIP_QUANTITIES
 from crane.dynamics.dynamics_formulas import DynamicsFormulas
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.force_terms import (
-    ForceElementTerm,
-    GasSpringTerm,
-    friction_term,
-)
 from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model_term import ForceDirection, InertialTerm
+from crane.identification.mechanics.model_terms import (
+    ForceDirection,
+    ForceElementTerm,
+    GasSpringTerm,
+    InertialTerm,
+    friction_term,
+)
 from crane.identification.signals.signal_processing import Motion
 
 BOOM, STRUT = ("base", "link7"), ("link3_H", "A1_rod")  # of the mini forwarder

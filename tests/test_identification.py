@@ -13,18 +13,16 @@ from crane.identification.mechanics.base_parameters import (
     group_parameters,
     random_samples,
 )
-from crane.identification.mechanics.force_terms import (
+from crane.identification.mechanics.identification_model import IdentificationModel
+from crane.identification.mechanics.model_terms import (
+    ForceDirection,
     ForceElementTerm,
     GasSpringTerm,
+    InertialTerm,
     PreslidingFriction,
+    RotorInertiaTerm,
     VelocityFriction,
     friction_term,
-)
-from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import (
-    ForceDirection,
-    InertialTerm,
-    RotorInertiaTerm,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")

@@ -19,12 +19,16 @@ from scipy.interpolate import CubicSpline
 import crane
 from crane import cli
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
-from crane.identification.mechanics.force_terms import ForceElementTerm, friction_term
 from crane.identification.mechanics.identification_model import default_terms
 from crane.identification.mechanics.identified_description import divide_locked_bodies
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.identify_payload import identify_payload
-from crane.identification.mechanics.model_term import InertialTerm, body_names
+from crane.identification.mechanics.model_terms import (
+    ForceElementTerm,
+    InertialTerm,
+    body_names,
+    friction_term,
+)
 from crane.identification.signals.signal_processing import Motion
 from crane.recordings.run_folder import read_run
 

@@ -21,21 +21,19 @@ from crane.identification.mechanics.cross_validation import (
     identify_options,
 )
 from crane.identification.mechanics.force_comparison import check_shared_samples
-from crane.identification.mechanics.force_terms import (
-    FrictionalMemory,
-    PreslidingFriction,
-    friction_term,
-    root_friction_term,
-)
+from crane.identification.mechanics.identifiability import prior_from_names
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identified_description import friction_laws
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model_term import (
+from crane.identification.mechanics.model_terms import (
     ForceDirection,
+    FrictionalMemory,
     InertialTerm,
+    PreslidingFriction,
     RotorInertiaTerm,
+    friction_term,
+    root_friction_term,
 )
-from crane.identification.mechanics.priors import prior_from_names
 from crane.identification.signals.signal_processing import Motion
 
 STEP = 5e-3

@@ -19,10 +19,9 @@ from crane.identification.estimation.estimators import (
     weighted_least_squares,
 )
 from crane.identification.mechanics import regression_equations
-from crane.identification.mechanics.equation_setup import build_equations
-from crane.identification.mechanics.force_terms import PreslidingFriction
 from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
-from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.identify import build_equations, identify
+from crane.identification.mechanics.model_terms import PreslidingFriction
 from crane.identification.mechanics.regression_equations import RegressionEquations
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals.signal_processing import Motion, filter_rows

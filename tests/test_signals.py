@@ -9,9 +9,8 @@ import pytest
 from scipy.linalg import block_diag
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
-from crane.identification.mechanics import recording_checks
 from crane.identification.mechanics.force_comparison import check_forces
-from crane.identification.mechanics.recording_checks import check_recording, check_samples
+from crane.identification.mechanics.smoothed_motion import check_recording, check_samples, signal_delay
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
 from crane.identification.signals.signal_processing import Motion, differentiate
@@ -463,7 +462,5 @@ def test_forces_come_late():
 
 def test_delay_between_samples():
     time = np.arange(5000) * 4e-3
-    found = recording_checks.signal_delay(
-        time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0]
-    )
+    found = signal_delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
     assert abs(found - 0.0615) < 1e-3

@@ -33,14 +33,11 @@ from crane.identification.calibration.calibration_statistics import (
     CalibrationEstimate,
     estimate_with_profiles,
     score_tests,
-)
-from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
-from crane.identification.calibration.parameter_selection import (
-    candidate_parameters,
     select_parameters,
 )
+from crane.identification.calibration.levenberg_marquardt import LevenbergMarquardt, Progress
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
-from crane.identification.calibration.unknowns import Unknown, build_unknowns
+from crane.identification.calibration.unknowns import Unknown, build_unknowns, candidate_parameters
 from crane.machine.machine import Machine
 from crane.recordings.logs import read_log_columns
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE
@@ -140,7 +137,7 @@ def calibrate(
     used_names = {name for x in unknowns for name in (x.name, *dict(x.members))}
     proposed = {x.name: x for x in candidate_parameters(machine, cases, parameters)}
     extras = [
-        replace(x, scale=proposed[x.name].std, prior=1.0)
+        replace(x, scale=proposed[x.name].scale, prior=1.0)
         for x in unknowns_for({x.name: (x.start, x.low, x.high) for x in proposed.values()})
         if not used_names & {x.name, *dict(x.members)}
     ]

@@ -22,16 +22,14 @@ from crane.identification.excitation.fisher_information import (
     InformationMeasures,
 )
 from crane.identification.excitation.fourier_trajectory import FourierTrajectory
-from crane.identification.excitation.trajectory_limits import (
+from crane.identification.excitation.trajectory_optimizer import (
+    COARSE_SAMPLES,
     QUANTITIES,
     TrajectoryLimits,
+    TrajectoryOptimizer,
     joint_values,
     singularity_proximity,
     trajectory_limits,
-)
-from crane.identification.excitation.trajectory_optimizer import (
-    COARSE_SAMPLES,
-    TrajectoryOptimizer,
 )
 from crane.identification.mechanics.base_parameters import (
     BaseParameters,
@@ -39,7 +37,7 @@ from crane.identification.mechanics.base_parameters import (
     random_samples,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS

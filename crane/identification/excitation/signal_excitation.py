@@ -17,9 +17,9 @@ from crane.common.units import format_quantity, format_table
 from crane.control.valve_commands import require_circuit
 from crane.description.sensors import VALVE_SIGNAL_PREFIX
 from crane.identification.calibration.unknowns import Unknown
-from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm, SignalLimits
+from crane.identification.excitation.exchange_algorithm import ExchangeAlgorithm
 from crane.identification.excitation.fisher_information import CRITERIA, InformationMeasures
-from crane.identification.excitation.signal_information import SignalInformation
+from crane.identification.excitation.signal_information import SignalInformation, SignalLimits
 from crane.machine.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import IDEAL_SENSORS, SENSORS_NOTE, Recording

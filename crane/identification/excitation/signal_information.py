@@ -1,4 +1,4 @@
-"""Fisher information of a recording with valve signals about calibrated parameters."""
+"""Recordings with valve signals: Fisher information about parameters, and limits."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -8,13 +8,13 @@ import numpy as np
 
 from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_number
-from crane.control.valve_commands import require_circuit
+from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.description.sensors import INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, VELOCITY_SUFFIX
 from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
-from crane.identification.calibration.unknowns import build_unknowns
+from crane.identification.calibration.unknowns import Unknown, build_unknowns
 from crane.identification.excitation.fisher_information import (
     InformationMeasures,
     information_measures,
@@ -23,9 +23,13 @@ from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import TIME, Table
 from crane.simulation.recorded_run import read_simulation, simulated_columns, simulated_units
+from crane.simulation.simulation_run import simulate
 
 # standard deviations of usual sensors, by unit
 _DEFAULT_NOISE = {"rad": 1e-3, "m": 5e-4, "rad/s": 5e-3, "m/s": 2e-3, "Pa": 3e4}
+_DEFAULT_DEVIATION = 0.3  # relative deviation of a parameter without bounds
+# [s] before the end, and share of the largest speed that counts as rest
+_FINAL_DURATION, _REST_SPEED_SHARE = 0.5, 0.1
 _MIN_SENSITIVITY = 1e-6  # change of all readings per scale of a parameter, in standard deviations
 
 
@@ -191,3 +195,130 @@ def _noise_std(name: str, given: Mapping[str, float], unit: str) -> float:
     if unit not in _DEFAULT_NOISE:
         raise InputError(f"noise of '{name}' is not known, give its deviation in {unit or '1'}")
     return _DEFAULT_NOISE[unit]
+
+
+class SignalLimits:
+    """Limits of a run that starts at home and is driven by valve signals.
+
+    Strokes keep a margin to both ends, or half of the margin of home if that is less; the demand
+    of flow is within the pump's flow, pressures are below those of the relief valves by the
+    margin, and in the last half second all speeds are below a tenth of their maxima. With each
+    unknown at its bounds, or 30 % off if it has one sign, strokes do not reach their ends.
+
+    Args:
+        information: Information of the machine and the unknowns.
+        margin: Margin relative to strokes, relief pressures and the pump's flow.
+
+    Attributes:
+        machine: The machine of the information.
+        low: (m,) lower limits [m], [rad].
+        high: (m,) upper limits [m], [rad].
+        flow: Largest demand of pump flow [m3/s].
+    """
+
+    def __init__(self, information: SignalInformation, margin: float):
+        machine = self.machine = information.machine
+        self._circuit, self._margin = require_circuit(machine), margin
+        which = [machine.active.index(joint) for joint in self._circuit.joints]
+        self._lower, self._upper = machine.lower[which], machine.upper[which]
+        self._stroke_lengths = self._upper - self._lower
+        home = np.array([machine.home[machine.column(joint)] for joint in self._circuit.joints])
+        below, above = np.minimum(
+            margin * self._stroke_lengths, [(home - self._lower) / 2, (self._upper - home) / 2]
+        )
+        self.low, self.high = self._lower + below, self._upper - above
+        supply = self._circuit.supply
+        if supply.control != "pressure":
+            raise InputError(
+                f"signals are designed for a pump that keeps its pressure, that of "
+                f"'{machine.name}' has {supply.control} control: record a task instead"
+            )
+        for joint, cylinder in self._circuit.cylinders.items():
+            if cylinder.motor:
+                raise InputError(
+                    f"signals are designed for cylinders, '{joint}' has a motor: lock it"
+                )
+        max_flow = supply.flow
+        self.flow = (1 - margin) * max_flow if max_flow else np.inf
+        self._perturbed_machines = [
+            information.perturbed_machine(values)
+            for values in _perturbed_values(information.unknowns)
+        ]
+
+    def exceeded_limit(self, run: Recording) -> str:
+        """Name of a limit that a run exceeds, "" if it exceeds none."""
+        q = self._strokes(run)
+        for i, joint in enumerate(self._circuit.joints):
+            if q[:, i].min() < self.low[i] - 1e-9 or q[:, i].max() > self.high[i] + 1e-9:
+                return f"the stroke of '{joint}'"
+        if self.pump_flow_share(run) > 1:
+            return "the pump's flow"
+        for joint, pressure in zip(self._circuit.joints, self.peak_pressures(run), strict=True):
+            relief = self._circuit.cylinders[joint].relief
+            if relief and pressure > (1 - self._margin) * relief:
+                return f"the relief pressure of '{joint}'"
+        speeds = np.abs(run.v)
+        last = speeds[run.time > run.time[-1] - _FINAL_DURATION].max(axis=0)
+        free = np.isin(run.joints, run.free)  # free joints sway
+        moving = (last > _REST_SPEED_SHARE * speeds.max(axis=0)) & ~free
+        if moving.any():
+            return f"the rest of '{run.joints[int(np.argmax(moving))]}' at the end"
+        return ""
+
+    def stroke_margins(self, run: Recording) -> Array:
+        """Smallest distances (m,) to the ends of the strokes, per stroke."""
+        q = self._strokes(run)
+        ends = np.minimum(q.min(axis=0) - self._lower, self._upper - q.max(axis=0))
+        return np.asarray(ends / self._stroke_lengths)
+
+    def worst_case_stroke_margins(self, run: Recording) -> Array:
+        """Stroke margins (m,) of the worst machine with deviating parameters and the same signals.
+
+        Raises:
+            CraneError: A simulation fails.
+        """
+        runs = [replay_signals(machine, run) for machine in self._perturbed_machines]
+        return np.min([self.stroke_margins(other) for other in (run, *runs)], axis=0)
+
+    def pump_flow_share(self, run: Recording) -> float:
+        """Largest share of the pump's flow, 0 if it has no limit."""
+        supply = self._circuit.supply
+        if not supply.flow:
+            return 0.0
+        flow_shares = (supply.pressure - run.channels["pressure_supply"]) / supply.droop
+        return float(flow_shares.max())
+
+    def peak_pressures(self, run: Recording) -> Array:
+        """Largest pressures (m,) in the cylinders [Pa]."""
+        return np.array([
+            max(run.channels[f"pressure_{joint}_{side}"].max() for side in "ab")
+            for joint in self._circuit.joints
+        ])  # fmt: skip
+
+    def _strokes(self, run: Recording) -> Array:
+        return run.q[:, [run.joints.index(joint) for joint in self._circuit.joints]]
+
+
+def _perturbed_values(unknowns: list[Unknown]) -> list[dict[str, float]]:
+    """Extreme values of the unknowns, one at a time."""
+    found = []
+    for one in unknowns:
+        ends = one.low, one.high
+        if not np.isfinite(ends).all():
+            deviation = _DEFAULT_DEVIATION * one.start if np.isfinite(ends).any() else 0.0
+            ends = one.start - deviation, one.start + deviation
+        found += [{one.name: end} for end in ends if end != one.start and not one.sensor]
+    return found
+
+
+def replay_signals(machine: Machine, run: Recording) -> Recording:
+    """Simulate a machine from home with the valve signals of another run.
+
+    Raises:
+        CraneError: The simulation fails.
+    """
+    joints, step = require_circuit(machine).joints, float(run.time[1] - run.time[0])
+    signals = {joint: run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints}
+    return simulate(
+        machine, ValveSignals(machine, run.time, signals), None, step * (len(run.time) - 1), step
+    )

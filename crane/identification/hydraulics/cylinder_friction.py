@@ -22,7 +22,7 @@ from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation import estimators
 from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.steady_samples import steady_samples
+from crane.identification.signals.signal_quality import steady_samples
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 

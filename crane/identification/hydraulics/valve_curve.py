@@ -25,7 +25,7 @@ from crane.identification.hydraulics.cylinder_signals import (
     cylinder_and_valve,
     joint_velocity,
 )
-from crane.identification.signals.steady_samples import steady_means
+from crane.identification.signals.signal_quality import steady_means
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 

@@ -11,7 +11,7 @@ from crane.common.errors import ClosureError, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 from crane.machine.machine import Machine
 
 _RANK_TOLERANCE = 1e-8  # independent part of a column, relative to its norm

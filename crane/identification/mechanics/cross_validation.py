@@ -12,13 +12,12 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number
 from crane.common.units import format_table
-from crane.identification.mechanics.equation_setup import RecordingOrMotion, prepare_motions
 from crane.identification.mechanics.feasible_parameters import load_convex_solver
+from crane.identification.mechanics.identifiability import prior_from_names, read_priors
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.priors import prior_from_names, read_priors
-from crane.identification.mechanics.regression_equations import Progress, RegressionEquations
-from crane.identification.signals.signal_processing import Motion
+from crane.identification.mechanics.identify import RecordingOrMotion, identify, prepare_motions
+from crane.identification.mechanics.regression_equations import RegressionEquations
+from crane.identification.signals.signal_processing import Motion, Progress
 from crane.machine.machine import Machine
 
 FOLD_COUNT = 5

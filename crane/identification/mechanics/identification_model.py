@@ -12,20 +12,18 @@ from crane.common.errors import InputError, suggest_names
 from crane.common.samples import Array, as_number, as_samples
 from crane.description.estimation_settings import TermValues
 from crane.dynamics.joint_forces import JointForces
-from crane.identification.mechanics.force_terms import (
+from crane.identification.mechanics.model_terms import (
+    ForceDirection,
     FrictionalMemory,
     GasSpringTerm,
-    PreslidingFriction,
-    friction_term,
-    root_friction_term,
-)
-from crane.identification.mechanics.model_term import (
-    ForceDirection,
     InertialTerm,
     ModelTerm,
     MotionSamples,
+    PreslidingFriction,
     RotorInertiaTerm,
     body_names,
+    friction_term,
+    root_friction_term,
 )
 from crane.machine.machine import Machine
 

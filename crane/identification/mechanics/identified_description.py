@@ -16,14 +16,18 @@ from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.formats.visuals.mesh_files import find_mesh_file
-from crane.identification.mechanics.feasible_estimate import thicken_body
-from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
-from crane.identification.mechanics.force_terms import (
-    FrictionTerm,
-    VelocityFriction,
+from crane.identification.mechanics.feasible_parameters import (
+    body_parameters,
+    pseudo_inertia,
+    thicken_body,
 )
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import ForceDirection, body_names
+from crane.identification.mechanics.model_terms import (
+    ForceDirection,
+    FrictionTerm,
+    VelocityFriction,
+    body_names,
+)
 from crane.machine.machine import Machine
 
 SpeedRanges = Mapping[str, tuple[float, float]]

@@ -15,12 +15,10 @@ from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.regression_problem import Estimate
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.equation_setup import build_equations, multi_pass_progress
 from crane.identification.mechanics.force_comparison import ForceComparison, check_forces
-from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.identify import METHODS
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.identify import METHODS, build_equations, multi_pass_progress
+from crane.identification.mechanics.model_terms import MotionSamples, friction_term
 from crane.identification.mechanics.payload_estimate import (
     MIN_FRICTION_SHARE,
     PayloadEstimate,
@@ -30,13 +28,11 @@ from crane.identification.mechanics.payload_estimate import (
     static_cutoff,
     static_mass,
 )
-from crane.identification.mechanics.recording_checks import reject_unless_trusted
 from crane.identification.mechanics.regression_equations import (
-    Progress,
     RegressionEquations,
 )
-from crane.identification.mechanics.smoothed_motion import smoothed_motion
-from crane.identification.signals.signal_processing import Motion
+from crane.identification.mechanics.smoothed_motion import reject_unless_trusted, smoothed_motion
+from crane.identification.signals.signal_processing import Motion, Progress
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 

@@ -12,14 +12,14 @@ from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation.regression_problem import confidence_intervals
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison
-from crane.identification.mechanics.force_delays import motion_frequency
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import (
+from crane.identification.mechanics.model_terms import (
     BODY_PARAMETERS,
     MotionSamples,
     inertial_regressor,
 )
 from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
+from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.machine.machine import Machine
 
 _REST_SPEED_SHARE = 0.05  # of a joint's largest velocity, below which it is at rest
@@ -162,7 +162,7 @@ def low_passed_motion(motion: Motion) -> Motion:
 def static_cutoff(motion: Motion) -> float:
     """Cutoff [Hz] below which forces are weights and friction."""
     step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
-    wanted = max(_CUTOFF_FACTOR * motion_frequency(motion.q, step), _MIN_PERIODS / duration)
+    wanted = max(_CUTOFF_FACTOR * spectral_edge_frequency(motion.q, step), _MIN_PERIODS / duration)
     return min(wanted, 0.24 / step)
 
 

@@ -14,9 +14,10 @@ from crane.identification.estimation.regressor import triangular_factor, update_
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_model import IdentificationModel
-from crane.identification.mechanics.model_term import MotionSamples
+from crane.identification.mechanics.model_terms import MotionSamples
 from crane.identification.signals.signal_processing import (
     Motion,
+    Progress,
     filter_kernel,
     filter_rows,
     is_moving,
@@ -26,7 +27,6 @@ _MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
 _BLOCK_BYTES = 1 << 25  # bytes of an unfiltered regressor per block
 # bytes of cached filtered blocks; others are computed again
 _CACHE_BYTES = 3 << 27
-Progress = Callable[[float], None]
 _MAX_ITERATIONS = 31
 _CONVERGENCE_TOLERANCE = 1e-2  # of a standard deviation
 _ROUNDING_TOLERANCE = 1e-9  # of the largest value

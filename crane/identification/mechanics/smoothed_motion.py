@@ -1,7 +1,8 @@
-"""Motions from recordings: checked samples, derivatives, and recorded loads."""
+"""Motions from recordings: checks of units, delays, outliers and hum, derivatives, loads."""
 
 import math
 import warnings
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -9,22 +10,23 @@ from crane.common.errors import CraneWarning, RecordingError, suggest_names
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.mechanics.force_delays import motion_frequency
-from crane.identification.mechanics.recording_checks import (
-    check_recording,
-    check_samples,
-    reject_unless_trusted,
-    remove_outliers,
-    warn_hum,
-)
-from crane.identification.mechanics.regression_equations import Progress
 from crane.identification.signals.signal_processing import (
     Derivatives,
     Motion,
+    Progress,
+    central_differences,
+    check_gaps,
     differentiate,
+    low_pass,
     resample_evenly,
+    sampling_step,
 )
-from crane.identification.signals.signal_quality import outlier_mask, replace_outliers
+from crane.identification.signals.signal_quality import (
+    outlier_mask,
+    replace_outliers,
+    spectral_edge_frequency,
+    strongest_spectral_line,
+)
 from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
@@ -35,6 +37,13 @@ _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint m
 _MAX_SPEED_FACTOR = 30.0
 _HUM_FACTOR = 10.0  # times the frequency of the motion, above which a spectral line is hum
 _LOAD_PREFIX, _PART_UNITS = "load_", {"force": "N", "moment": "N m"}
+_MIN_SAMPLES = 50  # samples
+_COMPARISON_CUTOFF = 10.0  # [Hz] of the comparison of velocities and positions
+_CORRELATION_TOLERANCE = 0.01  # of a correlation
+_MAX_DELAY = 1.0  # [s] longest delay of the search
+_MAX_OUTLIER_SHARE = 0.05  # of the samples of a column, above which it is rejected
+# units that are confused with SI units
+_COMMON_UNITS = {"rad": ("deg", 180 / math.pi), "m": ("mm", 1e3)}
 
 
 def smoothed_motion(
@@ -77,7 +86,7 @@ def smoothed_motion(
     columns[:, n:] += recorded_load_forces(machine, original, columns[:, :n], trust)
     time, columns = resample_evenly(time, columns)
     step = float(np.median(np.diff(time)))
-    lowest = _HUM_FACTOR * motion_frequency(columns[:, :n], step)
+    lowest = _HUM_FACTOR * spectral_edge_frequency(columns[:, :n], step)
     warn_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
     v, a = np.where(_is_moving(found), (found.v, found.a), 0.0)
@@ -232,3 +241,203 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
 def _load_name(column: str) -> str:
     """Name of the load of a column."""
     return column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)[0]
+
+
+def signal_delay(time: Array, one: Array, other: Array) -> float:
+    """Delay [s] of the second signal (N,) with respect to the first, at most 1 s.
+
+    It is the maximum of the correlation of the overlapping parts, refined by a parabola.
+    """
+    from scipy.signal import correlate
+
+    step = sampling_step(time)
+    one, other = one - one.mean(), other - other.mean()
+    shifts = np.arange(-(reach := min(round(_MAX_DELAY / step), len(time) // 4)), reach + 1)
+    products = correlate(other, one, method="fft")[shifts + len(time) - 1]
+    first, second = (np.append(0, np.cumsum(x**2)) for x in (one, other))
+    low, high = np.maximum(shifts, 0), len(time) + np.minimum(shifts, 0)
+    energy = (first[high - shifts] - first[low - shifts]) * (second[high] - second[low])
+    correlation = products / np.sqrt(np.maximum(energy, 1e-12 * first[-1] * second[-1] + 1e-300))
+    # the shortest of equal maxima, as for periodic signals
+    best = np.flatnonzero(correlation >= correlation.max() - _CORRELATION_TOLERANCE)
+    at = int(np.clip(best[np.abs(shifts[best]).argmin()], 1, 2 * reach - 1))
+    if correlation[at - 1 : at + 2].argmax() != 1:  # not at a local maximum
+        direction = 1 if correlation[at + 1] > correlation[at] else -1
+        while 1 < at < 2 * reach - 1 and correlation[at + direction] > correlation[at]:
+            at += direction
+    before, here, after = correlation[at - 1 : at + 2]
+    curvature = before - 2 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float((at - reach + shift) * step)
+
+
+def reject_unless_trusted(text: str, trust: bool) -> None:
+    """Reject a recording that is probably wrong, or warn if it is trusted.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    if not trust:
+        raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
+    warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
+
+
+def check_samples(time: Array) -> None:
+    """Reject a recording with too few samples, or with gaps between its instants (N,).
+
+    Raises:
+        RecordingError: There are too few samples, or a gap.
+    """
+    if len(time) < _MIN_SAMPLES:
+        raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
+    check_gaps(time)
+
+
+def remove_outliers(
+    time: Array, names: Sequence[str], columns: Array, trust: bool = False
+) -> Array:
+    """Replace outliers in columns (N, k) by linear interpolation.
+
+    Outliers are removed before filters, which would smear them. Columns of a trusted recording are
+    not changed.
+
+    Raises:
+        RecordingError: A column has too many outliers.
+    """
+    messages = []
+    for name, column in () if trust else zip(names, columns.T, strict=True):
+        bad = outlier_mask(column)
+        if not bad.any():
+            continue
+        first = f"the first at {time[bad.argmax()]:.6g} s"
+        if bad.mean() > _MAX_OUTLIER_SHARE:
+            reject_unless_trusted(
+                f"'{name}' has {bad.sum()} outliers in {len(bad)} samples, {first}", trust
+            )
+        messages.append(f"{bad.sum()} in '{name}' ({first})")
+        column[:] = replace_outliers(column, bad)
+    if messages:
+        text = f"outliers are left out and bridged: {', '.join(messages)} of {len(time)} samples"
+        warnings.warn(text, CraneWarning, stacklevel=3)
+    return columns
+
+
+def warn_hum(time: Array, columns: Mapping[str, Array], min_frequency: float) -> None:
+    """Warn of spectral lines in columns (N,) above a frequency [Hz] without motion."""
+    step, messages = float(np.median(np.diff(time))), []
+    for name, column in columns.items():
+        if (
+            np.ptp(column) > 0
+            and (found := strongest_spectral_line(column, step, min_frequency)) is not None
+        ):
+            share = 100 * found[1] / float(np.std(column))
+            messages.append(f"'{name}' of {found[0]:.3g} Hz ({found[1]:.3g}, {share:.2g} % of it)")
+    if messages:
+        text = f"hum in {', '.join(messages)}: keep the bandwidth well below it"
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def check_recording(
+    time: Array,
+    q: Array,
+    tau: Array,
+    joints: Sequence[str],
+    units: Mapping[str, str],
+    v: Array | None = None,
+    limits: Array | None = None,
+    longest_delay: float = 0.05,
+    free: Sequence[str] = (),
+    trust: bool = False,
+) -> None:
+    """Reject a recording that is not suitable for an identification.
+
+    Args:
+        time: Instants (N,) [s].
+        q: Coordinates (N, n).
+        tau: Generalized forces (N, n).
+        joints: Names (n,).
+        units: "rad" or "m" of each coordinate.
+        v: Recorded velocities (N, n), compared with the derivatives of q.
+        limits: Lower and upper limits (n, 2).
+        longest_delay: Largest delay [s] between recorded velocity and q, for filters of sensors.
+        free: Names of free joints.
+        trust: Whether to warn only of what is probably wrong.
+
+    Raises:
+        RecordingError: There is no motion, units are wrong, or columns are inconsistent; the
+            message names the column.
+    """
+    # steps between samples of pure noise have twice its variance
+    if all(np.ptp(x) == 0 or np.var(np.diff(x)) >= np.var(x) for x in q.T):
+        raise RecordingError("no joint moves, record a motion")
+    for i, joint in enumerate(joints):
+        if joint not in free and np.ptp(tau[:, i]) == 0 and np.ptp(q[:, i]) > 0:
+            reject_unless_trusted(
+                f"'{joint}_force' is constant while '{joint}' moves, check it", trust
+            )
+        if limits is not None:
+            _check_range(q[:, i], limits[i], joint, units[joint], trust)
+        if v is not None and np.var(np.diff(q[:, i])) < np.var(q[:, i]):
+            _check_velocity(time, q[:, i], v[:, i], joint, units[joint], longest_delay, trust)
+
+
+def _check_range(x: Array, limits: Array, joint: str, unit: str, trust: bool) -> None:
+    low, high = limits
+    slack = 0.1 * (high - low)
+
+    def inside(values: Array) -> bool:
+        return low - slack <= values.min() and values.max() <= high + slack
+
+    if not inside(x):
+        other, factor = _COMMON_UNITS[unit]
+        is_other_unit = inside(x / factor) and np.ptp(x) > 0.02 * factor * (high - low)
+        hint = f"it looks like {other}" if is_other_unit else "check its zero and unit"
+        reject_unless_trusted(
+            f"'{joint}' goes from {x.min():.4g} to {x.max():.4g} {unit}, its limits are "
+            f"{low:.4g} and {high:.4g} {unit}, {hint}",
+            trust,
+        )
+
+
+def _check_velocity(
+    time: Array, x: Array, v: Array, joint: str, unit: str, longest_delay: float, trust: bool
+) -> None:
+    """Compare a velocity with the derivative of its coordinate below 10 Hz."""
+    time, columns = resample_evenly(time, np.column_stack([x, v]))
+    step = sampling_step(time)
+    if 0.4 / step > _COMPARISON_CUTOFF:
+        columns = low_pass(time, columns, _COMPARISON_CUTOFF)
+    derivative, v = central_differences(time, columns[:, 0]), columns[:, 1]
+    # less than a micrometre is noise or rounding, not motion
+    if np.std(columns[:, 0]) < 1e-6:
+        return
+    ratio = math.sqrt(np.mean(v**2) / np.mean(derivative**2))
+    other, factor = _COMMON_UNITS[unit]
+    for wrong, scale in ((f"{joint}_velocity", factor), (joint, 1 / factor)):
+        if 0.8 < ratio / scale < 1.25:
+            return reject_unless_trusted(
+                f"'{joint}_velocity' is {ratio:.3g} times the derivative of '{joint}', "
+                f"'{wrong}' looks like {other}, give {unit}",
+                trust,
+            )
+    delay = signal_delay(time, derivative, v)
+    shift = round(delay / step)
+    first, second = (derivative, v) if shift >= 0 else (v, derivative)
+    overlap = len(v) - abs(shift)
+    first, second = first[:overlap], second[abs(shift) :]
+    correlation = float(np.corrcoef(first, second)[0, 1]) if np.ptp(v) > 0 else 0.0
+    if correlation < 0.7 or not 0.5 < ratio < 2:
+        return reject_unless_trusted(
+            f"'{joint}_velocity' is not the derivative of '{joint}' (correlation "
+            f"{correlation:.2f}, ratio {ratio:.3g}), check the columns",
+            trust,
+        )
+    if abs(delay) > longest_delay:
+        reject_unless_trusted(delay_message(f"{joint}_velocity", delay, f"'{joint}'"), trust)
+    return None
+
+
+def delay_message(name: str, delay: float, reference: str) -> str:
+    """Message about the delay [s] of a column with respect to another."""
+    side = "behind" if delay > 0 else "ahead of"
+    return f"'{name}' is {abs(delay) * 1e3:.0f} ms {side} {reference}, record them with one clock"

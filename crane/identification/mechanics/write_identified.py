@@ -25,7 +25,6 @@ from crane.formats.machine_file.yaml_text import KeyPath, format_yaml
 from crane.formats.machine_loading import load
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
-from crane.identification.mechanics.force_terms import FrictionTerm
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identified_description import (
     FrictionLawFit,
@@ -35,7 +34,7 @@ from crane.identification.mechanics.identified_description import (
     motor_chain,
     replace_inertials,
 )
-from crane.identification.mechanics.model_term import BODY_PARAMETERS
+from crane.identification.mechanics.model_terms import BODY_PARAMETERS, FrictionTerm
 from crane.machine.machine import Machine
 
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine

@@ -12,6 +12,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
 from crane.identification.signals.kalman_smoother import kalman_smooth
 
+Progress = Callable[[float], None]
 METHODS = ("kalman", "lowpass")
 _MIN_SAMPLES = 50  # samples
 _MAX_GAP = 5.0  # steps
@@ -72,7 +73,7 @@ def differentiate(
     q: Array,
     method: str = "kalman",
     cutoff: float | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Derivatives:
     """Velocities and accelerations from measured coordinates.
 
