@@ -220,8 +220,7 @@ def _machine_with_sensors(
     for line in read_log_columns(Path(columns))[1] if columns is not None else ():
         name, unit = parse_heading(line.heading)
         if quantity_unit(machine.tree, name) is not None:
-            known_sensor = sensors.get(name, Sensor())
-            sensors[name] = replace(known_sensor, column=line.expression, unit=unit)
+            sensors[name] = replace(sensors.get(name, Sensor()), column=line.expression, unit=unit)
     sensor_changes = {
         name: value for name, value in changes.items() if name.startswith(SENSOR_PREFIX)
     }
@@ -241,8 +240,9 @@ def _read_case(
             if name not in compared:
                 raise InputError(f"'{name}' cannot be compared, {known_names(compared, name)}")
         compared = compared if sensors is None else list(sensors)
-        known = known_sensors(table, machine)
-        return recording_case(machine, Path(path).name, table, known, compared, window)
+        return recording_case(
+            machine, Path(path).name, table, known_sensors(table, machine), compared, window
+        )
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
 

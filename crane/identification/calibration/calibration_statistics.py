@@ -262,8 +262,7 @@ def score_tests(
         except CraneError:  # the tests are optional
             return []
         weighted = (derivatives * search.channel_weights(case)[:, :, None])[case.train_mask]
-        columns = weighted[:, :, count : count + candidate_count]
-        rows.append(columns.reshape(-1, candidate_count))
+        rows.append(weighted[:, :, count : count + candidate_count].reshape(-1, candidate_count))
     return score_test(candidates, search.jacobian, np.vstack(rows), search.residual, search.prior)
 
 
@@ -301,8 +300,11 @@ def score_test(
         gain = -(2.0 * step * gradient + step**2 * size) / max(float(residual @ residual), 1e-300)
         value = candidate.start + candidate.scale * float(step)
         found.append(ScoreTestResult(candidate.name, value, float(gain)))
-    ranked = sorted(found, key=lambda one: -one.cost_reduction)
-    return [one for one in ranked if one.cost_reduction > _MIN_COST_REDUCTION][:_MAX_REPORTED]
+    return [
+        one
+        for one in sorted(found, key=lambda one: -one.cost_reduction)
+        if one.cost_reduction > _MIN_COST_REDUCTION
+    ][:_MAX_REPORTED]
 
 
 def select_parameters(

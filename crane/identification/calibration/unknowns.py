@@ -263,8 +263,7 @@ def _spool_candidates(
 ) -> Iterator[Unknown]:
     """Candidates of a spool and of the orifices that it opened."""
     name = f"valve.{spool.joint}" + ("" if isinstance(spool, Valve) else ".spool_b")
-    stroke = abs(spool.full - spool.neutral)
-    drift, dead = 0.02 * stroke, spool.dead_band
+    drift, dead = 0.02 * abs(spool.full - spool.neutral), spool.dead_band
     if len(directions) == 2:  # in one direction neutral and dead band are not separable
         least, most = spool.neutral - 3.0 * drift, spool.neutral + 3.0 * drift
         yield _candidate(f"{name}.neutral", spool.neutral, drift, least, most)

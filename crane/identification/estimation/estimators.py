@@ -38,8 +38,7 @@ def least_squares(
     Raises:
         InputError: Shapes differ, there are too few rows, or columns are linearly dependent.
     """
-    rows = RegressionProblem(W, None, y, groups, samples, prior)
-    return rows.estimate(rows.common_noise)
+    return RegressionProblem(W, None, y, groups, samples, prior).estimate(per_group=False)
 
 
 def weighted_least_squares(
@@ -53,8 +52,7 @@ def weighted_least_squares(
 
     Arguments and errors as for `least_squares`.
     """
-    rows = RegressionProblem(W, None, y, groups, samples, prior)
-    return rows.estimate(rows.group_noise)
+    return RegressionProblem(W, None, y, groups, samples, prior).estimate()
 
 
 def huber(
@@ -93,8 +91,7 @@ def instrumental_variables(
 
     Source: Janot, Vandanjon, Gautier 2014, IEEE Trans. Control Systems Technology 22(1).
     """
-    rows = RegressionProblem(W, Z, y, groups, samples, prior)
-    return rows.estimate(rows.group_noise)
+    return RegressionProblem(W, Z, y, groups, samples, prior).estimate()
 
 
 def estimate_from_minimum(
@@ -150,8 +147,7 @@ def essential_parameters(estimate: Estimate, level: float = 0.05) -> np.ndarray:
         worst = int(np.argmax(std / np.maximum(np.abs(values), np.finfo(float).tiny)))
         trial = [*dropped, kept[worst]]
         theta = estimate.values[trial]
-        C = estimate.covariance[np.ix_(trial, trial)]
-        F = theta @ np.linalg.solve(C, theta) / len(trial)
+        F = theta @ np.linalg.solve(estimate.covariance[np.ix_(trial, trial)], theta) / len(trial)
         if f.sf(F, len(trial), estimate.degrees_of_freedom) < level:
             break
         gain = covariance[:, worst] / covariance[worst, worst]

@@ -32,8 +32,28 @@ _MAX_ITERATIONS = 100
 _GAP_BLOCK = 4096  # instants without rows per block
 
 
+class EstimatedValues(OneLineRepr):
+    """Values (p,) with their covariance (p, p) and its degrees of freedom, () or (p,)."""
+
+    values: Array
+    covariance: Array
+    degrees_of_freedom: float | Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # negative by rounding only
+
+    def interval(self, level: float = 0.95) -> Array:
+        """Confidence intervals (p, 2) of a level, 0 to 1: values -+ t std with Student's t."""
+        from scipy.stats import t
+
+        half = t.ppf(0.5 + 0.5 * level, self.degrees_of_freedom) * self.std
+        return np.column_stack([self.values - half, self.values + half])
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Estimate(OneLineRepr):
+class Estimate(EstimatedValues):
     """Estimated parameters with their covariance.
 
     Attributes:
@@ -56,18 +76,6 @@ class Estimate(OneLineRepr):
     degrees_of_freedom: float
     condition: float
     scaled_condition: float
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations (p,)."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (p, 2) of a level.
-
-        They are values -+ t std with Student's t for `degrees_of_freedom`.
-        """
-        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
 
 class RegressionProblem:
@@ -149,22 +157,15 @@ class RegressionProblem:
         at = order[~np.isfinite(self.y)]
         raise InputError(f"forces not finite in row {at.min()}, leave such rows out")
 
-    def common_noise(self, theta: Array) -> Array:
-        """Common standard deviation of all rows, for each group (g,)."""
-        residual_rms = np.linalg.norm(self._residual_norms(theta)) / math.sqrt(len(self.y))
-        return np.full(len(self.group_rows), max(float(residual_rms), self.min_noise))
-
-    def group_noise(self, theta: Array) -> Array:
-        """Standard deviations of the groups (g,)."""
-        counts = np.array([len(rows) for rows in self.group_rows])
-        return np.maximum(self._residual_norms(theta) / np.sqrt(counts), self.min_noise)
-
-    def _residual_norms(self, theta: Array) -> Array:
-        """Norms |y - W theta| of the groups (g,), from the triangular factors."""
-        size = len(self.mean)
-        return np.linalg.norm(
-            self.plain[:, :, -1] - self.plain[:, :, -1 - size : -1] @ theta, axis=1
-        )
+    def _noise(self, theta: Array, per_group: bool) -> Array:
+        """Standard deviations of the groups (g,), from the triangular factors; or a common one."""
+        W = self.plain[:, :, -1 - len(theta) : -1]
+        norms = np.linalg.norm(self.plain[:, :, -1] - W @ theta, axis=1)
+        if per_group:
+            counts = np.array([len(rows) for rows in self.group_rows])
+            return np.maximum(norms / np.sqrt(counts), self.min_noise)
+        common = float(np.linalg.norm(norms) / math.sqrt(len(self.y)))
+        return np.full(len(norms), max(common, self.min_noise))
 
     def _robust_group_noise(self, e: Array) -> Array:
         """Robust standard deviations of the groups (g,) from medians of residuals (m,)."""
@@ -178,15 +179,20 @@ class RegressionProblem:
             e[rows] -= W @ theta
         return e
 
-    def estimate(self, noise_function) -> Estimate:  # type: ignore[no-untyped-def]
-        """Alternate between the estimate and the noise of the groups until convergence."""
-        theta, s = np.zeros(len(self.mean)), noise_function(np.zeros(len(self.mean)))
+    def estimate(self, per_group: bool = True) -> Estimate:
+        """Alternate between the estimate and the noise until convergence.
+
+        Args:
+            per_group: Whether each group has its own noise.
+        """
+        theta = np.zeros(len(self.mean))
+        s = self._noise(theta, per_group)
         for round_ in range(_MAX_ITERATIONS):
             before = theta
             theta, _, A = self._solve(self.plain, s)
             if round_ and np.abs(A @ (theta - before)).max() < _CONVERGENCE_TOLERANCE:
                 break
-            s = noise_function(theta)
+            s = self._noise(theta, per_group)
         return self.evaluate_estimate(theta, self.residuals(theta), s, math.inf)
 
     def huber_estimate(self) -> Estimate:
@@ -216,11 +222,7 @@ class RegressionProblem:
         copies = [self.prior_root] * ((group_factors.shape[2] - 1) // size)
         prior = np.column_stack([*copies, self.prior_root @ self.mean])
         stacked_factor = triangular_factor(np.vstack([*(group_factors / s[:, None, None]), prior]))
-        R, A, right_side = (
-            stacked_factor[:size, :size],
-            stacked_factor[:size, -1 - size : -1],
-            stacked_factor[:size, -1],
-        )
+        R, A = stacked_factor[:size, :size], stacked_factor[:size, -1 - size : -1]
         length = np.linalg.norm(R, axis=0)
         length[length == 0] = 1.0
         values = np.linalg.svd(A / length, compute_uv=False)
@@ -230,7 +232,7 @@ class RegressionProblem:
                 f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
                 "with finite deviations of those that do"
             )
-        return np.asarray(np.linalg.solve(A, right_side), dtype=np.float64), R, A
+        return np.asarray(np.linalg.solve(A, stacked_factor[:size, -1]), dtype=np.float64), R, A
 
     def evaluate_estimate(self, theta: Array, e: Array, s: Array, threshold: float) -> Estimate:
         """Estimate with the covariance A^-1 (sum of Q^T noise) A^-T for correlated noise.
@@ -247,23 +249,20 @@ class RegressionProblem:
         of all rows. Residuals have a lower bound by rounding errors of the rows and the base
         parameters.
         """
-        row_noise = s[self.groups]
-        clipped = np.clip(e, -threshold * row_noise, threshold * row_noise)
-        unclipped = np.abs(e) <= threshold * row_noise
+        limit = threshold * s[self.groups]
+        clipped, unclipped = np.clip(e, -limit, limit), np.abs(e) <= limit
+        del limit
         count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
         noise = inflated * np.array([_rms(clipped[rows]) for rows in self.group_rows])
         for group_indices in self.group_rows:
             if 0 < (group_rms := _rms(clipped[group_indices])) < self.min_noise:
                 clipped[group_indices] *= self.min_noise / group_rms
-        clipped /= row_noise
-        del row_noise
+        clipped /= s[self.groups]
         noises = [NoiseModel.fit(clipped[rows], self.samples[rows]) for rows in self.group_rows]
-        rows = (
-            self.plain
-            if unclipped.all()
-            else triangular_factors(self.W, self.y, self.groups, unclipped)
-        )
-        _, R, A = self._solve(rows, s)
+        factors = self.plain
+        if not unclipped.all():
+            factors = triangular_factors(self.W, self.y, self.groups, unclipped)
+        _, R, A = self._solve(factors, s)
         jackknife = Jackknife(self.samples, noises, len(theta))
         middle = self._noise_covariance_product(R, s, noises, jackknife, clipped, unclipped)
         del clipped, unclipped
@@ -274,9 +273,7 @@ class RegressionProblem:
             for x in (0.5 * (middle + middle.T), jackknife.covariance())
         )
         inflation = np.sqrt(np.maximum(np.diag(jackknife_covariance) / np.diag(covariance), 1.0))
-        unweighted_factors, scaled = condition_numbers(
-            np.vstack(list(self.plain[:, :, -1 - len(theta) : -1]))
-        )
+        plain, scaled = condition_numbers(np.vstack(list(self.plain[:, :, -1 - len(theta) : -1])))
         if self._order is not None:
             e, ordered = np.empty(count), e
             e[self._order] = ordered
@@ -287,7 +284,7 @@ class RegressionProblem:
             noise=noise,
             effective_samples=np.array([noise.effective_samples for noise in noises]),
             degrees_of_freedom=jackknife.degrees_of_freedom,
-            condition=unweighted_factors,
+            condition=plain,
             scaled_condition=scaled,
         )
 
@@ -306,9 +303,10 @@ class RegressionProblem:
         of unclipped rows.
         """
         from scipy.linalg import solve_triangular
+        from scipy.signal import lfilter
 
         S, size = innovation_covariance(noises), len(R)
-        filter_states = [noise.zero_state(size) for noise in noises]
+        filter_states = [np.zeros((size, len(noise.a) - 1)) for noise in noises]
         middle = np.zeros((size, size))
 
         def filter_instants(count: int, at: np.ndarray, groups: np.ndarray, Q: Array) -> None:
@@ -317,17 +315,15 @@ class RegressionProblem:
             for i, noise in enumerate(noises):
                 dense = np.zeros((size, count))
                 dense[:, at[groups == i]] = Q[:, groups == i]
-                out, filter_states[i] = noise.apply_filter(dense, filter_states[i])
+                out, filter_states[i] = lfilter([1.0], noise.a, dense, zi=filter_states[i])
                 filtered.append(out)
             for i, one in enumerate(filtered):
                 middle[:] += one @ sum(S[i, j] * other.T for j, other in enumerate(filtered))
 
         def skip_instants(count: int) -> None:
-            nothing = np.zeros(0, dtype=np.intp)
+            nothing = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros((size, 0))
             for start in range(0, count, _GAP_BLOCK):
-                filter_instants(
-                    min(_GAP_BLOCK, count - start), nothing, nothing, np.zeros((size, 0))
-                )
+                filter_instants(min(_GAP_BLOCK, count - start), *nothing)
 
         last = int(self.samples[-1]) + 1
         for rows, block in self.Z.blocks(backwards=True):
@@ -347,27 +343,6 @@ def _rms(e: Array) -> float:
 
 def condition_numbers(W: Array) -> tuple[float, float]:
     """Condition numbers of W, or of its triangular factor: plain, and with unit columns."""
-    return _condition_number(W), _condition_number(
-        W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
-    )
-
-
-def _condition_number(W: Array) -> float:
-    return float(np.linalg.cond(np.linalg.qr(W, mode="r")))
-
-
-def confidence_intervals(
-    values: Array, std: Array, degrees_of_freedom: float | Array, level: float
-) -> Array:
-    """Lower and upper ends (p, 2) of intervals values -+ t std with Student's t.
-
-    Args:
-        values: (p,) estimates.
-        std: (p,) standard deviations.
-        degrees_of_freedom: Degrees of freedom of the standard deviations, () or (p,).
-        level: Confidence level, 0 to 1.
-    """
-    from scipy.stats import t
-
-    half = t.ppf(0.5 + 0.5 * level, degrees_of_freedom) * std
-    return np.column_stack([values - half, values + half])
+    scaled = W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
+    plain, of_scaled = (float(np.linalg.cond(np.linalg.qr(x, mode="r"))) for x in (W, scaled))
+    return plain, of_scaled

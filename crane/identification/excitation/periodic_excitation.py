@@ -372,8 +372,7 @@ def _random_motions(
     """Random motions within the limits, with harmonics up to an angular frequency [rad/s]."""
     machine, rng = model.machine, np.random.default_rng(0)
     at = random_samples(model, 300)
-    is_regular = singularity_proximity(machine, at) <= 1
-    q_a = at.q_a[is_regular]
+    q_a = at.q_a[singularity_proximity(machine, at) <= 1]
     v_max = np.minimum(bounds.velocity, max_frequency * bounds.half_stroke)
     a_max = np.minimum(bounds.acceleration, max_frequency * v_max)
     v_a, a_a = (limit * rng.uniform(-1, 1, q_a.shape) for limit in (v_max, a_max))

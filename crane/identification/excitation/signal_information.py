@@ -111,8 +111,7 @@ class SignalInformation:
 
     def expected_readings(self, run: Recording, noisy: bool = False) -> Table:
         """Recording of a run: signals and readings, with noise or without."""
-        names = list(self.units)
-        values = read_simulation(self.machine, run, names)
+        values = read_simulation(self.machine, run, list(self.units))
         if noisy:
             random = np.random.default_rng(self._seed)
             values = values + self.noise * random.normal(size=values.shape)
@@ -259,8 +258,8 @@ class SignalLimits:
                 return f"the relief pressure of '{joint}'"
         speeds = np.abs(run.v)
         last = speeds[run.time > run.time[-1] - _FINAL_DURATION].max(axis=0)
-        free = np.isin(run.joints, run.free)  # free joints sway
-        moving = (last > _REST_SPEED_SHARE * speeds.max(axis=0)) & ~free
+        # free joints sway
+        moving = (last > _REST_SPEED_SHARE * speeds.max(axis=0)) & ~np.isin(run.joints, run.free)
         if moving.any():
             return f"the rest of '{run.joints[int(np.argmax(moving))]}' at the end"
         return ""
@@ -285,8 +284,7 @@ class SignalLimits:
         supply = self._circuit.supply
         if not supply.flow:
             return 0.0
-        flow_shares = (supply.pressure - run.channels["pressure_supply"]) / supply.droop
-        return float(flow_shares.max())
+        return float(((supply.pressure - run.channels["pressure_supply"]) / supply.droop).max())
 
     def peak_pressures(self, run: Recording) -> Array:
         """Largest pressures (m,) in the cylinders [Pa]."""

@@ -248,8 +248,7 @@ class TrajectoryOptimizer:
         )
         shares = self._limit_usage_at(at).reshape(motion_count, len(q) // motion_count, -1)
         largest = shares.max(axis=1, keepdims=True) + np.finfo(float).tiny
-        norms = largest[:, 0] * np.linalg.norm(shares / largest, _NORM_ORDER, axis=1)
-        return costs, 1 - norms
+        return costs, 1 - largest[:, 0] * np.linalg.norm(shares / largest, _NORM_ORDER, axis=1)
 
     def random_references(self, rng: np.random.Generator) -> Array:
         """Random vectors (V, size) of trajectories, scaled to the limits.
@@ -384,8 +383,7 @@ class TrajectoryOptimizer:
 
         def shares(times: Array) -> Array:
             q, v, a = trajectory(times)
-            tau = self._dynamics.inverse(q, v, a, friction=True)
-            return self._limits.usage(q, v, a, tau)
+            return self._limits.usage(q, v, a, self._dynamics.inverse(q, v, a, friction=True))
 
         dense = shares(self._dense_times)
         peaks = shares(self._times_near_peaks(dense.reshape(len(dense), -1)))

@@ -172,8 +172,7 @@ def cylinder_signals(
 
 def valve_opening(valve: Valve, u: Array) -> Array:
     """Opening (N,) for spool positions u (N,), see `Valve`."""
-    size = np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0)
-    return np.copysign(size, u)
+    return np.copysign(np.clip((np.abs(u) - valve.dead_band) / (1 - valve.dead_band), 0.0, 1.0), u)
 
 
 def spool_position(valve: Valve, voltage: Array, step: float) -> Array:

@@ -105,10 +105,13 @@ class OrificeCoefficients(Result):
             recording: As for `identify_orifices`.
             period: As for `identify_orifices`.
         """
-        signals = cylinder_signals(self.machine, recording, self.joint, period)
-        return OrificeEquations(self.machine, self.joint, signals, self.window, False).sides(
-            self.values
-        )
+        return OrificeEquations(
+            self.machine,
+            self.joint,
+            cylinder_signals(self.machine, recording, self.joint, period),
+            self.window,
+            False,
+        ).sides(self.values)
 
     def to_text(self) -> str:
         """A table of the parameters."""
@@ -273,8 +276,7 @@ def _weak_form_estimate(
             middle += total.T @ total
     inverse = np.linalg.inv(A)
     propagated = inverse @ middle @ inverse.T
-    found = float(np.sum(estimate.residuals**2 / scale[group]))
-    misfit = found / max(explained, 1e-300)
+    misfit = float(np.sum(estimate.residuals**2 / scale[group])) / max(explained, 1e-300)
     other = max(0.0, 1 - 1 / misfit) * estimate.covariance
     both = np.diag(propagated + other)
     # Welch-Satterthwaite: the propagated part is taken as exactly known

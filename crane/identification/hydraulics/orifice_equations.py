@@ -122,8 +122,7 @@ class OrificeEquations:
             states, columns = self._combined_terms(
                 shift_signal(self.signals, sensor, sign * offset)
             )
-            f = states[:, 0] * X[0] + states[:, 1]
-            ends.append((f, np.tensordot(columns, X[1:], (1, 0))))
+            ends.append((states[:, 0] * X[0] + states[:, 1], np.tensordot(columns, X[1:], (1, 0))))
         return 0.5 * (ends[0][0] - ends[1][0]), 0.5 * (ends[0][1] - ends[1][1])
 
 
@@ -159,8 +158,7 @@ def chamber_terms(machine: Machine, joint: str, signals: CylinderSignals) -> tup
             ],
         ]
     )
-    states = np.array([[signals.p_a, np.log(volume_a)], [signals.p_b, np.log(volume_b)]])
-    return states, columns
+    return np.array([[signals.p_a, np.log(volume_a)], [signals.p_b, np.log(volume_b)]]), columns
 
 
 def _signed_sqrt(drop: Array) -> Array:

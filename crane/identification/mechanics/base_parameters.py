@@ -63,8 +63,7 @@ class BaseParameters(OneLineRepr):
         small independent part may together be dependent.
         """
         names, units = [self.names[i] for i in self.independent], self.units[self.independent]
-        order = _pivot_order(rows)
-        identifiable = group_parameters(names, rows, units, order.index)
+        identifiable = group_parameters(names, rows, units, _pivot_order(rows).index)
         if identifiable.rank == self.rank:
             return self
         independent = self.independent[identifiable.independent]

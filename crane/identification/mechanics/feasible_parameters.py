@@ -172,8 +172,7 @@ def solve_feasible(
     cost = cp.sum_squares(scale * (prior_root * unit @ z - prior_root @ prior_offset))
     constraints = [z[bounded] >= -start[bounded] / unit[bounded]]
     for b, x in enumerate(X):
-        block = R[:, 10 * b : 10 * b + 10] @ maps[b]
-        model = model + block @ cp.vec(x - np.eye(4), order="F")
+        model = model + R[:, 10 * b : 10 * b + 10] @ maps[b] @ cp.vec(x - np.eye(4), order="F")
         cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MIN_EIGENVALUE * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
@@ -228,8 +227,7 @@ def divergence_hessian_root(body: Array) -> Array:
     """
     cholesky_factor = np.linalg.cholesky(pseudo_inertia(body))
     first = np.linalg.solve(cholesky_factor, pseudo_inertia(np.eye(10)))
-    transformed = np.linalg.solve(cholesky_factor, np.swapaxes(first, 1, 2))
-    return transformed.reshape(10, 16).T
+    return np.linalg.solve(cholesky_factor, np.swapaxes(first, 1, 2)).reshape(10, 16).T
 
 
 def _check_arguments(
@@ -420,8 +418,7 @@ def thicken_body(body: Array) -> Array:
     P = pseudo_inertia(body)
     mass, length = body_size(body)
     com = P[:3, 3] / mass
-    second = P[:3, :3] - mass * np.outer(com, com)
-    values, axes = np.linalg.eigh(second)
+    values, axes = np.linalg.eigh(P[:3, :3] - mass * np.outer(com, com))
     least = mass * (_MIN_THICKNESS * length) ** 2
     P[:3, :3] = axes @ np.diag(np.maximum(values, least)) @ axes.T + mass * np.outer(com, com)
     return body_parameters(P)

@@ -299,8 +299,11 @@ def warn_delays(
                 " motion"
             )
     if messages:
-        text = f"{', '.join(messages)}: record them with one clock, or shift them"
-        warnings.warn(text, CraneWarning, stacklevel=3)
+        warnings.warn(
+            f"{', '.join(messages)}: record them with one clock, or shift them",
+            CraneWarning,
+            stacklevel=3,
+        )
 
 
 def warn_validation(training: ForceComparison, validation: ForceComparison) -> None:

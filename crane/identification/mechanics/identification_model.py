@@ -75,8 +75,7 @@ class IdentificationModel:
             )
         self.nominal = np.concatenate([term.nominal for term in self.terms])
         self.nonnegative = tuple(sign for term in self.terms for sign in term.nonnegative)
-        has_bodies = isinstance(self.terms[0], InertialTerm)
-        self.bodies = body_names(machine) if has_bodies else ()
+        self.bodies = body_names(machine) if isinstance(self.terms[0], InertialTerm) else ()
         estimated_springs = {
             name.removesuffix(".gas_scale") for name in self.names if name.endswith(".gas_scale")
         }
@@ -226,8 +225,7 @@ def _default_kinds(machine: Machine) -> dict[str, dict[str, TermValues]]:
     }
     for joint in machine.joints:
         law = machine.friction.get(joint)
-        has_coulomb = law is not None and law.coulomb > 0
-        kinds = ("coulomb", "viscous") if has_coulomb else ("viscous",)
+        kinds = ("coulomb", "viscous") if law is not None and law.coulomb > 0 else ("viscous",)
         values_by_element.setdefault(joint, dict.fromkeys(kinds, ()))
     return values_by_element
 

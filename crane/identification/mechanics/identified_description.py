@@ -232,8 +232,7 @@ def replace_inertials(
         fixed_links: Links fixed to one of these, whose inertials are removed.
         origin_text: Source of the values, for a comment.
     """
-    parser = etree.XMLParser(resolve_entities=False, no_network=True)
-    tree = etree.parse(str(file), parser)
+    tree = etree.parse(str(file), etree.XMLParser(resolve_entities=False, no_network=True))
     robot = tree.getroot()
     for link in robot.iterfind("link"):
         name = link.get("name").strip()

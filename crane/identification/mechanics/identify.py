@@ -143,8 +143,9 @@ def identify(
     elif not feasible:
         T = equations.base.grouping
         check_identifiable(model.names, equations.stacked_factors(T), known_prior)
-    start = equations.base.values(model.nominal)
-    equations, estimate = equations.estimate(T, METHODS[method], estimator_prior, start)
+    equations, estimate = equations.estimate(
+        T, METHODS[method], estimator_prior, equations.base.values(model.nominal)
+    )
     values, covariance, parameters = estimate.values, estimate.covariance, None
     if feasible:
         estimate = feasible_estimate(

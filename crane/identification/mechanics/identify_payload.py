@@ -285,13 +285,12 @@ class _PayloadCase:
 
     def _force_comparison(self, equations: RegressionEquations, values: Array) -> ForceComparison:
         load_forces = equations.forces - equations.offset
-        joints = self.machine.active
         return ForceComparison(
             equations.time,
             load_forces,
             equations.modelled_forces(values),
             equations.is_moving,
-            joints,
+            self.machine.active,
         )
 
     def is_uncertain(self, estimate: PayloadEstimate) -> bool:
@@ -304,8 +303,13 @@ class _PayloadCase:
         self, friction_corrections: dict[str, float], com: Array
     ) -> tuple[float, float] | None:
         """See `static_mass`."""
-        load = PayloadTerm(self.machine, self.frame, 4)
-        return static_mass(self.machine, load, self.motion, friction_corrections, com)
+        return static_mass(
+            self.machine,
+            PayloadTerm(self.machine, self.frame, 4),
+            self.motion,
+            friction_corrections,
+            com,
+        )
 
 
 def _widen_covariance(

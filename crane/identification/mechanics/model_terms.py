@@ -92,8 +92,11 @@ class ForceDirection:
     def jacobian(self, machine: Machine, samples: MotionSamples) -> Array:
         """Derivatives (N, n) of the coordinate by q_A."""
         if self.between is not None:
-            length_derivatives = FrameDistances(machine, [self.between]).evaluate(samples.q)[1]
-            return np.einsum("ki,kij->kj", length_derivatives[:, 0], samples.gamma)
+            return np.einsum(
+                "ki,kij->kj",
+                FrameDistances(machine, [self.between]).evaluate(samples.q)[1][:, 0],
+                samples.gamma,
+            )
         if self.factors is None:
             return samples.gamma[:, machine.column(self.name)]
         row = np.zeros(len(machine.active))
@@ -145,8 +148,9 @@ def body_names(machine: Machine) -> tuple[str, ...]:
     model = machine.model
     names = []
     for joint in range(1, model.njoints):
-        frames = [f for f in model.frames if f.parentJoint == joint and f.type.name == "BODY"]
-        names.append(frames[0].name)
+        names.append(
+            [f for f in model.frames if f.parentJoint == joint and f.type.name == "BODY"][0].name
+        )
     return tuple(names)
 
 
@@ -318,8 +322,7 @@ class FrictionalMemory(ModelTerm):
         v = np.einsum("ij,ij->i", rows, samples.v_a)
         share = -np.expm1(-samples.step / self._lag)  # exact for constant speed
         w, state = np.empty_like(v), samples.term_states.get(self, np.zeros(1))
-        edges = sorted({0, *samples.starts, len(v)})
-        for start, end in pairwise(edges):
+        for start, end in pairwise(sorted({0, *samples.starts, len(v)})):
             state = np.zeros(1) if start in samples.starts else state
             w[start:end], state = lfilter([share], [1, share - 1], np.abs(v[start:end]), zi=state)
         samples.term_states[self] = state

@@ -238,8 +238,9 @@ class RegressionEquations:
     def compare(self, values: Array) -> ForceComparison:
         """Measured and modelled forces for parameters (r,)."""
         modelled = self.modelled_forces(values) + self.offset
-        joints = self._model.machine.active
-        return ForceComparison(self.time, self.forces, modelled, self.is_moving, joints)
+        return ForceComparison(
+            self.time, self.forces, modelled, self.is_moving, self._model.machine.active
+        )
 
     @cached_property
     def _row_indices(self) -> tuple[np.ndarray, np.ndarray]:
@@ -255,8 +256,7 @@ class RegressionEquations:
     @cached_property
     def groups(self) -> np.ndarray:
         """Groups (m,) of the used rows: joints 0, 1, ... without those that have no rows."""
-        there = self.is_moving.any(axis=0)
-        return (np.cumsum(there) - 1).astype(np.int8)[self._row_indices[1]]
+        return (np.cumsum(self.is_moving.any(axis=0)) - 1).astype(np.int8)[self._row_indices[1]]
 
     @cached_property
     def y(self) -> Array:
@@ -306,8 +306,13 @@ class RegressionEquations:
         has_free_joints = bool(self._model.machine.free)
         for _ in range(_MAX_ITERATIONS):
             equations = equations.at_values(values) if has_free_joints else equations
-            W = equations.projected_regressor(T)
-            found = estimator(W, equations.y, equations.groups, equations.samples, prior)
+            found = estimator(
+                equations.projected_regressor(T),
+                equations.y,
+                equations.groups,
+                equations.samples,
+                prior,
+            )
             if not has_free_joints or previous is not None and _is_converged(found, previous):
                 break
             values, previous = T @ found.values, found.values
@@ -360,8 +365,7 @@ class ProjectedRegressor:
 
     def triangular_factors(self, y: Array, groups: np.ndarray) -> Array:
         """See `regressor.triangular_factors`."""
-        size = self.shape[1]
-        T = np.zeros((len(self._T) + 1, size + 1))
+        T = np.zeros((len(self._T) + 1, self.shape[1] + 1))
         T[:-1, :-1], T[-1, -1] = self._T, 1.0
         return np.array([triangular_factor(R @ T) for R in self._equations.triangular_factors])
 

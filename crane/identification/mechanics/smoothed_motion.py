@@ -143,8 +143,9 @@ def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trus
     limits = np.column_stack([machine.lower, machine.upper])
     bounded = limits if np.isfinite(limits).all() else None
     units = {joint: machine.unit(joint) for joint in machine.active}
-    free = machine.free
-    check_recording(time, q, tau, machine.active, units, recorded, bounded, free=free, trust=trust)
+    check_recording(
+        time, q, tau, machine.active, units, recorded, bounded, free=machine.free, trust=trust
+    )
 
 
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
@@ -181,11 +182,12 @@ def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
     """Warn of joints that have noise, but no motion: static friction makes any force."""
     for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
         joint, place = machine.active[i], float(found.q[:, i].mean())
-        text = (
+        warnings.warn(
             f"'{joint}' stands still but for noise: its forces are not informative, move it, or "
-            f"lock it ({joint}={place:.4g})"
+            f"lock it ({joint}={place:.4g})",
+            CraneWarning,
+            stacklevel=3,
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, trust: bool) -> Array:
@@ -317,8 +319,11 @@ def remove_outliers(
         messages.append(f"{bad.sum()} in '{name}' ({first})")
         column[:] = replace_outliers(column, bad)
     if messages:
-        text = f"outliers are left out and bridged: {', '.join(messages)} of {len(time)} samples"
-        warnings.warn(text, CraneWarning, stacklevel=3)
+        warnings.warn(
+            f"outliers are left out and bridged: {', '.join(messages)} of {len(time)} samples",
+            CraneWarning,
+            stacklevel=3,
+        )
     return columns
 
 
@@ -333,8 +338,11 @@ def warn_hum(time: Array, columns: Mapping[str, Array], min_frequency: float) ->
             share = 100 * found[1] / float(np.std(column))
             messages.append(f"'{name}' of {found[0]:.3g} Hz ({found[1]:.3g}, {share:.2g} % of it)")
     if messages:
-        text = f"hum in {', '.join(messages)}: keep the bandwidth well below it"
-        warnings.warn(text, CraneWarning, stacklevel=3)
+        warnings.warn(
+            f"hum in {', '.join(messages)}: keep the bandwidth well below it",
+            CraneWarning,
+            stacklevel=3,
+        )
 
 
 def check_recording(

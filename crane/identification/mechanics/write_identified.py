@@ -126,9 +126,8 @@ def check_rewritable(machine: Machine) -> None:
     Raises:
         InputError: The format is not supported, or the machine has parameter changes.
     """
-    urdf = machine.path.suffix.lower() == ".urdf"
     if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
-        not urdf and is_parallel_robot(machine.path)
+        not (machine.path.suffix.lower() == ".urdf") and is_parallel_robot(machine.path)
     ):
         raise InputError(
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
@@ -351,8 +350,9 @@ def _check_written_machine(
             parameter_values[first : first + len(term.names)] = 0.0
         first += len(term.names)
     expected_forces = model.regressor(at) @ parameter_values + model.known_forces(at)
-    dynamics = Dynamics(written, backend="pinocchio")
-    written_forces = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=exact)
+    written_forces = Dynamics(written, backend="pinocchio").inverse(
+        at.q_a, at.v_a, at.a_a, friction=exact
+    )
     force_differences = np.abs(written_forces - expected_forces).max(axis=0)
     if force_differences.max() <= _FORCE_TOLERANCE * np.abs(expected_forces).max():
         return

@@ -142,8 +142,7 @@ def resample(time: Array, columns: Array, step: float) -> tuple[Array, Array]:
 
     as_number(step, "the step", "s", greater_than=0)
     check_gaps(time)
-    count = math.floor((time[-1] - time[0]) / step * (1 + 1e-9)) + 1
-    instants = time[0] + step * np.arange(count)
+    instants = time[0] + step * np.arange(math.floor((time[-1] - time[0]) / step * (1 + 1e-9)) + 1)
     return instants, CubicSpline(time, columns)(instants)
 
 
@@ -239,8 +238,7 @@ def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array,
             f"{len(time) * step:g} s hold fewer than two periods of {period:g} s, record longer"
         )
     stacked = x[: periods * count].reshape(periods, count, *x.shape[1:])
-    error = stacked.std(axis=0, ddof=1) / math.sqrt(periods)
-    return time[:count], stacked.mean(axis=0), error
+    return time[:count], stacked.mean(axis=0), (stacked.std(axis=0, ddof=1) / math.sqrt(periods))
 
 
 def filter_rows(
@@ -299,8 +297,7 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
         whole = upfirdn(weights, np.pad(x, edges), down=decimation, axis=0)
         return np.asarray(whole[kept_samples][: -(-count // decimation)])
 
-    weight_sums = convolved(np.ones(count))
-    return convolved(x) / weight_sums.reshape(-1, *[1] * (x.ndim - 1))
+    return convolved(x) / convolved(np.ones(count)).reshape(-1, *[1] * (x.ndim - 1))
 
 
 def is_moving(v: Array, threshold: ArrayLike) -> np.ndarray:
