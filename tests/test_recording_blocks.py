@@ -9,6 +9,7 @@ from pathlib import Path
 import forwarder_motions
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import crane
 from crane.identification.estimation import regression_problem, regressor
@@ -22,7 +23,10 @@ from crane.identification.mechanics import regression_equations
 from crane.identification.mechanics.identification_model import IdentificationModel, default_terms
 from crane.identification.mechanics.identify import build_equations, identify
 from crane.identification.mechanics.model_terms import PreslidingFriction
-from crane.identification.mechanics.regression_equations import RegressionEquations
+from crane.identification.mechanics.regression_equations import (
+    ProjectedRegressor,
+    RegressionEquations,
+)
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals.signal_processing import Motion, filter_rows
 
@@ -78,7 +82,7 @@ def test_covariance_is_that_of_all_rows_at_once():
     found = least_squares(W, y, groups - 1, samples)
     noise = NoiseModel.fit(found.residuals / found.noise, samples)
     impulse = np.eye(1, 2000)
-    answer, _ = noise.apply_filter(impulse, noise.zero_state(1))
+    answer = lfilter([1.0], noise.a, impulse)
     lags = np.correlate(answer[0], answer[0], "full")[1999:]
     C = toeplitz(lags)[samples][:, samples]
     inverse = np.linalg.inv(W.T @ W)
@@ -141,7 +145,7 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
         rows, base = build_equations(
             IdentificationModel(mini), [Motion(time, *parts)], bandwidth=100.0
         )
-        columns = rows.projected_regressor(rows.column_selection(base))
+        columns = ProjectedRegressor(rows, rows.column_selection(base))
         assert len(list(columns.blocks())) >= copies
         assert max(sizes) < 1.5 * (1 << 21)  # with what the filter needs around
         assert sum(W.nbytes for W in rows._block_cache.values()) <= 1 << 20

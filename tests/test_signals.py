@@ -10,7 +10,11 @@ from scipy.linalg import block_diag
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics.force_comparison import check_forces
-from crane.identification.mechanics.smoothed_motion import check_recording, check_samples, signal_delay
+from crane.identification.mechanics.smoothed_motion import (
+    check_recording,
+    check_samples,
+    signal_delay,
+)
 from crane.identification.signals import kalman_smoother
 from crane.identification.signals import signal_processing as signals
 from crane.identification.signals.signal_processing import Motion, differentiate

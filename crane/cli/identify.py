@@ -260,7 +260,7 @@ def identify(
         with progress_bar("cross-validating") as progress:
             tried_settings = cross_validate(loaded, inside, trials, progress, **settings)
         print(f"{format_trials(tried_settings)}\n")
-        settings = identify_options(tried_settings[0], settings)
+        settings = identify_options(tried_settings[0].settings, settings)
     with progress_bar("identifying") as progress:
         result = estimate(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:

@@ -5,7 +5,7 @@ A message is one line that says what is wrong, where, and what to do about it.
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import SequenceMatcher, get_close_matches
@@ -155,6 +155,24 @@ def suggest_names(names: Iterable[str], unknown_name: str | None = None) -> str:
         return f"known: {', '.join(sorted(names)[:_NEAREST])} and {len(names) - _NEAREST} more"
     listed = sorted(names, key=lambda name: (-_likeness(name, unknown_name), name))[:_NEAREST]
     return f"the nearest of {len(names)} known ones are {', '.join(listed)}"
+
+
+def check_name(
+    name: str, names: Collection[str], problem: str, error: type[CraneError] = InputError
+) -> None:
+    """Check that a name is among those that are known.
+
+    Args:
+        name: The name.
+        names: Those that are known.
+        problem: What is wrong if it is not; the names that are meant are appended.
+        error: Class of the error.
+
+    Raises:
+        CraneError: The name is not known.
+    """
+    if name not in names:
+        raise error(f"{problem}, {suggest_names(names, name)}")
 
 
 def _likeness(name: str, wanted: str) -> float:

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import CraneError, InputError, RecordingError, prefix_location
-from crane.common.errors import suggest_names as known_names
+from crane.common.errors import CraneError, InputError, RecordingError, check_name, prefix_location
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
@@ -237,8 +236,7 @@ def _read_case(
     try:
         compared = simulated_columns(machine, table)
         for name in sensors or ():
-            if name not in compared:
-                raise InputError(f"'{name}' cannot be compared, {known_names(compared, name)}")
+            check_name(name, compared, f"'{name}' cannot be compared")
         compared = compared if sensors is None else list(sensors)
         return recording_case(
             machine, Path(path).name, table, known_sensors(table, machine), compared, window

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.description.machine_parameters import unknown_parameter_text
 from crane.description.sensors import INCLINATION_PREFIX, SENSOR_PREFIX
 from crane.description.specification import MachineSpec
@@ -113,13 +113,8 @@ def _build_unknown(
     start, low, high = _read_bounds(name, given)
     if name.startswith(SENSOR_PREFIX):
         column, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
-        if column not in sensor_units:
-            raise InputError(f"'{name}' is of no sensor, {suggest_names(sensor_units, column)}")
-        if what not in SENSOR_PARAMETER_DEFAULTS:
-            raise InputError(
-                f"'{name}': a sensor has no '{what}', "
-                f"{suggest_names(SENSOR_PARAMETER_DEFAULTS, what)}"
-            )
+        check_name(column, sensor_units, f"'{name}' is of no sensor")
+        check_name(what, SENSOR_PARAMETER_DEFAULTS, f"'{name}': a sensor has no '{what}'")
         described = parameters.get(name, SENSOR_PARAMETER_DEFAULTS[what])
         size = _DELAY_SCALE if what == "delay" else _ZERO_SCALES.get(sensor_units[column], 1.0)
         size = 0.05 if what == "scale" else size

@@ -9,7 +9,7 @@ import yaml
 from numpy.typing import ArrayLike
 
 from crane.common.atomic_output import replace_file
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_count, as_number, as_seed
@@ -235,10 +235,7 @@ def excite(
         InputError: Arguments are out of range, or no trajectory is within the limits.
     """
     progress = progress_reporter(progress)
-    if criterion not in CRITERIA:
-        raise InputError(
-            f"criterion '{criterion}' is unknown, {suggest_names(CRITERIA, criterion)}"
-        )
+    check_name(criterion, CRITERIA, f"criterion '{criterion}' is unknown")
     for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):
         as_count(value, f"the number of {what}")
     period = as_number(period, "the period", "s", greater_than=0)

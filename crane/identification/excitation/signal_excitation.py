@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import format_count
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
@@ -198,10 +198,7 @@ def excite_valves(
     """
     progress = progress_reporter(progress)
     require_circuit(machine)
-    if criterion not in CRITERIA:
-        raise InputError(
-            f"criterion '{criterion}' is unknown, {suggest_names(CRITERIA, criterion)}"
-        )
+    check_name(criterion, CRITERIA, f"criterion '{criterion}' is unknown")
     step = as_number(step, "the step", "s", greater_than=0, max_magnitude=_MAX_STEP)
     duration = as_number(duration, "the duration", "s", greater_than=0)
     if step < _MIN_STEP or duration < _MIN_DURATION:

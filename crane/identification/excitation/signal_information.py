@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number
 from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.description.sensors import INCLINATION_PREFIX, VALVE_SIGNAL_PREFIX, VELOCITY_SUFFIX
@@ -88,10 +88,7 @@ class SignalInformation:
         given = {x: y.noise for x, y in machine.sensors.items() if y.noise and x in self.units}
         given |= noise or {}
         for name in given:
-            if name not in self.units:
-                raise InputError(
-                    f"noise of '{name}', which is not measured, {suggest_names(self.units, name)}"
-                )
+            check_name(name, self.units, f"noise of '{name}', which is not measured")
         self.noise = np.array([_noise_std(name, given, unit) for name, unit in self.units.items()])
         signals = {VALVE_SIGNAL_PREFIX + joint: "V" for joint in joints}
         simulated_columns(machine, Table(self.units, np.zeros((0, len(self.units))), {}))
@@ -183,8 +180,7 @@ def _triangular_factor(matrix: Array) -> Array:
 def _sensor_unit(available_units: Mapping[str, str], name: str) -> str:
     if name.startswith(INCLINATION_PREFIX):
         return "rad/s" if name.endswith(VELOCITY_SUFFIX) else "rad"
-    if name not in available_units:
-        raise InputError(f"'{name}' cannot be compared, {suggest_names(available_units, name)}")
+    check_name(name, available_units, f"'{name}' cannot be compared")
     return available_units[name]
 
 

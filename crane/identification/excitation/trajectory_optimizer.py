@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.common.errors import ClosureError, InputError, suggest_names
+from crane.common.errors import ClosureError, InputError, check_name
 from crane.common.samples import Array, as_number
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.excitation.fisher_information import FisherInformation
@@ -148,10 +148,7 @@ def joint_values(
     """
     out = default.copy()
     for joint, value in (given or {}).items():
-        if joint not in machine.active:
-            raise InputError(
-                f"{what} of '{joint}', which is not active, {suggest_names(machine.active, joint)}"
-            )
+        check_name(joint, machine.active, f"{what} of '{joint}', which is not active")
         out[machine.active.index(joint)] = as_number(
             value, f"{what} of '{joint}'", "", greater_than=0
         )

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import RecordingError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
 from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
+from crane.identification.estimation.regression_problem import Estimate, EstimatedValues
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_quality import steady_samples
 from crane.machine.machine import Machine
@@ -37,7 +37,7 @@ _STRIBECK_GRID_SIZE = 40  # stribeck velocities tried before the fit
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CylinderFriction(Result):
+class CylinderFriction(EstimatedValues, Result):
     """Identified friction of one joint.
 
     Attributes:
@@ -66,15 +66,6 @@ class CylinderFriction(Result):
     def names(self) -> tuple[str, ...]:
         """Names of the values."""
         return PARAMETER_NAMES[: len(self.values)]
-
-    @property
-    def std(self) -> Array:
-        """Standard errors."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (p, 2) of a level."""
-        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     @property
     def friction(self) -> Friction:
@@ -130,10 +121,7 @@ def identify_cylinder_friction(
         InputError: The joint is not active.
         RecordingError: The recording is not suitable, or does not determine the parameters.
     """
-    if joint not in machine.active:
-        raise InputError(
-            f"'{joint}' is not an active joint, {suggest_names(machine.active, joint)}"
-        )
+    check_name(joint, machine.active, f"'{joint}' is not an active joint")
     index = machine.active.index(joint)
     motion = smoothed_motion(machine, recording)
     load = Dynamics(machine).inverse(motion.q, motion.v, motion.a)[:, index]

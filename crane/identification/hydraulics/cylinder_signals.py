@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.samples import Array
 from crane.hydraulics.components import Cylinder, Valve
 from crane.identification.signals.signal_processing import (
@@ -63,8 +63,7 @@ def cylinder_and_valve(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     circuit = machine.hydraulics
     if circuit is None:
         raise InputError(f"'{machine.name}' has no hydraulics, add the section to its file")
-    if joint not in circuit.cylinders:
-        raise InputError(f"'{joint}' has no cylinder, {suggest_names(circuit.cylinders, joint)}")
+    check_name(joint, circuit.cylinders, f"'{joint}' has no cylinder")
     if circuit.valves[joint].spool_b:
         raise InputError(
             f"the valve of '{joint}' has two spools, which this method does not separate: fit "
@@ -85,10 +84,7 @@ def joint_index(recording: Recording, joint: str) -> int:
     Raises:
         RecordingError: It is not recorded.
     """
-    if joint not in recording.joints:
-        raise RecordingError(
-            f"'{joint}' is not recorded, {suggest_names(recording.joints, joint)}"
-        )
+    check_name(joint, recording.joints, f"'{joint}' is not recorded", RecordingError)
     return recording.joints.index(joint)
 
 
@@ -110,10 +106,7 @@ def channel_values(recording: Recording, name: str, unit: str) -> Array:
     Raises:
         RecordingError: The channel is missing, or has another unit.
     """
-    if name not in recording.channels:
-        raise RecordingError(
-            f"channel '{name}' [{unit}] is missing, {suggest_names(recording.channels, name)}"
-        )
+    check_name(name, recording.channels, f"channel '{name}' [{unit}] is missing", RecordingError)
     given = recording.channel_units.get(name, "")
     if given not in ("", unit):
         raise RecordingError(f"channel '{name}' is in {given}, give {unit}")
@@ -233,8 +226,7 @@ def signal_noise(
         InputError: A sensor is unknown.
     """
     for name in given or {}:
-        if name not in SIGNAL_NAMES:
-            raise InputError(f"sensor '{name}' is unknown, {suggest_names(SIGNAL_NAMES, name)}")
+        check_name(name, SIGNAL_NAMES, f"sensor '{name}' is unknown")
     return {name: noise_std(getattr(signals, name)) for name in SIGNAL_NAMES} | (given or {})
 
 

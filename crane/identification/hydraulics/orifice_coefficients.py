@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import confidence_intervals
+from crane.identification.estimation.regression_problem import EstimatedValues
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,
     cylinder_and_valve,
@@ -56,7 +56,7 @@ _UNIDENTIFIABLE_REASONS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OrificeCoefficients(Result):
+class OrificeCoefficients(EstimatedValues, Result):
     """Identified bulk modulus and orifice coefficients of one cylinder.
 
     Attributes:
@@ -85,18 +85,9 @@ class OrificeCoefficients(Result):
     training_sides: tuple[EquationSides, ...] = ()
 
     @property
-    def std(self) -> Array:
-        """Standard errors (5,)."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
     def bulk_modulus(self) -> float:
         """Bulk modulus beta [Pa]; infinite if the estimate of 1/beta is negative."""
         return 1 / float(self.values[0]) if self.values[0] > 0 else np.inf
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (5, 2) of a level."""
-        return confidence_intervals(self.values, self.std, self.degrees_of_freedom, level)
 
     def predict(self, recording: Recording, period: float | None = None) -> EquationSides:
         """Both sides of (29) on another recording, as means over windows.
@@ -182,8 +173,7 @@ def identify_orifices(
         InputError: The method, joint or sensor is unknown, or parameters are not identifiable.
         RecordingError: Columns are missing, or samples are not suitable.
     """
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    check_name(method, METHODS, f"method '{method}' is unknown")
     cylinder, _ = cylinder_and_valve(machine, joint)
     if cylinder.counterbalance_a or cylinder.counterbalance_b:
         raise InputError(

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
-from crane.common.errors import InputError
-from crane.common.errors import suggest_names as known_names
+from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number, as_sample
 from crane.description.estimation_settings import ParameterPrior
 from crane.identification.estimation.regression_problem import Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
-from crane.identification.mechanics.feasible_parameters import body_size
+from crane.identification.mechanics.feasible_parameters import body_size, body_units
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.signals.signal_processing import Motion
 from crane.machine.machine import Machine
@@ -60,7 +59,7 @@ def parameter_magnitudes(
     usual = tuple(np.mean(heavy, axis=0).tolist())
     for i, size in enumerate(sizes):
         mass, length = size if min(size) > 0 else usual
-        out[10 * i : 10 * i + 10] = mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
+        out[10 * i : 10 * i + 10] = body_units(mass, length)
     force = np.linalg.norm(factors[:, :, -1], axis=1)
     # for free joints the norm of the described force components
     parts = np.linalg.norm(factors[:, :, :-1], axis=1) * base.values(model.nominal)
@@ -193,8 +192,7 @@ def prior_from_names(
             std[i] = size or (parameter_sizes[i] or 1.0)
         place = name.rpartition(".")[0]
         if not bodies and not others and not fnmatch.filter(model.machine.locked_joints, place):
-            names = (*model.bodies, *model.names[count:])
-            raise InputError(f"prior '{name}' is unknown, {known_names(names, name)}")
+            check_name(name, (*model.bodies, *model.names[count:]), f"prior '{name}' is unknown")
     return mean, std
 
 

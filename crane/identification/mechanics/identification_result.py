@@ -14,7 +14,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_table
-from crane.identification.estimation.regression_problem import Estimate, confidence_intervals
+from crane.identification.estimation.regression_problem import Estimate, EstimatedValues
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions
@@ -26,7 +26,7 @@ _MAX_SHOWN = 3  # directions in a table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification(Result):
+class Identification(EstimatedValues, Result):
     """Result of an identification.
 
     Attributes:
@@ -88,13 +88,9 @@ class Identification(Result):
         return tuple(self.base.names[i] for i in self.base.independent)
 
     @property
-    def std(self) -> Array:
-        """Standard deviations (r,)."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # negative by rounding only
-
-    def interval(self, level: float = 0.95) -> Array:
-        """Confidence intervals (r, 2) of a level."""
-        return confidence_intervals(self.values, self.std, self.estimate.degrees_of_freedom, level)
+    def degrees_of_freedom(self) -> float:  # type: ignore[override]
+        """Degrees of freedom of the covariance."""
+        return self.estimate.degrees_of_freedom
 
     @cached_property
     def marks(self) -> tuple[str, ...]:

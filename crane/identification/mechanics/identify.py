@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import CraneWarning, InputError, RecordingError, suggest_names
+from crane.common.errors import CraneWarning, InputError, RecordingError, check_name, suggest_names
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number, as_sample
 from crane.common.threads import with_single_threaded_blas
@@ -40,6 +40,7 @@ from crane.identification.mechanics.identification_model import IdentificationMo
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.model_terms import FrictionTerm, ModelTerm, body_names
 from crane.identification.mechanics.regression_equations import (
+    ProjectedRegressor,
     RegressionEquations,
     is_long_enough,
 )
@@ -119,8 +120,7 @@ def identify(
         RecordingError: A recording is not suitable, or does not determine any parameter.
     """
     progress = progress_reporter(progress)
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    check_name(method, METHODS, f"method '{method}' is unknown")
     model = IdentificationModel(machine, terms)
     if feasible:
         if not model.bodies:
@@ -133,14 +133,12 @@ def identify(
     if model.bodies:
         _check_forces(model, motions, equations, trust)
     selection = equations.column_selection(identifiable)
-    columns = equations.projected_regressor(selection)
+    columns = ProjectedRegressor(equations, selection)
     factors = columns.triangular_factors(equations.y, equations.groups)
     parameter_sizes = parameter_magnitudes(model, identifiable, factors)
-    known_prior = _build_prior(model, prior, equations.base, parameter_sizes, feasible)
+    known_prior = _build_prior(model, prior, equations, parameter_sizes, feasible)
     estimator_prior, T = (None, selection) if feasible else (known_prior, selection)
-    if known_prior is None:
-        _check_mass_scale(machine, equations)
-    elif not feasible:
+    if known_prior is not None and not feasible:
         T = equations.base.grouping
         check_identifiable(model.names, equations.stacked_factors(T), known_prior)
     equations, estimate = equations.estimate(
@@ -187,21 +185,6 @@ def identify(
     return identification
 
 
-def _check_mass_scale(machine: Machine, equations: RegressionEquations) -> None:
-    """Check that the mass scale is determined: not all forces are zero.
-
-    Raises:
-        RecordingError: All forces are zero.
-    """
-    if machine.free and not equations.y.any():
-        body = body_names(machine)[-1]
-        raise RecordingError(
-            "nothing drives what moves in this recording: it determines ratios of masses only; "
-            f"give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} "
-            f"(--prior {body}.m=100+-1)"
-        )
-
-
 def _compare_held_out(
     model: IdentificationModel,
     base: BaseParameters,
@@ -218,42 +201,51 @@ def _compare_held_out(
         held_out = RegressionEquations(model, base, long_motions, bandwidth, slow_speeds, progress)
         if held_out.is_moving.any():
             comparison = held_out.compare(values)
-    if comparison is None or len(long_motions) < len(motions):
-        _warn_short_validations(motions, long_motions, bandwidth)
-    return comparison
-
-
-def _warn_short_validations(
-    motions: Sequence[Motion], long_motions: Sequence[Motion], bandwidth: float
-) -> None:
-    """Warn of held-out data that are not usable."""
     short_count = len(motions) - len(long_motions)
-    text = (
-        f"{short_count} of {len(motions)} held-out recordings are too short for a low-pass of "
-        f"{bandwidth:g} Hz and are not used"
-        if short_count
-        else "no held-out recording moves faster than standstill, none is used"
-    )
-    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=5)
+    if short_count:
+        text = (
+            f"{short_count} of {len(motions)} held-out recordings are too short for a low-pass of "
+            f"{bandwidth:g} Hz and are not used"
+        )
+    else:
+        text = "no held-out recording moves faster than standstill, none is used"
+    if short_count or comparison is None:
+        warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
+    return comparison
 
 
 def _build_prior(
     model: IdentificationModel,
     given: float | Mapping[str, object] | Prior | None,
-    base: BaseParameters,
+    equations: RegressionEquations,
     parameter_sizes: Array,
     feasible: bool,
 ) -> Prior | None:
-    """Prior means and standard deviations (p,) of all parameters; None without a prior."""
+    """Prior means and standard deviations (p,) of all parameters; None without a prior.
+
+    Raises:
+        InputError: The prior is not valid.
+        RecordingError: Without a prior nothing determines the scale of masses, as all forces are
+            zero.
+    """
     known = dict(model.machine.estimation.prior)
     if given is not None:
         if not isinstance(given, Mapping | int | float):
-            return check_prior(model, base, given, feasible)
+            return check_prior(model, equations.base, given, feasible)
         given_priors = read_priors(given)  # takes precedence over the machine file
         known = {
             name: what for name, what in known.items() if name not in given_priors
         } | given_priors
-    return prior_from_names(model, known, parameter_sizes) if known else None
+    if known:
+        return prior_from_names(model, known, parameter_sizes)
+    if model.machine.free and not equations.y.any():
+        body = body_names(model.machine)[-1]
+        raise RecordingError(
+            "nothing drives what moves in this recording: it determines ratios of masses only; "
+            f"give a prior of one mass, as prior={{'{body}.m': '100 +- 1'}} "
+            f"(--prior {body}.m=100+-1)"
+        )
+    return None
 
 
 def _check_forces(

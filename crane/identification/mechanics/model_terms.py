@@ -1,18 +1,17 @@
-"""Terms of an identification model: bodies, rotors, friction, gas springs, known shapes."""
+"""Terms of an identification model: bodies, rotors, friction, gas springs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
 
-from crane.common.errors import InputError, suggest_names
+from crane.common.errors import InputError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
-from crane.dynamics.frame_jacobians import FrameDistances
 from crane.dynamics.joint_forces import JointForces
 from crane.machine.machine import Machine
 
@@ -65,60 +64,63 @@ class ModelTerm(Protocol):
 
 @dataclass(frozen=True)
 class ForceDirection:
-    """Direction of a force: a joint of the tree, a combination of active joints, or a distance.
+    """Direction of a force: a joint of the tree, or a combination of active joints.
 
     Attributes:
-        name: Name of the joint, or of the combination (a motor that turns two joints) or distance.
+        name: Name of the joint, or of the combination (a motor that turns two joints).
         factors: Factors by active joint; None for the joint `name`.
-        between: The two links of a distance.
     """
 
     name: str
     factors: Mapping[str, float] | None = None
-    between: tuple[str, str] | None = None
-
-    def has_locked_joint(self, machine: Machine) -> bool:
-        """Whether it combines joints of which one is locked."""
-        return any(joint in machine.locked_joints for joint in self.factors or ())
 
     def coordinate(self, machine: Machine, samples: MotionSamples) -> Array:
         """Coordinate (N,) along the direction [m], [rad]."""
-        if self.between is not None:
-            return FrameDistances(machine, [self.between]).evaluate(samples.q)[0][:, 0]
         if self.factors is None:
             return samples.q[:, machine.column(self.name)]
         return np.einsum("ij,ij->i", self.jacobian(machine, samples), samples.q_a)
 
     def jacobian(self, machine: Machine, samples: MotionSamples) -> Array:
         """Derivatives (N, n) of the coordinate by q_A."""
-        if self.between is not None:
-            return np.einsum(
-                "ki,kij->kj",
-                FrameDistances(machine, [self.between]).evaluate(samples.q)[1][:, 0],
-                samples.gamma,
-            )
         if self.factors is None:
             return samples.gamma[:, machine.column(self.name)]
         row = np.zeros(len(machine.active))
         for joint, factor in self.factors.items():
-            if joint not in machine.active:
-                raise InputError(
-                    f"'{self.name}' combines '{joint}', which is not active, "
-                    f"{suggest_names(machine.active, joint)}"
-                )
+            check_name(
+                joint, machine.active, f"'{self.name}' combines '{joint}', which is not active"
+            )
             row[machine.active.index(joint)] = factor
         return np.broadcast_to(row, samples.v_a.shape)
 
 
-def resolve_direction(machine: Machine, given: str | ForceDirection) -> ForceDirection:
-    """Direction of a joint's name, or the given one, with a check that it exists."""
-    direction = ForceDirection(given) if isinstance(given, str) else given
-    if direction.between is not None:
-        for link in direction.between:
-            machine.frame(link)
-    elif direction.factors is None:
-        machine.column(direction.name)
-    return direction
+class DirectionalTerm(ModelTerm):
+    """Term of a force along a direction.
+
+    Args:
+        machine: The machine.
+        direction: Name of a joint, active or passive, or a combination of active ones.
+        kinds: (k,) names of the parameters along it.
+        nominal: (k,) values by the description of the machine.
+        nonnegative: (k,) whether a parameter must not be negative.
+
+    Attributes:
+        direction: The direction.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        direction: str | ForceDirection,
+        kinds: Iterable[str],
+        nominal: Sequence[float],
+        nonnegative: Iterable[bool],
+    ):
+        self.direction = ForceDirection(direction) if isinstance(direction, str) else direction
+        if self.direction.factors is None:
+            machine.column(self.direction.name)  # raises an error for an unknown joint
+        self._machine, self.nominal = machine, np.array(nominal, dtype=np.float64)
+        self.names = tuple(f"{self.direction.name}.{kind}" for kind in kinds)
+        self.nonnegative = tuple(nonnegative)
 
 
 class InertialTerm(ModelTerm):
@@ -146,15 +148,14 @@ def inertial_regressor(dynamics: Dynamics, samples: MotionSamples) -> Array:
 def body_names(machine: Machine) -> tuple[str, ...]:
     """Names of the links that the joints move, in the order of the joints."""
     model = machine.model
-    names = []
-    for joint in range(1, model.njoints):
-        names.append(
-            [f for f in model.frames if f.parentJoint == joint and f.type.name == "BODY"][0].name
-        )
-    return tuple(names)
+    links: dict[int, str] = {}  # first link of each joint
+    for frame in model.frames:
+        if frame.type.name == "BODY":
+            links.setdefault(frame.parentJoint, frame.name)
+    return tuple(links[joint] for joint in range(1, model.njoints))
 
 
-class RotorInertiaTerm(ModelTerm):
+class RotorInertiaTerm(DirectionalTerm):
     """Term of a rotor inertia along a direction s, such as that of a geared motor.
 
         tau_A = c s'' I,   c = ds/dq_A,   s'' = c^T a_A + dc^T/dt v_A.
@@ -167,12 +168,9 @@ class RotorInertiaTerm(ModelTerm):
     """
 
     def __init__(self, machine: Machine, direction: str | ForceDirection):
-        self.direction = direction = resolve_direction(machine, direction)
-        self._machine = machine
-        joint = machine.tree.joints.get(direction.name)
-        nominal = 0.0 if joint is None else joint.rotor_inertia
-        self.names, self.nominal = (f"{direction.name}.rotor_inertia",), np.array([nominal])
-        self.nonnegative = (True,)
+        super().__init__(machine, direction, ("rotor_inertia",), (0.0,), (True,))
+        if (joint := machine.tree.joints.get(self.direction.name)) is not None:
+            self.nominal[0] = joint.rotor_inertia
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""
@@ -185,7 +183,7 @@ class RotorInertiaTerm(ModelTerm):
         return (rows * rate[:, None])[:, :, None]
 
 
-class VelocityFriction(ModelTerm):
+class VelocityFriction(DirectionalTerm):
     """Friction term: known functions of the velocity along one direction times parameters.
 
     Args:
@@ -196,7 +194,6 @@ class VelocityFriction(ModelTerm):
         nonnegative: Names of parameters that must not be negative.
 
     Attributes:
-        direction: Direction of the friction.
         stribeck_velocities: Stribeck velocities [m/s], [rad/s].
     """
 
@@ -210,11 +207,10 @@ class VelocityFriction(ModelTerm):
         nominal: Mapping[str, float] | None = None,
         nonnegative: Sequence[str] = (),
     ):
-        direction = resolve_direction(machine, direction)
-        self._machine, self.direction, self._shapes = machine, direction, shapes
-        self.names = tuple(f"{direction.name}.{name}" for name in shapes)
-        self.nominal = np.array([(nominal or {}).get(name, 0.0) for name in shapes])
-        self.nonnegative = tuple(name in nonnegative for name in shapes)
+        values = [(nominal or {}).get(name, 0.0) for name in shapes]
+        signs = [name in nonnegative for name in shapes]
+        super().__init__(machine, direction, shapes, values, signs)
+        self._shapes = shapes
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""
@@ -225,13 +221,6 @@ class VelocityFriction(ModelTerm):
     def steady_forces(self, v: Array) -> Array:
         """Forces (N, k) per parameter at steady speeds (N,)."""
         return np.stack([shape(v) for shape in self._shapes.values()], axis=1)
-
-
-def smoothed_sign(smoothing: float) -> ForceShape:
-    """Function sign(v), smoothed to tanh(v / smoothing) as in the simulation."""
-    if smoothing == 0:
-        return np.sign
-    return lambda v: np.tanh(v / smoothing)
 
 
 def friction_term(
@@ -255,7 +244,11 @@ def friction_term(
     """
     name = direction if isinstance(direction, str) else direction.name
     law = machine.friction.get(name, Friction(smoothing=0.0))
-    sign = smoothed_sign(law.smoothing if smoothing is None else smoothing)
+    width = law.smoothing if smoothing is None else smoothing
+
+    def sign(v: Array) -> Array:  # as in the simulation
+        return np.tanh(v / width) if width else np.sign(v)
+
     shapes_by_kind: dict[str, ForceShape] = {
         "coulomb": sign,
         "coulomb_offset": np.ones_like,
@@ -263,10 +256,7 @@ def friction_term(
         "viscous_offset": lambda v: v * sign(v),
     }
     for kind in kinds:
-        if kind not in shapes_by_kind:
-            raise InputError(
-                f"friction '{kind}' is unknown, {suggest_names(shapes_by_kind, kind)}"
-            )
+        check_name(kind, shapes_by_kind, f"friction '{kind}' is unknown")
     shapes = {kind: shapes_by_kind[kind] for kind in kinds}
     nominal = {kind: getattr(law, kind) for kind in kinds}
     for i, v_s in enumerate(stribeck, start=1):
@@ -283,11 +273,12 @@ def friction_term(
 
 def root_friction_term(machine: Machine, direction: str | ForceDirection) -> VelocityFriction:
     """Friction term of mixed lubrication: root sign(v) sqrt |v|."""
-    shape = {"root": lambda v: np.sign(v) * np.sqrt(np.abs(v))}
-    return VelocityFriction(machine, direction, shape)
+    return VelocityFriction(
+        machine, direction, {"root": lambda v: np.sign(v) * np.sqrt(np.abs(v))}
+    )
 
 
-class FrictionalMemory(ModelTerm):
+class FrictionalMemory(DirectionalTerm):
     """Frictional memory: memory sign(v) e^-(w / speed), lag w' = |v| - w, w = 0 at the start.
 
     The friction is larger after rest than before it, as the contact changes with a lag.
@@ -302,15 +293,13 @@ class FrictionalMemory(ModelTerm):
     def __init__(
         self, machine: Machine, direction: str | ForceDirection, lag: float, speed: float
     ):
-        direction = resolve_direction(machine, direction)
+        super().__init__(machine, direction, ("memory",), (0.0,), (False,))
         if not (lag > 0 and speed > 0):
             raise InputError(
-                f"the memory of '{direction.name}' has the lag {lag:g} s and the speed {speed:g}, "
-                "give two numbers above 0"
+                f"the memory of '{self.direction.name}' has the lag {lag:g} s and the speed "
+                f"{speed:g}, give two numbers above 0"
             )
-        self._machine, self.direction, self._lag, self._speed = machine, direction, lag, speed
-        self.names, self.nominal = (f"{direction.name}.memory",), np.zeros(1)
-        self.nonnegative = (False,)
+        self._lag, self._speed = lag, speed
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""
@@ -333,7 +322,7 @@ class FrictionalMemory(ModelTerm):
         return (np.sign(v) * np.exp(-np.abs(v) / self._speed))[:, None]
 
 
-class PreslidingFriction(ModelTerm):
+class PreslidingFriction(DirectionalTerm):
     """Presliding friction: Dahl's law over the travelled distance.
 
     F = force z, dz = (1 - sign(v) z) ds / length, z = 0 at the start of a recording (Dahl, 1968).
@@ -345,12 +334,10 @@ class PreslidingFriction(ModelTerm):
     """
 
     def __init__(self, machine: Machine, direction: str | ForceDirection, length: float):
-        direction = resolve_direction(machine, direction)
+        super().__init__(machine, direction, ("presliding",), (0.0,), (True,))
         if not length > 0:
-            raise InputError(f"the length of presliding of '{direction.name}' is {length:g}")
-        self._machine, self.direction, self._length = machine, direction, length
-        self.names, self.nominal = (f"{direction.name}.presliding",), np.zeros(1)
-        self.nonnegative = (True,)
+            raise InputError(f"the length of presliding of '{self.direction.name}' is {length:g}")
+        self._length = length
 
     def columns(self, samples: MotionSamples) -> Array:
         """See `ModelTerm`."""
@@ -387,10 +374,9 @@ class GasSpringTerm(ModelTerm):
     """
 
     def __init__(self, machine: Machine, joint: str):
+        names = [spring.joint for spring in machine.gas_springs]
+        check_name(joint, names, f"joint '{joint}' has no gas spring")
         springs = [spring for spring in machine.gas_springs if spring.joint == joint]
-        if not springs:
-            names = [spring.joint for spring in machine.gas_springs]
-            raise InputError(f"joint '{joint}' has no gas spring, {suggest_names(names, joint)}")
         self._joint_forces = JointForces(machine.replace(gas_springs=tuple(springs)))
         self.names, self.nominal, self.nonnegative = (f"{joint}.gas_scale",), np.ones(1), (True,)
 
@@ -399,33 +385,3 @@ class GasSpringTerm(ModelTerm):
         return -np.einsum("kij,ki->kj", samples.gamma, self._joint_forces.gas_forces(samples.q))[
             :, :, None
         ]
-
-
-class ForceElementTerm(ModelTerm):
-    """Passive force of known shape along a joint or distance times a factor.
-
-    Args:
-        machine: The machine.
-        direction: Name of a joint, active or passive, or a combination or distance.
-        shape: Function coordinate (N,) [m], [rad] -> force in the positive direction per factor.
-        name: Name of the factor.
-        nominal: Nominal value of the factor.
-    """
-
-    def __init__(
-        self,
-        machine: Machine,
-        direction: str | ForceDirection,
-        shape: ForceShape,
-        name: str,
-        nominal: float = 0.0,
-    ):
-        self._machine, self._shape = machine, shape
-        self._direction = resolve_direction(machine, direction)
-        self.names, self.nominal = (f"{self._direction.name}.{name}",), np.array([nominal])
-        self.nonnegative = (False,)
-
-    def columns(self, samples: MotionSamples) -> Array:
-        """See `ModelTerm`."""
-        force = self._shape(self._direction.coordinate(self._machine, samples))
-        return -(self._direction.jacobian(self._machine, samples) * force[:, None])[:, :, None]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from crane.common.errors import CraneWarning, RecordingError, suggest_names
+from crane.common.errors import CraneWarning, RecordingError, check_name, suggest_names
 from crane.common.samples import Array
 from crane.description.external_forces import WRENCH_COMPONENTS
 from crane.dynamics.dynamics import Dynamics
@@ -222,9 +222,9 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
             raise RecordingError(
                 f"'{column}' is recorded in {unit}, give {_PART_UNITS[part[:-2]]}"
             )
-        if name not in frames and name not in machine.tree.links:
-            links = suggest_names(machine.tree.links, name)
-            raise RecordingError(f"'{column}' acts on no link of '{machine.name}', {links}")
+        if name not in frames:
+            problem = f"'{column}' acts on no link of '{machine.name}'"
+            check_name(name, machine.tree.links, problem, RecordingError)
         rows = wrenches.setdefault(name, np.zeros((len(values), len(WRENCH_COMPONENTS))))
         rows[:, WRENCH_COMPONENTS.index(part)] = values
     for name in frames:

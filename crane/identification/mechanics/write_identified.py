@@ -27,7 +27,6 @@ from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identified_description import (
-    FrictionLawFit,
     divide_locked_bodies,
     friction_laws,
     joint_combinations,
@@ -95,10 +94,8 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         origin_text += (
             f", {undetermined_count} of {len(identification.marks)} base parameters not determined"
         )
-    law_fits = friction_laws(identification.model, parameters, identification.speeds)
-    content, motor_urdfs = _machine_file_content(
-        identification, spec, names, origin_text, law_fits
-    )
+    laws, deviations = friction_laws(identification.model, parameters, identification.speeds)
+    content, motor_urdfs = _machine_file_content(identification, spec, names, origin_text, laws)
     with replace_folder(folder) as part:
         for chain in spec.chains:
             tree = replace_inertials(chain.urdf, bodies, _fixed_links(spec), origin_text)
@@ -110,13 +107,16 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         for name, text in motor_urdfs.items():
             (part / name).write_text(text, encoding="utf-8")
         (part / file).write_text(content, encoding="utf-8")
-        _check_written_machine(
-            identification,
-            bodies,
-            part / file,
-            exact=not any(each.max_deviation for each in law_fits.values()),
+        _check_written_machine(identification, bodies, part / file, exact=not deviations)
+    if deviations:
+        worst = max(deviations, key=lambda name: deviations[name])
+        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
+        text = (
+            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
+            "the nearest law at steady speeds is written, off by at most "
+            f"{deviations[worst]:.3g} {unit} ({worst})"
         )
-    _warn_inexact_friction(machine, law_fits)
+        warnings.warn(text, CraneWarning, stacklevel=3)
     return Path(folder) / file
 
 
@@ -183,20 +183,17 @@ def _machine_file_content(
     spec: MachineSpec,
     names: Mapping[str, str],
     origin_text: str,
-    law_fits: Mapping[str, FrictionLawFit],
+    laws: Mapping[str, Friction],
 ) -> tuple[str, dict[str, str]]:
     """Content of the machine file, and of URDF files of motors that turn several joints."""
     machine = result.described_machine
-    data: dict[str, Any]
     if machine.path.suffix.lower() == ".urdf":
-        data = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
-        loops = [dataclasses.asdict(loop) for loop in spec.loops]
-        data |= {
-            "loops": [{k: v for k, v in loop.items() if k != "source_location"} for loop in loops]
-        }
+        data: dict[str, Any] = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
+        data["loops"] = [dataclasses.asdict(loop) for loop in spec.loops]
         for loop in data["loops"]:
+            del loop["source_location"]
             loop["axis"] = list(loop["axis"])
-        data |= {"active": list(spec.active if spec.active is not None else machine.active)}
+        data["active"] = list(spec.active if spec.active is not None else machine.active)
         if machine.tip is not None:
             data["tip"] = machine.tip
     else:
@@ -212,7 +209,7 @@ def _machine_file_content(
         data["chains"].append(chain)
         data["couplings"] = [*(data.get("couplings") or ()), coupling]
         motor_urdfs[chain["urdf"]] = text
-    data["friction"] = _friction_data(result, spec, law_fits)
+    data["friction"] = _friction_data(result, spec, laws)
     data["rotor_inertia"] = _rotor_inertias(result, spec)
     scales = _parameters_of_kind(result, "gas_scale")
     moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
@@ -268,8 +265,8 @@ def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
 
 def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, float]:
     """Rotor inertias by joint, identified or described."""
-    described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
-    found = described | _parameters_of_kind(result, "rotor_inertia")
+    found = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
+    found |= _parameters_of_kind(result, "rotor_inertia")
     for joint, value in found.items():
         if value < 0:
             raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
@@ -277,7 +274,7 @@ def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, floa
 
 
 def _friction_data(
-    result: Identification, spec: MachineSpec, law_fits: Mapping[str, FrictionLawFit]
+    result: Identification, spec: MachineSpec, laws: Mapping[str, Friction]
 ) -> dict[str, dict[str, Any]]:
     """Friction by joint; joints without friction in the model have none."""
     machine = result.described_machine
@@ -287,27 +284,11 @@ def _friction_data(
         if joint in machine.locked_joints
     }
     for joint in (*machine.joints, *(x.name for x in joint_combinations(result.model))):
-        if joint in law_fits:
-            friction[joint] = friction_data(law_fits[joint].law)
+        if joint in laws:
+            friction[joint] = friction_data(laws[joint])
         elif joint in spec.friction:
             friction[joint] = {"viscous": 0.0}
     return friction
-
-
-def _warn_inexact_friction(machine: Machine, law_fits: Mapping[str, FrictionLawFit]) -> None:
-    """Warn of friction that is replaced by the nearest law."""
-    deviations = {
-        name: each.max_deviation for name, each in law_fits.items() if each.max_deviation
-    }
-    if deviations:
-        worst = max(deviations, key=lambda name: deviations[name])
-        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
-        text = (
-            f"a machine file has no place for all of the friction of {', '.join(deviations)}: "
-            "the nearest law at steady speeds is written, off by at most "
-            f"{deviations[worst]:.3g} {unit} ({worst})"
-        )
-        warnings.warn(text, CraneWarning, stacklevel=4)
 
 
 def _non_default_fields(element: Any, **changed: Any) -> dict[str, Any]:

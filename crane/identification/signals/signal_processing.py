@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, RecordingError, suggest_names
+from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
 from crane.identification.signals.kalman_smoother import kalman_smooth
@@ -43,6 +43,11 @@ class Motion(OneLineRepr):
     a: Array
     tau: Array
     passband: float = math.inf
+
+    def __getitem__(self, part: slice) -> "Motion":
+        """The motion at some of its samples."""
+        q, v, a, tau = (x[part] for x in (self.q, self.v, self.a, self.tau))
+        return Motion(self.time[part], q, v, a, tau, self.passband)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,8 +95,7 @@ def differentiate(
         RecordingError: Samples are not equidistant, or too few.
     """
     step = sampling_step(time)
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, {suggest_names(METHODS, method)}")
+    check_name(method, METHODS, f"method '{method}' is unknown")
     if (method == "lowpass") != (cutoff is not None):
         verb = "needs" if cutoff is None else "estimates its own and takes no"
         raise InputError(f"method '{method}' {verb} cutoff, give one to 'lowpass' alone")
