@@ -147,13 +147,6 @@ def test_intervals_cover_the_truth(estimator, kind, strength, gaps, count):
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
-def test_effective_rows_of_autoregressive_noise():
-    rng = np.random.default_rng(5)
-    W = rng.standard_normal((20_000, 2))
-    found = least_squares(W, draw("ar", 0.9, rng, 20_000, 1)[:, 0])
-    assert found.effective_samples[0] == pytest.approx(20_000 * 0.1 / 1.9, rel=0.15)
-
-
 def test_essential_parameters():
     W, _ = white(500, 6, seed=6)
     rng = np.random.default_rng(6)

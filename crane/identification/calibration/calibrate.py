@@ -1,6 +1,6 @@
 """Calibration of machines: parameters fitted to recordings through the simulation."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,8 +119,14 @@ def calibrate(
     automatic = AUTO in requested
     if requested.pop(AUTO, None) is not None:
         raise InputError(f"'{AUTO}' chooses parameters by itself, give it no start")
+    sensor_names = [name for name in requested if name.startswith(SENSOR_PREFIX)]
     for path, case in zip((*paths, *validation), cases, strict=True):
-        _check_sensor_parameters(path, case.table, requested)
+        if sensor_names and case.table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
+            raise InputError(
+                f"{path}: '{sensor_names[0]}' cannot be fitted to quantities, which its note "
+                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
+                "the note if they are"
+            )
     variants = MachineVariants(machine)
     parameters = variants.values | sensor_parameters(cases[0].known_sensors)
     units = {
@@ -197,17 +203,6 @@ def _read_cases(
     return cases
 
 
-def _check_sensor_parameters(path: str | Path, table: Table, fit: Iterable[str]) -> None:
-    """Check that sensor parameters are fitted to readings, not to ideal quantities."""
-    for name in fit:
-        if name.startswith(SENSOR_PREFIX) and table.notes.get(SENSORS_NOTE) == IDEAL_SENSORS:
-            raise InputError(
-                f"{path}: '{name}' cannot be fitted to quantities, which its note "
-                f"'{SENSORS_NOTE}: {IDEAL_SENSORS}' says they are: give the readings, or remove "
-                "the note if they are"
-            )
-
-
 def _machine_with_sensors(
     machine: Machine,
     known: Mapping[str, Sensor],
@@ -255,7 +250,10 @@ def _calibration_result(
     unknowns, z, covariance = problem.unknowns, estimate.z, estimate.covariance
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = problem.values(z)
-    correlation = _correlation_matrix(covariance, len(unknowns))
+    divisors = np.where(deviations > 0, deviations, np.inf)[: len(unknowns)]
+    correlation = covariance[: len(unknowns), : len(unknowns)] / np.outer(divisors, divisors)
+    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
+    correlated = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
     fitted = []
     for i, unknown in enumerate(unknowns):
         value, scale = values[unknown.name], unknown.scale
@@ -294,28 +292,12 @@ def _calibration_result(
         tuple(fitted),
         tuple(channels),
         problem.changes(z),
-        tuple(_correlated_pairs(unknowns, correlation)),
+        tuple(sorted(correlated, key=lambda pair: -abs(pair[2]))),
         problem.simulation_count,
         correlation=correlation,
         states=simulated_states(problem, z),
         is_lowest_minimum=estimate.is_lowest_minimum,
     )
-
-
-def _correlation_matrix(covariance: Array, count: int) -> Array:
-    """Correlations (n, n) of the first n unknowns; 0 if a variance is zero."""
-    deviations = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0))
-    divisors = np.where(deviations > 0, deviations, np.inf)
-    return covariance[:count, :count] / np.outer(divisors, divisors)
-
-
-def _correlated_pairs(
-    unknowns: Sequence[Unknown], correlation: Array
-) -> list[tuple[str, str, float]]:
-    """Strongly correlated pairs of parameters, with their correlation."""
-    pairs = np.argwhere(np.abs(np.tril(correlation, -1)) > _MAX_CORRELATION).tolist()
-    found = [(unknowns[j].name, unknowns[i].name, float(correlation[i, j])) for i, j in pairs]
-    return sorted(found, key=lambda pair: -abs(pair[2]))
 
 
 def simulated_states(problem: CalibrationProblem, z: Array) -> dict[str, Mapping[str, Array]]:

@@ -243,7 +243,13 @@ class ScoreTestResult:
 def score_tests(
     search: LevenbergMarquardt, candidates: Sequence[Unknown], z: Array
 ) -> list[ScoreTestResult]:
-    """Score tests of parameters that are not fitted, at the minimum z (p,) of a search."""
+    """Score tests of parameters that are not fitted, in descending order of cost reduction.
+
+    Args:
+        search: A search at its minimum.
+        candidates: The parameters, with their standard deviations as scales.
+        z: (p,) the minimum.
+    """
     problem = search.problem
     if not candidates:
         return []
@@ -263,26 +269,9 @@ def score_tests(
             return []
         weighted = (derivatives * search.channel_weights(case)[:, :, None])[case.train_mask]
         rows.append(weighted[:, :, count : count + candidate_count].reshape(-1, candidate_count))
-    return score_test(candidates, search.jacobian, np.vstack(rows), search.residual, search.prior)
-
-
-def score_test(
-    candidates: Sequence[Unknown],
-    jacobian: Array,
-    candidate_jacobian: Array,
-    residual: Array,
-    prior: Array,
-) -> list[ScoreTestResult]:
-    """Score tests of parameters that are not fitted, in descending order of cost reduction.
-
-    Args:
-        candidates: The parameters, with their standard deviations as scales.
-        jacobian: (M, p) weighted derivatives by the fitted unknowns.
-        candidate_jacobian: (M, k) weighted derivatives by the candidates.
-        residual: (M,) weighted residuals.
-        prior: (p,) one over the standard deviations of the fitted unknowns.
-    """
-    inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(prior**2), hermitian=True)
+    jacobian, candidate_jacobian = search.jacobian, np.vstack(rows)
+    residual = search.residual
+    inverse = np.linalg.pinv(jacobian.T @ jacobian + np.diag(search.prior**2), hermitian=True)
     independent_columns = candidate_jacobian - jacobian @ (
         inverse @ (jacobian.T @ candidate_jacobian)
     )

@@ -1,6 +1,7 @@
 """Unknowns of a calibration: machine parameters, common factors, sensor parameters."""
 
 import fnmatch
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -111,45 +112,47 @@ def _build_unknown(
     sensor_units: Mapping[str, str],
 ) -> Unknown:
     start, low, high = _read_bounds(name, given)
+    members: tuple[tuple[str, float], ...] = ()
+    sensor = ""
     if name.startswith(SENSOR_PREFIX):
-        column, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
-        check_name(column, sensor_units, f"'{name}' is of no sensor")
+        sensor, _, what = name.removeprefix(SENSOR_PREFIX).rpartition(".")
+        check_name(sensor, sensor_units, f"'{name}' is of no sensor")
         check_name(what, SENSOR_PARAMETER_DEFAULTS, f"'{name}': a sensor has no '{what}'")
         described = parameters.get(name, SENSOR_PARAMETER_DEFAULTS[what])
-        size = _DELAY_SCALE if what == "delay" else _ZERO_SCALES.get(sensor_units[column], 1.0)
-        size = 0.05 if what == "scale" else size
-        initial = described if start is None else start
-        lower = (0.0 if what == "delay" else -float("inf")) if low is None else low
-        return _bounded_unknown(name, initial, lower, high, size, ((name, described),), column)
-    if "*" in name:
+        zero_scale = _ZERO_SCALES.get(sensor_units[sensor], 1.0)
+        scale = {"delay": _DELAY_SCALE, "scale": 0.05, "zero": zero_scale}[what]
+        if what == "delay" and low is None:
+            low = 0.0
+    elif "*" in name:
         found = {x: parameters[x] for x in fnmatch.filter(parameters, name) if parameters[x]}
         if not found:
             raise InputError(f"'{name}' matches no nonzero parameter of the machine")
-        initial = 1.0 if start is None else start
-        lower = _MIN_SHARE if low is None else low
-        return _bounded_unknown(name, initial, lower, high, 1.0, tuple(found.items()))
-    if name not in parameters:
+        described, scale, members = 1.0, 1.0, tuple(found.items())
+        low = _MIN_SHARE if low is None else low
+    elif name not in parameters:
         raise InputError(unknown_parameter_text(spec, parameters, name))
-    initial = parameters[name] if start is None else start
-    if name.endswith(".delay"):
-        lower = 0.0 if low is None else low
-        return _bounded_unknown(
-            name, initial, lower, high, _DELAY_SCALE, ((name, parameters[name]),)
-        )
-    signed = name.endswith(tuple("." + word for word in _SIGNED_PARAMETERS))
-    if not signed and initial >= 0:
-        low = _MIN_SHARE * initial if low is None else low
-    elif not signed:
-        high = _MIN_SHARE * initial if high is None else high
-    if initial:
-        size = abs(initial)
-    elif low is not None and high is not None:
-        size = high - low
     else:
-        raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
-    if name.endswith((".x", ".y", ".z")):
-        size = min(size, 0.1)
-    return _bounded_unknown(name, initial, low, high, size, ((name, parameters[name]),))
+        described = parameters[name]
+        initial = described if start is None else start
+        scale = abs(initial)
+        if name.endswith(".delay"):
+            scale, low = _DELAY_SCALE, 0.0 if low is None else low
+        elif not name.endswith(tuple("." + word for word in _SIGNED_PARAMETERS)):
+            if initial >= 0:
+                low = _MIN_SHARE * initial if low is None else low
+            else:
+                high = _MIN_SHARE * initial if high is None else high
+        if not scale:
+            if low is None or high is None:
+                raise InputError(f"'{name}' is 0 initially, give its range: '{name}=0,LOW~HIGH'")
+            scale = high - low
+        if name.endswith((".x", ".y", ".z")):
+            scale = min(scale, 0.1)
+    start = float(described if start is None else start)
+    lower, upper = -math.inf if low is None else low, math.inf if high is None else high
+    if not lower < upper or not lower <= start <= upper:
+        raise InputError(f"'{name}': {start:g} does not lie within {lower:g} to {upper:g}")
+    return Unknown(name, start, lower, upper, scale, members or ((name, described),), sensor)
 
 
 def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, float | None]:
@@ -161,22 +164,6 @@ def _read_bounds(name: str, given: object) -> tuple[float | None, float | None, 
         raise InputError(f"'{name}': give a start, or (start, low, high)")
     start, low, high = (None if x is None else float(x) for x in given)
     return start, low, high
-
-
-def _bounded_unknown(
-    name: str,
-    start: float,
-    low: float | None,
-    high: float | None,
-    scale: float,
-    members: tuple[tuple[str, float], ...] = (),
-    sensor: str = "",
-) -> Unknown:
-    lower = -float("inf") if low is None else float(low)
-    upper = float("inf") if high is None else float(high)
-    if not lower < upper or not lower <= start <= upper:
-        raise InputError(f"'{name}': {start:g} does not lie within {lower:g} to {upper:g}")
-    return Unknown(name, float(start), lower, upper, scale, members, sensor)
 
 
 def candidate_parameters(

@@ -5,8 +5,6 @@ may be correlated in time, and with that of other joints at the same instant. Th
 in blocks of rows, see `regressor.Regressor`, and may exceed the memory.
 """
 
-import math
-
 import numpy as np
 
 from crane.common.samples import Array
@@ -92,33 +90,6 @@ def instrumental_variables(
     Source: Janot, Vandanjon, Gautier 2014, IEEE Trans. Control Systems Technology 22(1).
     """
     return RegressionProblem(W, Z, y, groups, samples, prior).estimate()
-
-
-def estimate_from_minimum(
-    W: Array | Regressor,
-    y: Array,
-    groups: np.ndarray,
-    samples: np.ndarray | None,
-    values: Array,
-    noise: Array,
-    prior_root: Array,
-) -> Estimate:
-    """Covariance of parameters that minimize another cost than least squares.
-
-    Args:
-        W: Regressor (m, p), as an array or in blocks.
-        y: Forces (m,).
-        groups: Joint of each row (m,).
-        samples: Number of the instant of each row (m,).
-        values: Minimum (p,) of |(y - W theta) / noise|^2 + c(theta).
-        noise: Standard deviation of the noise of each group (g,).
-        prior_root: L (k, p), L^T L half of the second derivative of c there.
-
-    Returns:
-        Estimate with the covariance of `weighted_least_squares` for a prior with the rows L.
-    """
-    rows = RegressionProblem(W, None, y, groups, samples, None, prior_root)
-    return rows.evaluate_estimate(values, rows.residuals(values), noise, math.inf)
 
 
 def essential_parameters(estimate: Estimate, level: float = 0.05) -> np.ndarray:

@@ -22,7 +22,6 @@ class NoiseModel:
         a: Coefficients.
         innovations: u (T,) at all instants from the first to the last, nan where unknown.
         first_instant: Number of the first instant.
-        effective_samples: See `Estimate`.
         correlation_time: Correlation time in samples, the sum of the squared autocorrelations at
             all lags (Bartlett 1946), mean S^2 / (mean S)^2 of the spectrum S: 1 for white noise,
             (1 + c^2) / (1 - c^2) for a = (1, -c).
@@ -32,7 +31,6 @@ class NoiseModel:
     a: Array
     innovations: Array
     first_instant: int
-    effective_samples: float
     correlation_time: float
     memory_length: int
 
@@ -44,8 +42,6 @@ class NoiseModel:
         is always stable. For filtered noise that is not decimated (a passband of a tenth of the
         Nyquist frequency), valid intervals need some thousand rows.
         """
-        from scipy.signal import lfilter
-
         breaks = np.flatnonzero(np.diff(samples) != 1) + 1
         runs = np.split(e, breaks)
         a = _burg_coefficients(runs)
@@ -57,18 +53,12 @@ class NoiseModel:
         # for predictable signals, rounding may put a root on the unit circle or beyond
         rate = -math.log(min(max(largest, 1e-3), 1.0))
         memory = len(series) if rate * len(series) <= 20 else math.ceil(20 / rate)
-        # response of e to an impulse in u
-        impulse_response = lfilter([1.0], a, np.eye(1, 4 * memory)[0])
-        # mean of the spectrum, by Parseval, over the spectrum at zero
-        effective = float(
-            len(e) * (impulse_response @ impulse_response) / impulse_response.sum() ** 2
-        )
         gain = np.abs(np.fft.fft(a, _FREQUENCY_COUNT)) ** 2
         correlated = float(len(series))  # of a spectral line
         if gain.min():
             spectrum = gain.min() / gain
             correlated = float(np.mean(spectrum**2) / spectrum.mean() ** 2)
-        return cls(a, series, int(samples[0]), effective, correlated, memory)
+        return cls(a, series, int(samples[0]), correlated, memory)
 
 
 def _burg_coefficients(runs: list[Array]) -> Array:

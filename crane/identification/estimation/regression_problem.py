@@ -61,8 +61,6 @@ class Estimate(EstimatedValues):
         covariance: (p, p) covariance for correlated noise.
         residuals: (m,) y - W values.
         noise: (g,) standard deviation of the noise of each group.
-        effective_samples: (g,) number of independent rows equivalent to the N correlated rows of a
-            group for its mean, N variance / spectral density at zero.
         degrees_of_freedom: Degrees of freedom behind the standard deviations, see `Jackknife`.
         condition: Condition number of W.
         scaled_condition: Condition number of W with columns of length one.
@@ -72,7 +70,6 @@ class Estimate(EstimatedValues):
     covariance: Array
     residuals: Array
     noise: Array
-    effective_samples: Array
     degrees_of_freedom: float
     condition: float
     scaled_condition: float
@@ -282,7 +279,6 @@ class RegressionProblem:
             covariance=covariance * np.outer(inflation, inflation),
             residuals=e,
             noise=noise,
-            effective_samples=np.array([noise.effective_samples for noise in noises]),
             degrees_of_freedom=jackknife.degrees_of_freedom,
             condition=plain,
             scaled_condition=scaled,

@@ -103,7 +103,15 @@ class PulseSignals(ValveCommand):
         """Peak spool positions (m,) in a slot."""
         opening, share = self._plan[slot].T
         x = q[self._joint_columns]
-        speeds = self._full_opening_speeds(pressures)
+        circuit = self._circuit
+        speeds = np.empty((len(x), 2))  # at full opening, forwards and backwards
+        for i, joint in enumerate(circuit.joints):
+            cylinder, valve = circuit.cylinders[joint], circuit.valves[joint]
+            force = cylinder.area_a * pressures[i][0] - cylinder.area_b * pressures[i][1]
+            speeds[i] = [
+                full_opening_speed(cylinder, valve, circuit.supply, force, side)
+                for side in (False, True)
+            ]
         self._pulse_durations = share * self.period
         openings = np.array(
             [
@@ -129,50 +137,27 @@ class PulseSignals(ValveCommand):
         """See `ValveCommand`."""
         return inputs.reference
 
-    def _full_opening_speeds(self, pressures: Array) -> Array:
-        """Steady velocities (m, 2) at full opening, forwards and backwards [m/s], [rad/s]."""
-        found = []
-        for joint, (a, b) in zip(self._circuit.joints, pressures, strict=True):
-            cylinder, valve = self._circuit.cylinders[joint], self._circuit.valves[joint]
-            force = cylinder.area_a * a - cylinder.area_b * b
-            found.append([
-                full_opening_speed(cylinder, valve, self._circuit.supply, force, side)
-                for side in (False, True)
-            ])  # fmt: skip
-        return np.array(found)
-
     def _opening_within_stroke(self, i: int, opening: float, x: float, speeds: Array) -> float:
         """Opening of a pulse that keeps cylinder i within its range."""
+        dead, rate, duration = self._dead_bands[i], self._rate, self._pulse_durations[i]
         clearances = max(self._high[i] - x, 0.0), max(x - self._low[i], 0.0)
-        side, size = int(opening < 0), self._reachable_opening(i, abs(opening))
+        side = int(opening < 0)
+        # what the rate allows within the pulse
+        size = min(abs(opening), max((rate * duration / 2 - dead) / (1.0 - dead), 0.0))
         if size and self._opening_integral(i, size) * speeds[side] > clearances[side]:
             side = int(clearances[1] > clearances[0])
             if self._opening_integral(i, size) * speeds[side] > clearances[side]:
-                size = self._opening_for_integral(i, clearances[side] / speeds[side])
+                # the smaller root of the integral, which is quadratic in the opening
+                integral, slope = clearances[side] / speeds[side], duration - 2 * dead / rate
+                root = np.sqrt(max(slope**2 - 4 * (1.0 - dead) / rate * integral, 0.0))
+                size = float(2 * integral / (slope + root)) if slope > 0 else 0.0
         return -size if side else size
-
-    def _reachable_opening(self, i: int, opening: float) -> float:
-        """Opening that the rate allows within the pulse."""
-        dead = self._dead_bands[i]
-        most = (self._rate * self._pulse_durations[i] / 2 - dead) / (1.0 - dead)
-        return min(opening, max(most, 0.0))
 
     def _opening_integral(self, i: int, opening: float) -> float:
         """Integral of the opening over the pulse [s]."""
         dead = self._dead_bands[i]
         u = dead + (1.0 - dead) * opening
         return float(opening * (self._pulse_durations[i] - (u + dead) / self._rate))
-
-    def _opening_for_integral(self, i: int, integral: float) -> float:
-        """Opening with a given integral over the pulse [s], the smaller root."""
-        dead, rate = self._dead_bands[i], self._rate
-        linear_coefficient = self._pulse_durations[i] - 2 * dead / rate
-        root = linear_coefficient**2 - 4 * (1.0 - dead) / rate * integral
-        return (
-            float(2 * integral / (linear_coefficient + np.sqrt(max(root, 0.0))))
-            if linear_coefficient > 0
-            else 0.0
-        )
 
     def _pump_flow(self, openings: Array, speeds: Array) -> float:
         """Demand of pump flow [m3/s]."""

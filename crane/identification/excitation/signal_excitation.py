@@ -216,50 +216,27 @@ def excite_valves(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reference_run, best = search.run(trials, np.random.default_rng(seed), progress)
-        initial_information, optimized_information = (
-            information.measures(reference_run),
-            information.measures(best),
+        initial_information, optimized_information = map(
+            information.measures, (reference_run, best)
         )
         worst_case_margins = limits.worst_case_stroke_margins(best)
-    return _excitation_result(
-        information,
-        limits,
-        best,
-        initial_information,
-        optimized_information,
-        worst_case_margins,
-        criterion,
-        seed,
-    )
-
-
-def _excitation_result(
-    information: SignalInformation,
-    limits: SignalLimits,
-    run: Recording,
-    initial_information: InformationMeasures,
-    optimized_information: InformationMeasures,
-    worst_case_margins: Array,
-    criterion: str,
-    seed: int,
-) -> SignalExcitation:
-    table, joints = information.expected_readings(run), require_circuit(information.machine).joints
+    joints = require_circuit(machine).joints
     largest_changes = np.abs(
-        np.diff([run.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints])
+        np.diff([best.channels[VALVE_SIGNAL_PREFIX + joint] for joint in joints])
     ).max(axis=1)
     return SignalExcitation(
         machine=information.machine,
         unknowns=tuple(information.unknowns),
-        run=run,
-        expected_readings=table,
+        run=best,
+        expected_readings=information.expected_readings(best),
         noise=dict(zip(information.units, information.noise.tolist(), strict=True)),
         initial_information=initial_information,
         optimized_information=optimized_information,
-        stroke_margins=limits.stroke_margins(run),
+        stroke_margins=limits.stroke_margins(best),
         worst_case_stroke_margins=worst_case_margins,
-        pump_flow_share=limits.pump_flow_share(run),
-        peak_pressures=limits.peak_pressures(run),
-        signal_rates=largest_changes / (run.time[1] - run.time[0]),
+        pump_flow_share=limits.pump_flow_share(best),
+        peak_pressures=limits.peak_pressures(best),
+        signal_rates=largest_changes / (best.time[1] - best.time[0]),
         criterion=criterion,
         seed=seed,
     )

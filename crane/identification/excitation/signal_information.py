@@ -14,7 +14,7 @@ from crane.dynamics.joint_forces import find_stick_slip_columns
 from crane.formats.machine_loading import MachineVariants
 from crane.identification.calibration.calibration_problem import CalibrationProblem
 from crane.identification.calibration.recording_case import RecordingCase, recording_case
-from crane.identification.calibration.unknowns import Unknown, build_unknowns
+from crane.identification.calibration.unknowns import build_unknowns
 from crane.identification.excitation.fisher_information import (
     InformationMeasures,
     information_measures,
@@ -79,17 +79,28 @@ class SignalInformation:
             *(f"pressure_{joint}_{side}" for joint in joints for side in "ab"),
         ]
         available_units = simulated_units(machine)
-        self.units = {
-            name: _sensor_unit(available_units, name)
-            for name in dict.fromkeys(default_sensors if sensors is None else sensors)
-        }
+        self.units: dict[str, str] = {}
+        for name in default_sensors if sensors is None else sensors:
+            unit = "rad/s" if name.endswith(VELOCITY_SUFFIX) else "rad"
+            if not name.startswith(INCLINATION_PREFIX):
+                check_name(name, available_units, f"'{name}' cannot be compared")
+                unit = available_units[name]
+            self.units[name] = unit
         if not self.units:
             raise InputError(f"no sensor is named, choose among {', '.join(available_units)}")
         given = {x: y.noise for x, y in machine.sensors.items() if y.noise and x in self.units}
         given |= noise or {}
         for name in given:
             check_name(name, self.units, f"noise of '{name}', which is not measured")
-        self.noise = np.array([_noise_std(name, given, unit) for name, unit in self.units.items()])
+        noise_std = []
+        for name, unit in self.units.items():
+            if name not in given and unit not in _DEFAULT_NOISE:
+                raise InputError(
+                    f"noise of '{name}' is not known, give its deviation in {unit or '1'}"
+                )
+            std = given.get(name, _DEFAULT_NOISE.get(unit))
+            noise_std.append(as_number(std, f"noise of '{name}'", unit, greater_than=0))
+        self.noise = np.array(noise_std)
         signals = {VALVE_SIGNAL_PREFIX + joint: "V" for joint in joints}
         simulated_columns(machine, Table(self.units, np.zeros((0, len(self.units))), {}))
         variants = MachineVariants(machine)
@@ -151,20 +162,13 @@ class SignalInformation:
     def measures(self, run: Recording) -> InformationMeasures:
         """Information measures of a recording of a run; standard deviations in SI units."""
         rows = self.information_root(run)
-        result = information_measures(rows, np.eye(len(self.unknowns)), 0.0)
-        scale = np.array([unknown.scale for unknown in self.unknowns])
-        return replace(result, std=self.standard_deviations(rows) * scale)
-
-    def standard_deviations(self, information_root: Array) -> Array:
-        """Standard deviations (p,) of the scaled parameters, infinite if not identifiable."""
-        is_identifiable = np.linalg.norm(information_root, axis=0) > _MIN_SENSITIVITY
-        out = np.full(len(information_root), np.inf)
+        result = information_measures(rows, np.eye(len(rows)), 0.0)
+        is_identifiable = np.linalg.norm(rows, axis=0) > _MIN_SENSITIVITY
+        std = np.full(len(rows), np.inf)
         if is_identifiable.any():
-            identifiable_root = _triangular_factor(information_root[:, is_identifiable])
-            out[is_identifiable] = information_measures(
-                identifiable_root, np.eye(len(identifiable_root)), 0.0
-            ).std
-        return out
+            root = _triangular_factor(rows[:, is_identifiable])
+            std[is_identifiable] = information_measures(root, np.eye(len(root)), 0.0).std
+        return replace(result, std=std * [unknown.scale for unknown in self.unknowns])
 
     def _smoothed_problem(self, cases: list[RecordingCase]) -> CalibrationProblem:
         problem = CalibrationProblem(self.machine, self.unknowns, cases)
@@ -175,21 +179,6 @@ class SignalInformation:
 def _triangular_factor(matrix: Array) -> Array:
     """Triangular factor R of a QR factorization."""
     return np.asarray(np.linalg.qr(matrix, mode="r"), dtype=np.float64)
-
-
-def _sensor_unit(available_units: Mapping[str, str], name: str) -> str:
-    if name.startswith(INCLINATION_PREFIX):
-        return "rad/s" if name.endswith(VELOCITY_SUFFIX) else "rad"
-    check_name(name, available_units, f"'{name}' cannot be compared")
-    return available_units[name]
-
-
-def _noise_std(name: str, given: Mapping[str, float], unit: str) -> float:
-    if name in given:
-        return as_number(given[name], f"noise of '{name}'", unit, greater_than=0)
-    if unit not in _DEFAULT_NOISE:
-        raise InputError(f"noise of '{name}' is not known, give its deviation in {unit or '1'}")
-    return _DEFAULT_NOISE[unit]
 
 
 class SignalLimits:
@@ -235,10 +224,17 @@ class SignalLimits:
                 )
         max_flow = supply.flow
         self.flow = (1 - margin) * max_flow if max_flow else np.inf
-        self._perturbed_machines = [
-            information.perturbed_machine(values)
-            for values in _perturbed_values(information.unknowns)
-        ]
+        self._perturbed_machines: list[Machine] = []  # with one unknown at an end
+        for one in information.unknowns:
+            ends = one.low, one.high
+            if not np.isfinite(ends).all():
+                deviation = _DEFAULT_DEVIATION * one.start if np.isfinite(ends).any() else 0.0
+                ends = one.start - deviation, one.start + deviation
+            self._perturbed_machines += [
+                information.perturbed_machine({one.name: end})
+                for end in ends
+                if end != one.start and not one.sensor
+            ]
 
     def exceeded_limit(self, run: Recording) -> str:
         """Name of a limit that a run exceeds, "" if it exceeds none."""
@@ -291,18 +287,6 @@ class SignalLimits:
 
     def _strokes(self, run: Recording) -> Array:
         return run.q[:, [run.joints.index(joint) for joint in self._circuit.joints]]
-
-
-def _perturbed_values(unknowns: list[Unknown]) -> list[dict[str, float]]:
-    """Extreme values of the unknowns, one at a time."""
-    found = []
-    for one in unknowns:
-        ends = one.low, one.high
-        if not np.isfinite(ends).all():
-            deviation = _DEFAULT_DEVIATION * one.start if np.isfinite(ends).any() else 0.0
-            ends = one.start - deviation, one.start + deviation
-        found += [{one.name: end} for end in ends if end != one.start and not one.sensor]
-    return found
 
 
 def replay_signals(machine: Machine, run: Recording) -> Recording:

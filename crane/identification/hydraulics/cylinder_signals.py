@@ -1,6 +1,6 @@
 """Signals of one hydraulic cylinder in a recording: stroke, valve opening, pressures."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -215,28 +215,3 @@ def noise_std(x: Array) -> float:
         size = np.median(np.abs(np.diff(x, order)))
         found.append(1.4826 * float(size) / np.sqrt(comb(2 * order, order)))
     return min(found)
-
-
-def signal_noise(
-    signals: CylinderSignals, given: dict[str, float] | None = None
-) -> dict[str, float]:
-    """Standard deviation of the noise of each sensor, estimated if not given.
-
-    Raises:
-        InputError: A sensor is unknown.
-    """
-    for name in given or {}:
-        check_name(name, SIGNAL_NAMES, f"sensor '{name}' is unknown")
-    return {name: noise_std(getattr(signals, name)) for name in SIGNAL_NAMES} | (given or {})
-
-
-def shift_signal(signals: CylinderSignals, name: str, offset: float) -> CylinderSignals:
-    """Signals with an offset added to one of them; an opening of zero stays zero."""
-    values = {entry.name: getattr(signals, entry.name) for entry in fields(signals)}
-    where = values["opening"] != 0 if name == "opening" else 1.0
-    return CylinderSignals(**values | {name: values[name] + offset * where})
-
-
-def opening_regions(y: Array) -> np.ndarray:
-    """Label (N,) of the smooth piece of the opening: closed, open, or fully open, with sign."""
-    return np.sign(y) * (1.0 + (np.abs(y) >= 1))

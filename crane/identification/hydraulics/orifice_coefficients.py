@@ -16,11 +16,11 @@ from crane.common.threads import with_single_threaded_blas
 from crane.identification.estimation import estimators
 from crane.identification.estimation.regression_problem import EstimatedValues
 from crane.identification.hydraulics.cylinder_signals import (
+    SIGNAL_NAMES,
     CylinderSignals,
     cylinder_and_valve,
     cylinder_signals,
     noise_std,
-    signal_noise,
 )
 from crane.identification.hydraulics.orifice_equations import (
     EquationSides,
@@ -174,7 +174,9 @@ def identify_orifices(
         RecordingError: Columns are missing, or samples are not suitable.
     """
     check_name(method, METHODS, f"method '{method}' is unknown")
-    cylinder, _ = cylinder_and_valve(machine, joint)
+    for name in noise or ():
+        check_name(name, SIGNAL_NAMES, f"sensor '{name}' is unknown")
+    cylinder, valve = cylinder_and_valve(machine, joint)
     if cylinder.counterbalance_a or cylinder.counterbalance_b:
         raise InputError(
             f"the cylinder of '{joint}' has a counterbalance valve, for which (21), (22) do not "
@@ -190,32 +192,23 @@ def identify_orifices(
     if method == "ls":
         values, covariance, freedom, condition, misfit = _pointwise_estimate(machine, joint, runs)
     else:
-        levels = [
-            _opening_noise(machine, one, joint, len(run.time)) | dict(noise or {})
-            for one, run in zip(recordings, runs, strict=True)
-        ]
+        levels = []
+        for one, run in zip(recordings, runs, strict=True):
+            level = {name: noise_std(getattr(run, name)) for name in SIGNAL_NAMES}
+            if f"spool_{joint}" not in one.channels and valve.bandwidth:
+                # the spool dynamics keep the noise of the signal at the low frequencies of the
+                # windows, and remove it from differences between samples
+                volts = noise_std(one.channels[f"voltage_{joint}"])
+                scale = abs(valve.full - valve.neutral) * (1 - valve.dead_band)
+                periods = max(len(one.time) // len(run.time), 1)
+                level["opening"] = volts / scale / np.sqrt(periods)
+            levels.append(level | dict(noise or {}))
         values, covariance, freedom, condition, misfit = _weak_form_estimate(sets, levels, joint)
     _check_values(values, covariance, joint, method, runs)
     training = tuple(rows.sides(values) for rows in sets)
     return OrificeCoefficients(
         machine, joint, method, values, covariance, freedom, condition, misfit, window, training
     )
-
-
-def _opening_noise(
-    machine: Machine, recording: Recording, joint: str, count: int
-) -> dict[str, float]:
-    """Noise of an opening that is computed from the valve signal, over `count` samples.
-
-    The spool dynamics keep the noise at the low frequencies of the windows, and remove it from
-    differences between samples.
-    """
-    _, valve = cylinder_and_valve(machine, joint)
-    if f"spool_{joint}" in recording.channels or not valve.bandwidth:
-        return {}
-    level = noise_std(recording.channels[f"voltage_{joint}"])
-    level /= abs(valve.full - valve.neutral) * (1 - valve.dead_band)
-    return {"opening": level / np.sqrt(max(len(recording.time) // count, 1))}
 
 
 def _weak_form_estimate(
@@ -246,10 +239,10 @@ def _weak_form_estimate(
     X, scale = estimate.values, estimate.noise**2
     A = sum(Z_all[group == g].T @ W_all[group == g] / scale[g] for g in range(len(scale)))
     middle, explained = np.zeros((5, 5)), 0.0
-    for rows, given in zip(sets, noise, strict=True):
+    for rows, levels in zip(sets, noise, strict=True):
         w, N = rows.windows, len(rows.signals.time)
         Z_rows = rows.W[:, ::-1] * rows.is_smooth[:, None]
-        for sensor, level in signal_noise(rows.signals, given).items():
+        for sensor, level in levels.items():
             df, dg = rows.noise_sensitivity(X, sensor, level)
             total = np.zeros((N, 5))
             for e in range(count):

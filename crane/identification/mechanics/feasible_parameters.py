@@ -8,6 +8,7 @@ with positive mass density, if and only if the pseudo-inertia
 is positive definite (Wensing, Kim, Slotine 2018, IEEE Robotics and Automation Letters 3(1)).
 """
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
@@ -17,8 +18,7 @@ import numpy as np
 from crane.common.errors import CraneError, InputError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import Array
-from crane.identification.estimation.estimators import estimate_from_minimum
-from crane.identification.estimation.regression_problem import Estimate, Prior
+from crane.identification.estimation.regression_problem import Estimate, Prior, RegressionProblem
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.regression_equations import (
@@ -307,15 +307,17 @@ def feasible_estimate(
             solution[body]
         )
     prior_root[-len(mean) :] = np.diag(np.append(np.sqrt(parameter_weights), 1 / parameter_std))
-    return estimate_from_minimum(
+    # the covariance of weighted least squares for a prior with these rows
+    rows = RegressionProblem(
         ProjectedRegressor(equations, K),
+        None,
         equations.y,
         equations.groups,
         equations.samples,
-        solution,
-        noise,
+        None,
         prior_root,
     )
+    return rows.evaluate_estimate(solution, rows.residuals(solution), noise, math.inf)
 
 
 def thicken_body(body: Array) -> Array:

@@ -20,7 +20,6 @@ from crane.identification.mechanics.smoothed_motion import (
 )
 from crane.identification.signals.signal_processing import (
     Motion,
-    is_moving,
     low_pass,
     sampling_step,
 )
@@ -93,9 +92,8 @@ def force_delays(
         W[:, i] = low_pass(time, W[:, i], cutoff)
     known = low_pass(time, model.known_forces(at), cutoff)
     force = low_pass(motion.time, motion.tau, cutoff)[chosen]
-    is_resting = ~is_moving(
-        motion.v, np.maximum(slow, _STANDSTILL_SHARE * np.abs(motion.v).max(axis=0))
-    )[chosen]
+    speed = np.abs(motion.v)
+    is_resting = (speed <= np.maximum(slow, _STANDSTILL_SHARE * speed.max(axis=0)))[chosen]
     is_used = ~binary_dilation(is_resting, np.ones((2 * filter_reach + 1, 1), dtype=bool))
     is_used[:filter_reach] = is_used[-filter_reach:] = False
     is_used[:, ~model.machine.is_driven] = False  # forces of free joints are zero
@@ -123,7 +121,13 @@ def _iterate_delays(
     noise = force.std(axis=0) + _TINY
     for _ in range(_MAX_ITERATIONS):
         shifted = np.stack([f(time + d) for f, d in zip(splines, shifts, strict=True)], axis=1)
-        U, values, V = _truncated_svd(A / noise[joint][:, None])
+        # truncated singular value decomposition with columns of length one
+        weighted = A / noise[joint][:, None]
+        length = np.linalg.norm(weighted, axis=0)
+        length[length == 0] = 1.0
+        U, values, V = np.linalg.svd(weighted / length, full_matrices=False)
+        is_significant = values > _SINGULAR_VALUE_TOLERANCE * values[0]
+        U, values, V = U[:, is_significant], values[is_significant], V[is_significant] / length
         y = (shifted - known)[instant, joint] / noise[joint]
         projected = U.T @ y
         rate = np.gradient(W @ (V.T @ (projected / values)) + known, time, axis=0)
@@ -145,15 +149,6 @@ def _iterate_delays(
     not_converged[is_identifiable] = np.abs(found) > std[is_identifiable]
     shifts[~is_identifiable | not_converged] = std[not_converged] = np.nan
     return shifts, std
-
-
-def _truncated_svd(A: Array) -> tuple[Array, Array, Array]:
-    """Truncated singular value decomposition of a matrix with columns of length one."""
-    length = np.linalg.norm(A, axis=0)
-    length[length == 0] = 1.0
-    U, values, V = np.linalg.svd(A / length, full_matrices=False)
-    is_significant = values > _SINGULAR_VALUE_TOLERANCE * values[0]
-    return U[:, is_significant], values[is_significant], V[is_significant] / length
 
 
 @dataclass(frozen=True, eq=False, repr=False)

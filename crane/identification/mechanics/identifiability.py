@@ -26,16 +26,6 @@ _MAX_LISTED = 8
 _RELATIVE_STD_RANGE = 1e-7, 1e6  # range of a relative standard deviation
 
 
-def base_magnitudes(base: BaseParameters, parameter_sizes: Array) -> Array:
-    """Magnitudes (r,) of base parameters: sqrt(sum_j (K_ij s_j)^2) for the group K_i.
-
-    Args:
-        base: Base parameters that a recording determines.
-        parameter_sizes: Magnitudes s (p,) of all parameters, see `parameter_magnitudes`.
-    """
-    return np.asarray(np.sqrt(base.grouping**2 @ parameter_sizes**2))
-
-
 def parameter_magnitudes(
     model: IdentificationModel, base: BaseParameters, factors: Array
 ) -> Array:
@@ -187,21 +177,17 @@ def prior_from_names(
         others = model.names[count:] if everything else _matching_names(model.names, name)
         for i in map(model.names.index, others):
             mean[i] = model.nominal[i] if what.mean is None else what.mean
-            reference_value = abs(mean[i]) or _described_friction(model, i)
-            size = what.std * (reference_value if what.relative else 1.0)
+            where, _, kind = model.names[i].rpartition(".")
+            size = what.std
+            if what.relative:  # of an offset of zero, to the friction that it is an offset of
+                law = model.machine.friction.get(where) if kind.endswith("_offset") else None
+                other = float(getattr(law, kind.removesuffix("_offset"), 0.0))
+                size *= abs(mean[i]) or other
             std[i] = size or (parameter_sizes[i] or 1.0)
         place = name.rpartition(".")[0]
         if not bodies and not others and not fnmatch.filter(model.machine.locked_joints, place):
             check_name(name, (*model.bodies, *model.names[count:]), f"prior '{name}' is unknown")
     return mean, std
-
-
-def _described_friction(model: IdentificationModel, i: int) -> float:
-    """Described friction of the same joint and kind as the offset of a parameter, else 0."""
-    where, _, kind = model.names[i].rpartition(".")
-    base_kind = kind.removesuffix("_offset")
-    law = model.machine.friction.get(where)
-    return float(getattr(law, base_kind, 0.0)) if base_kind != kind else 0.0
 
 
 def _matching_names(names: Sequence[str], pattern: str) -> list[str]:

@@ -239,7 +239,13 @@ def _build_terms(
         if friction_kinds or "stiction" in kinds:
             stribeck = kinds.get("stiction", ())
             if "stiction" in kinds and not stribeck:
-                stribeck = (_described_stribeck_velocity(machine, where),)
+                law = machine.friction.get(where)
+                if law is None or not law.stiction:
+                    raise InputError(
+                        f"term '{where}.stiction' needs the velocity over which it fades, which "
+                        "the machine does not have: give it"
+                    )
+                stribeck = (law.stribeck,)
             terms.append(friction_term(machine, direction, friction_kinds, stribeck=stribeck))
         if "root" in kinds:
             terms.append(root_friction_term(machine, direction))
@@ -248,14 +254,3 @@ def _build_terms(
         if "memory" in kinds:
             terms.append(FrictionalMemory(machine, direction, *kinds["memory"]))
     return terms
-
-
-def _described_stribeck_velocity(machine: Machine, joint: str) -> float:
-    """Stribeck velocity of a joint by the description."""
-    law = machine.friction.get(joint)
-    if law is None or not law.stiction:
-        raise InputError(
-            f"term '{joint}.stiction' needs the velocity over which it fades, which the machine "
-            "does not have: give it"
-        )
-    return law.stribeck

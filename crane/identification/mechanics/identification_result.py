@@ -41,7 +41,8 @@ class Identification(EstimatedValues, Result):
         method: Name of the estimator.
         feasible: Whether every body of `parameters` is physically feasible.
         training: Comparison of forces on the training data.
-        magnitude: (r,) magnitudes of the base parameters, see `base_magnitudes`.
+        magnitude: (r,) magnitudes of the base parameters: sqrt(sum_j (K_ij s_j)^2) for the group
+            K_i and the `parameter_magnitudes` s.
         advice: Text that recommends a motion for the parameters that are not determined.
         speeds: Least and largest speed of the training data by direction of friction [m/s],
             [rad/s].

@@ -28,7 +28,6 @@ from crane.identification.mechanics.force_comparison import (
     warn_validation,
 )
 from crane.identification.mechanics.identifiability import (
-    base_magnitudes,
     check_identifiable,
     check_prior,
     motion_advice,
@@ -173,7 +172,7 @@ def identify(
             warn_validation(training, validation_comparison)
     if final_progress is not None:
         final_progress(1.0)
-    magnitudes = base_magnitudes(identifiable, parameter_sizes)
+    magnitudes = np.sqrt(identifiable.grouping**2 @ parameter_sizes**2)
     identification = Identification(
         model, identifiable, values, covariance, parameters, estimate, method, feasible, training,
         magnitudes, advice, speeds, bandwidth, slow_speeds, validation_comparison,

@@ -17,7 +17,7 @@ from crane.identification.mechanics.model_terms import (
     MotionSamples,
     inertial_regressor,
 )
-from crane.identification.signals.signal_processing import Motion, is_moving, low_pass
+from crane.identification.signals.signal_processing import Motion, low_pass
 from crane.identification.signals.signal_quality import spectral_edge_frequency
 from crane.machine.machine import Machine
 
@@ -166,7 +166,7 @@ def static_mass(
     """
     step = float(motion.time[1] - motion.time[0])
     v = low_passed_motion(motion).v
-    is_resting = ~is_moving(v, _REST_SPEED_SHARE * np.abs(v).max(axis=0)).any(axis=1)
+    is_resting = (np.abs(v) <= _REST_SPEED_SHARE * np.abs(v).max(axis=0)).all(axis=1)
     edges = np.flatnonzero(np.diff(is_resting.astype(np.int8), prepend=0, append=0))
     runs = [
         (i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _MIN_REST_DURATION

@@ -20,7 +20,6 @@ from crane.identification.signals.signal_processing import (
     Progress,
     filter_kernel,
     filter_rows,
-    is_moving,
 )
 
 _MIN_PERIODS = 5.0  # least duration of a recording in periods of the cutoff
@@ -59,7 +58,7 @@ class _FilteredMotion:
             kernel_reach = len(filter_kernel(self.step, bandwidth)) // 2
         self.filter_reach = -(-kernel_reach // self.thinning) * self.thinning
         # friction laws are not valid near standstill, nor in rows within the reach of the filter
-        is_resting = ~is_moving(motion.v, slow)
+        is_resting = np.abs(motion.v) <= slow
         is_near_rest = maximum_filter1d(
             is_resting.view(np.uint8), 2 * kernel_reach + 1, axis=0, mode="constant"
         )

@@ -14,7 +14,6 @@ from crane.identification.signals.signal_processing import (
     Derivatives,
     Motion,
     Progress,
-    central_differences,
     check_gaps,
     differentiate,
     low_pass,
@@ -79,20 +78,40 @@ def smoothed_motion(
     ):
         reject_unless_trusted(f"{text}, do not lock it, or lock it where it is", trust)
     time, n = recording.time, len(machine.active)
-    check_samples(time)
     names = [x + suffix for suffix in ("", FORCE_SUFFIX) for x in machine.active]
     columns = remove_outliers(time, names, np.hstack([recording.q, recording.tau]), trust)
-    _check_columns(machine, time, columns, recording.v, trust)
+    recorded = None
+    if np.any(recording.v):  # for comparison only, without outliers
+        recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in recording.v.T])
+    limits = np.column_stack([machine.lower, machine.upper])
+    check_recording(
+        time,
+        columns[:, :n],
+        columns[:, n:],
+        machine.active,
+        {joint: machine.unit(joint) for joint in machine.active},
+        recorded,
+        limits if np.isfinite(limits).all() else None,
+        free=machine.free,
+        trust=trust,
+    )
     columns[:, n:] += recorded_load_forces(machine, original, columns[:, :n], trust)
     time, columns = resample_evenly(time, columns)
     step = float(np.median(np.diff(time)))
     lowest = _HUM_FACTOR * spectral_edge_frequency(columns[:, :n], step)
     warn_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
-    v, a = np.where(_is_moving(found), (found.v, found.a), 0.0)
+    is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
+    if found.std_v is not None:
+        uncertainty = np.sqrt(np.mean(found.std_v**2, axis=0))
+        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * uncertainty
+    v, a = np.where(is_moving, (found.v, found.a), 0.0)
     _check_speeds(machine, v, trust)
     _warn_standstill(machine, found, v)
-    return Motion(time, found.q, v, a, columns[:, n:], _lowest_passband(found))
+    passband = math.inf
+    if found.passband is not None:
+        passband = float(found.passband[is_moving].min(initial=math.inf))
+    return Motion(time, found.q, v, a, columns[:, n:], passband)
 
 
 def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
@@ -134,20 +153,6 @@ def _select_active_joints(machine: Machine, recording: Recording) -> Recording:
     return Recording(recording.time, machine.active, q, v, tau, joint_units, free=machine.free)
 
 
-def _check_columns(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
-    """Check coordinates and forces (N, 2 n) and recorded velocities (N, n)."""
-    q, tau = np.split(columns, 2, axis=1)
-    recorded = None
-    if np.any(v):  # for comparison only, without outliers
-        recorded = np.column_stack([replace_outliers(x, outlier_mask(x)) for x in v.T])
-    limits = np.column_stack([machine.lower, machine.upper])
-    bounded = limits if np.isfinite(limits).all() else None
-    units = {joint: machine.unit(joint) for joint in machine.active}
-    check_recording(
-        time, q, tau, machine.active, units, recorded, bounded, free=machine.free, trust=trust
-    )
-
-
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
     """Reject velocities (N, n) far above the velocity limits."""
     limits = machine.model.velocityLimit[machine.closure.active]
@@ -161,21 +166,6 @@ def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
                 f"{unit}: look at the unit of the time",
                 trust,
             )
-
-
-def _lowest_passband(found: Derivatives) -> float:
-    """Lowest passband [Hz] of the moving joints."""
-    if found.passband is None:
-        return math.inf
-    return float(found.passband[_is_moving(found)].min(initial=math.inf))
-
-
-def _is_moving(found: Derivatives) -> np.ndarray:
-    """Mask (n,) of joints that move by more than the uncertainty of their velocities."""
-    if found.std_v is None:
-        return np.ones(found.v.shape[1], dtype=bool)
-    uncertain = np.sqrt(np.mean(found.std_v**2, axis=0))
-    return np.asarray(found.v.std(axis=0) > _MOTION_FACTOR * uncertain)
 
 
 def _warn_standstill(machine: Machine, found: Derivatives, v: Array) -> None:
@@ -211,13 +201,11 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
     frames = {force.name: force.frame for force in machine.external_forces}
     wrenches: dict[str, Array] = {}
     for column, values in recording.channels.items():
-        part = next(
-            (x for x in WRENCH_COMPONENTS if column == f"{_LOAD_PREFIX}{_load_name(column)}_{x}"),
-            None,
-        )
-        if part is None:
+        pieces = column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)
+        part = "_".join(pieces[1:])
+        if not column.startswith(_LOAD_PREFIX) or part not in WRENCH_COMPONENTS:
             continue
-        name, unit = _load_name(column), recording.channel_units[column]
+        name, unit = pieces[0], recording.channel_units[column]
         if unit != _PART_UNITS[part[:-2]]:
             raise RecordingError(
                 f"'{column}' is recorded in {unit}, give {_PART_UNITS[part[:-2]]}"
@@ -238,11 +226,6 @@ def recorded_load_forces(machine: Machine, recording: Recording, q_a: Array, tru
     for name, rows in wrenches.items():
         total += dynamics.project_wrenches(q_a, {frames.get(name, name): rows})
     return total
-
-
-def _load_name(column: str) -> str:
-    """Name of the load of a column."""
-    return column.removeprefix(_LOAD_PREFIX).rsplit("_", 2)[0]
 
 
 def signal_delay(time: Array, one: Array, other: Array) -> float:
@@ -282,17 +265,6 @@ def reject_unless_trusted(text: str, trust: bool) -> None:
     if not trust:
         raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
     warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
-
-
-def check_samples(time: Array) -> None:
-    """Reject a recording with too few samples, or with gaps between its instants (N,).
-
-    Raises:
-        RecordingError: There are too few samples, or a gap.
-    """
-    if len(time) < _MIN_SAMPLES:
-        raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
-    check_gaps(time)
 
 
 def remove_outliers(
@@ -372,9 +344,12 @@ def check_recording(
         trust: Whether to warn only of what is probably wrong.
 
     Raises:
-        RecordingError: There is no motion, units are wrong, or columns are inconsistent; the
-            message names the column.
+        RecordingError: There are too few samples, a gap or no motion, units are wrong, or columns
+            are inconsistent; the message names the column.
     """
+    if len(time) < _MIN_SAMPLES:
+        raise RecordingError(f"{len(time)} samples are too few, record at least {_MIN_SAMPLES}")
+    check_gaps(time)
     # steps between samples of pure noise have twice its variance
     if all(np.ptp(x) == 0 or np.var(np.diff(x)) >= np.var(x) for x in q.T):
         raise RecordingError("no joint moves, record a motion")
@@ -415,7 +390,8 @@ def _check_velocity(
     step = sampling_step(time)
     if 0.4 / step > _COMPARISON_CUTOFF:
         columns = low_pass(time, columns, _COMPARISON_CUTOFF)
-    derivative, v = central_differences(time, columns[:, 0]), columns[:, 1]
+    derivative = np.gradient(columns[:, 0], step, axis=0, edge_order=2)
+    v = columns[:, 1]
     # less than a micrometre is noise or rounding, not motion
     if np.std(columns[:, 0]) < 1e-6:
         return

@@ -210,7 +210,12 @@ def _machine_file_content(
         data["couplings"] = [*(data.get("couplings") or ()), coupling]
         motor_urdfs[chain["urdf"]] = text
     data["friction"] = _friction_data(result, spec, laws)
-    data["rotor_inertia"] = _rotor_inertias(result, spec)
+    rotors = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
+    rotors |= _parameters_of_kind(result, "rotor_inertia")
+    for joint, value in rotors.items():
+        if value < 0:
+            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
+    data["rotor_inertia"] = {joint: value for joint, value in rotors.items() if value}
     scales = _parameters_of_kind(result, "gas_scale")
     moving = lock_joints(spec, machine.locked_joints) if machine.locked_joints else spec
 
@@ -261,16 +266,6 @@ def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
     return {
         name.removesuffix(f".{kind}"): value for name, value in named if name.endswith(f".{kind}")
     }
-
-
-def _rotor_inertias(result: Identification, spec: MachineSpec) -> dict[str, float]:
-    """Rotor inertias by joint, identified or described."""
-    found = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
-    found |= _parameters_of_kind(result, "rotor_inertia")
-    for joint, value in found.items():
-        if value < 0:
-            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
-    return {joint: value for joint, value in found.items() if value}
 
 
 def _friction_data(

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, RecordingError, check_name
 from crane.common.one_line_repr import OneLineRepr
@@ -101,9 +100,9 @@ def differentiate(
         raise InputError(f"method '{method}' {verb} cutoff, give one to 'lowpass' alone")
     if cutoff is not None:
         filtered = low_pass(time, q, cutoff)
-        v = central_differences(time, filtered)
-        half = np.full(q.shape[1], float(cutoff))
-        return Derivatives(filtered, v, central_differences(time, v), passband=half)
+        v = np.gradient(filtered, step, axis=0, edge_order=2)
+        a = np.gradient(v, step, axis=0, edge_order=2)
+        return Derivatives(filtered, v, a, passband=np.full(q.shape[1], float(cutoff)))
     position, v, a, std_v, std_a = (np.empty(q.shape) for _ in range(5))
     noise, half = np.empty((2, q.shape[1]))
     for i, column in enumerate(q.T):
@@ -208,11 +207,6 @@ def filter_kernel(step: float, cutoff: float) -> Array:
     return np.asarray(weights / weights.sum())
 
 
-def central_differences(time: Array, x: Array) -> Array:
-    """Central differences (x_k+1 - x_k-1) / (2 dt) of x (N, ...); one-sided at the ends."""
-    return np.gradient(x, sampling_step(time), axis=0, edge_order=2)
-
-
 def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array, Array]:
     """Mean over the complete periods of a recording.
 
@@ -302,11 +296,3 @@ def _weighted_means(x: Array, weights: Array, decimation: int) -> Array:
         return np.asarray(whole[kept_samples][: -(-count // decimation)])
 
     return convolved(x) / convolved(np.ones(count)).reshape(-1, *[1] * (x.ndim - 1))
-
-
-def is_moving(v: Array, threshold: ArrayLike) -> np.ndarray:
-    """Mask (N, n) of |v| (N, n) above a threshold, one for all or (n,).
-
-    Near zero velocity the friction laws of the model are not valid.
-    """
-    return np.abs(v) > np.asarray(threshold)

@@ -101,7 +101,12 @@ def outlier_mask(x: Array) -> np.ndarray:
     found = np.zeros(len(x), dtype=bool)
     if len(x) <= 2 * _NEIGHBOUR_COUNT + _MAX_RUN:
         return found
-    noise = _neighbour_noise(x)
+    # robust standard deviation of samples about the mean of their neighbours; coarse samples may
+    # coincide with it: at least the median nonzero step
+    noise = _MAD_TO_STD * float(np.median(np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))))
+    steps = np.abs(np.diff(x))
+    if steps.any():
+        noise = max(noise, float(np.median(steps[steps > 0])))
     while True:  # outliers masked by others appear after these are replaced
         bridged, before = replace_outliers(x, found), found.sum()
         for length in range(1, _MAX_RUN + 1):
@@ -118,17 +123,6 @@ def replace_outliers(x: Array, mask: np.ndarray) -> Array:
     out = x.copy()
     out[mask] = np.interp(np.flatnonzero(mask), good, x[good])
     return out
-
-
-def _neighbour_noise(x: Array) -> float:
-    """Robust standard deviation of samples about the mean of their neighbours.
-
-    Coarse samples may coincide with it: at least the median nonzero step is returned.
-    """
-    deviation = _MAD_TO_STD * float(np.median(np.abs(x[1:-1] - 0.5 * (x[:-2] + x[2:]))))
-    steps = np.abs(np.diff(x))
-    steps = steps[steps > 0]
-    return max(deviation, float(np.median(steps)) if len(steps) else 0.0)
 
 
 def _outlier_runs(x: Array, length: int, noise: float) -> np.ndarray:
