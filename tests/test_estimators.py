@@ -7,12 +7,12 @@ from scipy.stats import f, t
 
 from crane.common.errors import InputError
 from crane.identification.estimation.estimators import (
-    essential_parameters,
     huber,
     instrumental_variables,
     least_squares,
     weighted_least_squares,
 )
+from crane.identification.mechanics.identifiability import essential_parameters
 
 
 def white(count=800, size=4, seed=0, noise=0.5):

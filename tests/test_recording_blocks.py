@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import lfilter
 
 import crane
-from crane.identification.estimation import regression_problem, regressor
+from crane.identification.estimation import estimators, regressor
 from crane.identification.estimation.estimators import (
     huber,
     instrumental_variables,
@@ -63,7 +63,7 @@ def test_estimates_do_not_depend_on_the_blocks(estimator, prior, monkeypatch):
     whole = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     stored = regressor.StoredRegressor.__init__.__defaults__
     monkeypatch.setattr(regressor.StoredRegressor.__init__, "__defaults__", (50,))
-    monkeypatch.setattr(regression_problem, "_GAP_BLOCK", 7)
+    monkeypatch.setattr(estimators, "_GAP_BLOCK", 7)
     found = estimator(parts[0], y, *parts[1:], groups=groups, samples=samples, prior=prior)
     assert stored == (8192,)  # what the first call had: all rows in one block
     keys = ("values", "covariance", "residuals", "noise")

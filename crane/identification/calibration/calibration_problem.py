@@ -90,8 +90,7 @@ class CalibrationProblem:
 
     def fitted_machine(self, z: Array) -> Machine:
         """The machine and its sensors with the changed parameters."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return self._variants.machine(self.changes(z))
 
     def simulated_machine(self, z: Array, friction_smoothing: float) -> Machine:
@@ -100,20 +99,20 @@ class CalibrationProblem:
             x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR_PREFIX)
         }
         key = friction_smoothing, *changes.values()
-        if key not in self._machine_cache:
-            if len(self._machine_cache) >= _MAX_CACHED_MACHINES:
-                self._machine_cache.clear()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                machine = self._variants.machine(changes) if changes else self.machine
-            if friction_smoothing:
-                friction = dict(machine.friction)
-                for joint in (machine.joints[i] for i in find_stick_slip_columns(machine)):
-                    width = friction_smoothing * _FRICTION_SMOOTHING[machine.unit(joint)]
-                    friction[joint] = replace(friction.get(joint, Friction()), smoothing=width)
-                machine = machine.replace(friction=friction)
-            self._machine_cache[key] = machine
-        return self._machine_cache[key]
+        if key in self._machine_cache:
+            return self._machine_cache[key]
+        if len(self._machine_cache) >= _MAX_CACHED_MACHINES:
+            self._machine_cache.clear()
+        with warnings.catch_warnings(action="ignore"):
+            machine = self._variants.machine(changes) if changes else self.machine
+        if friction_smoothing:
+            friction = dict(machine.friction)
+            for joint in (machine.joints[i] for i in find_stick_slip_columns(machine)):
+                width = friction_smoothing * _FRICTION_SMOOTHING[machine.unit(joint)]
+                friction[joint] = replace(friction.get(joint, Friction()), smoothing=width)
+            machine = machine.replace(friction=friction)
+        self._machine_cache[key] = machine
+        return machine
 
     def simulate_readings(self, case: RecordingCase, z: Array, training_only: bool) -> CubicSpline:
         """Simulated ideal readings of a recording's sensors over time.
@@ -130,8 +129,7 @@ class CalibrationProblem:
         inputs = self._inputs_with_start(case, z)
         machine = self.simulated_machine(z, self.smooth)
         step, steps = _step_size_and_count(case, _MAX_STEP, training_only)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             run = simulate(
                 machine, inputs.valve_drive(machine), inputs.initial, steps * step, step
             )
@@ -270,8 +268,7 @@ class CalibrationProblem:
             return base, SimulationConstants(*(np.array(x) for x in zip(*every, strict=True)))
 
         motion = SimulationProblem(dynamics, drive, initial, steps, step)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             solution = integrate_sensitivities(
                 motion,
                 case.sensors,

@@ -139,8 +139,7 @@ class LevenbergMarquardt:
         """
         problem, count = self.problem, len(self.problem.unknowns)
         minima = [self._minimize(z, _INITIAL_COST_TOLERANCE, _CAUTIOUS_DAMPING)]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             parts = [
                 x
                 for case in self.training_cases

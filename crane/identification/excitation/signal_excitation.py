@@ -213,8 +213,7 @@ def excite_valves(
     information = SignalInformation(machine, fit, sensors, noise, as_seed(seed))
     limits = SignalLimits(information, margin)
     search = ExchangeAlgorithm(information, limits, CRITERIA[criterion], duration, step, rate)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         reference_run, best = search.run(trials, np.random.default_rng(seed), progress)
         initial_information, optimized_information = map(
             information.measures, (reference_run, best)

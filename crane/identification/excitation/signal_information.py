@@ -143,8 +143,7 @@ class SignalInformation:
             CraneError: The simulation of a perturbed machine fails.
         """
         names, table = list(self.units), self.expected_readings(run, noisy=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             case = recording_case(self.machine, "the design", table, {}, names, (0.0, np.inf))
         if not self._problem.cases:
             self._problem = self._smoothed_problem([case])

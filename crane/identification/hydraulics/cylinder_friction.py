@@ -19,8 +19,7 @@ from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import Estimate, EstimatedValues
+from crane.identification.estimation.estimators import Estimate, EstimatedValues, least_squares
 from crane.identification.mechanics.smoothed_motion import smoothed_motion
 from crane.identification.signals.signal_quality import steady_samples
 from crane.machine.machine import Machine
@@ -151,7 +150,7 @@ def identify_cylinder_friction(
             raise RecordingError(f"stiction of '{joint}' cannot be determined: {note}")
     if estimate is None:
         W = _friction_columns(speed, described_friction.smoothing)
-        estimate = estimators.least_squares(W, force, samples=at)
+        estimate = least_squares(W, force, samples=at)
     return CylinderFriction(
         joint=joint,
         values=estimate.values,
@@ -217,7 +216,7 @@ def _fit_with_stiction(
     J = np.column_stack([W, stribeck_derivative])
     if np.linalg.cond(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)) > 1e8:
         return None, f"{low} show no stiction"
-    estimate = estimators.least_squares(
+    estimate = least_squares(
         J, force - _friction_law(values, v, smoothing) + J @ values, samples=at
     )
     if not linear[3] > 3 * estimate.std[3]:

@@ -13,8 +13,11 @@ from crane.common.errors import InputError, check_name
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
-from crane.identification.estimation import estimators
-from crane.identification.estimation.regression_problem import EstimatedValues
+from crane.identification.estimation.estimators import (
+    EstimatedValues,
+    instrumental_variables,
+    least_squares,
+)
 from crane.identification.hydraulics.cylinder_signals import (
     SIGNAL_NAMES,
     CylinderSignals,
@@ -145,7 +148,7 @@ def identify_orifices(
     opening crosses zero or its end are omitted, as the integrands have kinks there. Rows use every
     other sample, with the samples between them as instruments, so that white noise does not bias
     X. Standard errors propagate the white noise of the sensors to X; residuals beyond that noise
-    add the covariance of `estimators.instrumental_variables`, with its correlation in time.
+    add the covariance of `instrumental_variables`, with its correlation in time.
 
     "chambers": the same with the two equations of (23) instead of their difference (29). In (29)
     c1 and c2 (and c3, c4) differ only by the change of V_A / V_B along the stroke; here each has
@@ -189,20 +192,20 @@ def identify_orifices(
     runs = [cylinder_signals(machine, one, joint, period) for one in recordings]
     sets = [OrificeEquations(machine, joint, run, window, method == "chambers") for run in runs]
     _check_identifiable(sets, joint)
+    levels = []
+    for one, run in zip(recordings, runs, strict=True):
+        level = {name: noise_std(getattr(run, name)) for name in SIGNAL_NAMES}
+        if f"spool_{joint}" not in one.channels and valve.bandwidth:
+            # the spool dynamics keep the noise of the signal at the low frequencies of the
+            # windows, and remove it from differences between samples
+            volts = noise_std(one.channels[f"voltage_{joint}"])
+            scale = abs(valve.full - valve.neutral) * (1 - valve.dead_band)
+            periods = max(len(one.time) // len(run.time), 1)
+            level["opening"] = volts / scale / np.sqrt(periods)
+        levels.append(level | dict(noise or {}))
     if method == "ls":
         values, covariance, freedom, condition, misfit = _pointwise_estimate(machine, joint, runs)
     else:
-        levels = []
-        for one, run in zip(recordings, runs, strict=True):
-            level = {name: noise_std(getattr(run, name)) for name in SIGNAL_NAMES}
-            if f"spool_{joint}" not in one.channels and valve.bandwidth:
-                # the spool dynamics keep the noise of the signal at the low frequencies of the
-                # windows, and remove it from differences between samples
-                volts = noise_std(one.channels[f"voltage_{joint}"])
-                scale = abs(valve.full - valve.neutral) * (1 - valve.dead_band)
-                periods = max(len(one.time) // len(run.time), 1)
-                level["opening"] = volts / scale / np.sqrt(periods)
-            levels.append(level | dict(noise or {}))
         values, covariance, freedom, condition, misfit = _weak_form_estimate(sets, levels, joint)
     _check_values(values, covariance, joint, method, runs)
     training = tuple(rows.sides(values) for rows in sets)
@@ -231,7 +234,7 @@ def _weak_form_estimate(
     group = np.concatenate(groups)[order]
     W_all, Z_all, y_all = (np.concatenate(part)[order] for part in (W, Z, y))
     try:
-        estimate = estimators.instrumental_variables(
+        estimate = instrumental_variables(
             W_all, y_all, Z_all, group, np.concatenate(samples)[order]
         )
     except InputError as error:
@@ -288,9 +291,7 @@ def _pointwise_estimate(
         y.append((-found.v[:, 1] * stiff)[::every])
         samples.append(start + np.arange(len(y[-1])))
         start += len(y[-1]) + 100
-    estimate = estimators.least_squares(
-        np.concatenate(W), np.concatenate(y), samples=np.concatenate(samples)
-    )
+    estimate = least_squares(np.concatenate(W), np.concatenate(y), samples=np.concatenate(samples))
     freedom = np.full(5, estimate.degrees_of_freedom)
     return estimate.values, estimate.covariance, freedom, estimate.scaled_condition, np.nan
 

@@ -182,8 +182,7 @@ def _held_out_error(
             for part in (slice(0, start), slice(stop, None))
             if len(motion.time[part]) >= _MIN_FOLD_SAMPLES
         ]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)
+    with warnings.catch_warnings(action="ignore", category=CraneWarning):
         trial = identify_options(settings, options)
         # checks are not reliable on folds; the complete recordings were checked
         identification = identify(machine, training, **trial | {"trust": True})

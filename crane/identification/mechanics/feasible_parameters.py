@@ -18,7 +18,7 @@ import numpy as np
 from crane.common.errors import CraneError, InputError
 from crane.common.optional_libraries import import_optional_library
 from crane.common.samples import Array
-from crane.identification.estimation.regression_problem import Estimate, Prior, RegressionProblem
+from crane.identification.estimation.estimators import Estimate, Prior, RegressionProblem
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.regression_equations import (

@@ -10,7 +10,7 @@ from scipy.linalg import qr
 from crane.common.errors import InputError, check_name
 from crane.common.samples import Array, as_number, as_sample
 from crane.description.estimation_settings import ParameterPrior
-from crane.identification.estimation.regression_problem import Prior
+from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.feasible_parameters import body_size, body_units
 from crane.identification.mechanics.identification_model import IdentificationModel
@@ -177,12 +177,11 @@ def prior_from_names(
         others = model.names[count:] if everything else _matching_names(model.names, name)
         for i in map(model.names.index, others):
             mean[i] = model.nominal[i] if what.mean is None else what.mean
+            # an offset of zero is relative to the friction that it is an offset of
             where, _, kind = model.names[i].rpartition(".")
-            size = what.std
-            if what.relative:  # of an offset of zero, to the friction that it is an offset of
-                law = model.machine.friction.get(where) if kind.endswith("_offset") else None
-                other = float(getattr(law, kind.removesuffix("_offset"), 0.0))
-                size *= abs(mean[i]) or other
+            law = model.machine.friction.get(where) if kind.endswith("_offset") else None
+            reference = abs(mean[i]) or float(getattr(law, kind.removesuffix("_offset"), 0.0))
+            size = what.std * (reference if what.relative else 1.0)
             std[i] = size or (parameter_sizes[i] or 1.0)
         place = name.rpartition(".")[0]
         if not bodies and not others and not fnmatch.filter(model.machine.locked_joints, place):
@@ -279,3 +278,40 @@ def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
         "separately: move the joints both ways and at several speeds, give prior=(means, "
         "deviations) with finite ones for them, or omit the prior to estimate base parameters"
     )
+
+
+def essential_parameters(estimate: Estimate, level: float = 0.05) -> np.ndarray:
+    """Essential parameters, without which the model would be significantly worse.
+
+    The parameter with the largest relative standard deviation is set to zero and the others are
+    updated by their covariances, repeatedly, until an F-test of all zero parameters against the
+    full estimate rejects at `level`:
+
+        F = theta_d^T C_dd^-1 theta_d / d.
+
+    For least squares with independent noise this is (RSS_reduced - RSS) / (d sigma^2), and the
+    updates equal new estimates; it remains valid for correlated noise.
+
+    Returns:
+        Indices of the kept parameters, increasing.
+
+    Source: Pham, Gautier 1991, essential parameters of robots, IEEE CDC.
+    """
+    from scipy.stats import f
+
+    kept, dropped = list(range(len(estimate.values))), list[int]()
+    values, covariance = estimate.values, estimate.covariance
+    while len(kept) > 1:
+        std = np.sqrt(np.diag(covariance))
+        worst = int(np.argmax(std / np.maximum(np.abs(values), np.finfo(float).tiny)))
+        trial = [*dropped, kept[worst]]
+        theta = estimate.values[trial]
+        F = theta @ np.linalg.solve(estimate.covariance[np.ix_(trial, trial)], theta) / len(trial)
+        if f.sf(F, len(trial), estimate.degrees_of_freedom) < level:
+            break
+        gain = covariance[:, worst] / covariance[worst, worst]
+        rest = np.arange(len(kept)) != worst
+        values = (values - gain * values[worst])[rest]
+        covariance = (covariance - np.outer(gain, covariance[worst]))[np.ix_(rest, rest)]
+        dropped.append(kept.pop(worst))
+    return np.array(kept)

@@ -14,7 +14,7 @@ from crane.common.atomic_output import replace_file
 from crane.common.result import Result
 from crane.common.samples import Array
 from crane.common.units import format_table
-from crane.identification.estimation.regression_problem import Estimate, EstimatedValues
+from crane.identification.estimation.estimators import Estimate, EstimatedValues
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identifiability import weak_directions

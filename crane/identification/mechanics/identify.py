@@ -12,8 +12,13 @@ from crane.common.errors import CraneWarning, InputError, RecordingError, check_
 from crane.common.progress import progress_reporter
 from crane.common.samples import Array, as_number, as_sample
 from crane.common.threads import with_single_threaded_blas
-from crane.identification.estimation.estimators import huber, least_squares, weighted_least_squares
-from crane.identification.estimation.regression_problem import Prior, condition_numbers
+from crane.identification.estimation.estimators import (
+    Prior,
+    condition_numbers,
+    huber,
+    least_squares,
+    weighted_least_squares,
+)
 from crane.identification.mechanics.base_parameters import BaseParameters, base_parameters
 from crane.identification.mechanics.feasible_parameters import (
     feasible_estimate,

@@ -12,7 +12,7 @@ from crane.common.progress import progress_reporter
 from crane.common.samples import Array
 from crane.common.threads import with_single_threaded_blas
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.estimation.regression_problem import Estimate
+from crane.identification.estimation.estimators import Estimate
 from crane.identification.estimation.regressor import triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison, check_forces

@@ -8,7 +8,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.units import format_table
 from crane.dynamics.dynamics import Dynamics
-from crane.identification.estimation.regression_problem import EstimatedValues
+from crane.identification.estimation.estimators import EstimatedValues
 from crane.identification.mechanics.feasible_parameters import body_parameters, pseudo_inertia
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_model import IdentificationModel

@@ -9,7 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.identification.estimation.regression_problem import Estimate, Prior
+from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.estimation.regressor import triangular_factor, update_triangular_factor
 from crane.identification.mechanics.base_parameters import BaseParameters
 from crane.identification.mechanics.force_comparison import ForceComparison
@@ -319,7 +319,8 @@ class RegressionEquations:
         Returns:
             The equations of the last iteration, and the estimate.
         """
-        equations, values, previous = self, start, None
+        equations, values = self, start
+        previous = np.full(T.shape[1], np.nan)  # nothing converges to it
         has_free_joints = bool(self._model.machine.free)
         for _ in range(_MAX_ITERATIONS):
             if has_free_joints:
@@ -339,13 +340,10 @@ class RegressionEquations:
                 equations.samples,
                 prior,
             )
-            if not has_free_joints:
+            tolerance = _CONVERGENCE_TOLERANCE * found.std
+            tolerance += _ROUNDING_TOLERANCE * np.abs(previous).max()
+            if not has_free_joints or (np.abs(found.values - previous) <= tolerance).all():
                 break
-            if previous is not None:
-                rounding = _ROUNDING_TOLERANCE * np.abs(previous).max()
-                tolerance = _CONVERGENCE_TOLERANCE * found.std + rounding
-                if (np.abs(found.values - previous) <= tolerance).all():
-                    break
             values, previous = T @ found.values, found.values
         return equations, found
 

@@ -74,8 +74,8 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
     check_rewritable(machine)
     if parameters is None or not identification.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # reported when the machine was loaded
+    # warnings were reported when the machine was loaded
+    with warnings.catch_warnings(action="ignore", category=CraneWarning):
         spec = read_machine_spec(machine.path)
         unlocked_machine = load(machine.path) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
@@ -309,8 +309,7 @@ def _check_written_machine(
         exact: Whether friction is exact; otherwise it is excluded from the comparison.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CraneWarning)
+        with warnings.catch_warnings(action="ignore", category=CraneWarning):
             written = load(file, lock=dict(result.described_machine.locked_joints))
     except CraneError as error:
         # an infeasible body is no error of the file that a user could correct
