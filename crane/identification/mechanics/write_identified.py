@@ -16,6 +16,7 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.description.inertia_feasibility import inertia_problem
+from crane.description.machine_schema import END_STOP, FORCE, GAS_SPRING, LOOP, ROPE
 from crane.description.parameter_changes import lock_joints
 from crane.description.specification import Chain, MachineSpec
 from crane.dynamics.dynamics import Dynamics
@@ -189,10 +190,9 @@ def _machine_file_content(
     machine = result.described_machine
     if machine.path.suffix.lower() == ".urdf":
         data: dict[str, Any] = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
-        data["loops"] = [dataclasses.asdict(loop) for loop in spec.loops]
-        for loop in data["loops"]:
-            del loop["source_location"]
-            loop["axis"] = list(loop["axis"])
+        data["loops"] = [
+            LOOP.values_of(loop) | {"axis": [float(x) for x in loop.axis]} for loop in spec.loops
+        ]
         data["active"] = list(spec.active if spec.active is not None else machine.active)
         if machine.tip is not None:
             data["tip"] = machine.tip
@@ -204,12 +204,17 @@ def _machine_file_content(
     if spec.payload is not None:
         data["payload"] = {"urdf": names[spec.payload.chain.name]}
     motor_urdfs = {}
-    for direction in joint_combinations(result.model):
+    combinations = joint_combinations(result.model)
+    for direction in combinations:
         chain, coupling, text = motor_chain(direction, spec.tree.root_link)
         data["chains"].append(chain)
         data["couplings"] = [*(data.get("couplings") or ()), coupling]
         motor_urdfs[chain["urdf"]] = text
-    data["friction"] = _friction_data(result, spec, laws)
+    friction = {x: law for x, law in spec.friction.items() if x in machine.locked_joints}
+    for joint in (*machine.joints, *(x.name for x in combinations)):
+        if joint in laws or joint in spec.friction:  # without friction in the model it has none
+            friction[joint] = laws.get(joint, Friction())
+    data["friction"] = {joint: friction_data(law) for joint, law in friction.items()}
     rotors = {joint.name: joint.rotor_inertia for joint in spec.tree.moving_joints}
     rotors |= _parameters_of_kind(result, "rotor_inertia")
     for joint, value in rotors.items():
@@ -224,17 +229,14 @@ def _machine_file_content(
         kept = getattr(moving, kind)
         return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
 
-    data["forces"] = [_non_default_fields(item) for item in elements_of("forces")]
+    data["forces"] = [FORCE.values_of(item) for item in elements_of("forces")]
     data["gas_springs"] = {
-        item.joint: _non_default_fields(
-            item, joint=None, pressure=item.pressure * scales.get(item.joint, 1.0)
-        )
+        item.joint: GAS_SPRING.values_of(item)
+        | {"pressure": item.pressure * scales.get(item.joint, 1.0)}
         for item in elements_of("gas_springs")
     }
-    data["ropes"] = [_non_default_fields(item) for item in elements_of("ropes")]
-    data["end_stops"] = {
-        item.joint: _non_default_fields(item, joint=None) for item in elements_of("end_stops")
-    }
+    data["ropes"] = [ROPE.values_of(item) for item in elements_of("ropes")]
+    data["end_stops"] = {item.joint: END_STOP.values_of(item) for item in elements_of("end_stops")}
     for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
         if not data.get(key):
             data.pop(key, None)
@@ -266,35 +268,6 @@ def _parameters_of_kind(result: Identification, kind: str) -> dict[str, float]:
     return {
         name.removesuffix(f".{kind}"): value for name, value in named if name.endswith(f".{kind}")
     }
-
-
-def _friction_data(
-    result: Identification, spec: MachineSpec, laws: Mapping[str, Friction]
-) -> dict[str, dict[str, Any]]:
-    """Friction by joint; joints without friction in the model have none."""
-    machine = result.described_machine
-    friction = {
-        joint: friction_data(law)
-        for joint, law in spec.friction.items()
-        if joint in machine.locked_joints
-    }
-    for joint in (*machine.joints, *(x.name for x in joint_combinations(result.model))):
-        if joint in laws:
-            friction[joint] = friction_data(laws[joint])
-        elif joint in spec.friction:
-            friction[joint] = {"viscous": 0.0}
-    return friction
-
-
-def _non_default_fields(element: Any, **changed: Any) -> dict[str, Any]:
-    """Fields of a dataclass that differ from their defaults."""
-    values = {
-        field.name: changed.get(field.name, getattr(element, field.name))
-        for field in dataclasses.fields(element)
-        if field.name not in changed or changed[field.name] is not None
-    }
-    defaults = {field.name: field.default for field in dataclasses.fields(element)}
-    return {key: value for key, value in values.items() if value != defaults[key]}
 
 
 def _check_written_machine(
