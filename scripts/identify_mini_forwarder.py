@@ -18,10 +18,9 @@ from rig import Converter, Rig, Tolerances, default_sensors
 
 import crane
 from crane.identification.excitation.periodic_excitation import excite
-from crane.identification.mechanics.force_terms import friction_term
 from crane.identification.mechanics.identification_model import IdentificationModel
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model_term import InertialTerm, ModelTerm
+from crane.identification.mechanics.model_terms import InertialTerm, ModelTerm, friction_term
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic
