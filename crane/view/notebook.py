@@ -20,8 +20,7 @@ from crane.recordings.recording_summary import summarize
 from crane.view.machine_facts import MachineFact, machine_facts
 from crane.view.page.html_document import html_table
 from crane.view.page.report_page import report_html
-from crane.view.plots.image_tags import image_tag, svg_tag
-from crane.view.plots.recording_figure import FIGURE_STYLE
+from crane.view.plots.figure_style import FIGURE_STYLE, image_tag, svg_tag
 from crane.view.result_files import figure_function, notebook_figures, result_files
 from crane.view.sketches.sketch_figure import sketch_figure
 

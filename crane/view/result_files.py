@@ -138,7 +138,7 @@ def _view_function(name: str) -> Callable[..., Any]:
 
 
 def _write_figure(path: Path, function: str, *arguments: Any) -> None:
-    from crane.view.plots.recording_figure import write_figure
+    from crane.view.plots.figure_style import write_figure
 
     write_figure(path, lambda: figure_function(function)(*arguments))
 

@@ -3,7 +3,6 @@
 from html import escape
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from crane.common.units import display_unit
@@ -17,14 +16,13 @@ from crane.identification.calibration.calibration_result import (
 from crane.recordings.recording_summary import result_title
 from crane.view.page.html_document import definition_list, html_table, write_document
 from crane.view.plots.calibration_figure import channel_residual_figure, residual_dependence_figure
+from crane.view.plots.figure_style import figure_style, image_tag
 from crane.view.plots.identification_figures import correlation_figure
-from crane.view.plots.image_tags import image_tag
-from crane.view.plots.recording_figure import FIGURE_STYLE
 
 _MIN_MATRIX_PARAMETERS = 3  # numbers, whose correlations need no picture
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def write_calibration_report(calibration: Calibration, path: str | Path) -> Path:
     """Write a calibration as one self-contained HTML file.
 

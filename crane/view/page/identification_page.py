@@ -4,7 +4,6 @@ import dataclasses
 from html import escape
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from crane.identification.estimation.estimators import essential_parameters
@@ -12,13 +11,12 @@ from crane.identification.mechanics.identification_result import Identification
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.recording_summary import result_title
 from crane.view.page.html_document import definition_list, html_table, write_document
+from crane.view.plots.figure_style import RECORDED_COLOUR, figure_style, image_tag
 from crane.view.plots.identification_figures import (
     correlation_figure,
     force_time_figure,
     residual_spectrum_figure,
 )
-from crane.view.plots.image_tags import image_tag
-from crane.view.plots.recording_figure import FIGURE_STYLE, RECORDED_COLOUR
 
 _MAX_GROUP_LENGTH = 70  # letters of a group that are shown at once
 _MAX_PAIRS = 10
@@ -26,7 +24,7 @@ _CORRELATION_THRESHOLD = 0.9
 _VALIDATION_COLOUR = "#2a9d6f"
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def identification_report(
     result: Identification, path: str | Path, recording: str = "", validation: str = ""
 ) -> Path:

@@ -1,6 +1,5 @@
 """Figures of simulated and measured channels: calibrations, residuals, comparisons."""
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,20 +15,21 @@ from crane.identification.calibration.calibration_result import (
 )
 from crane.recordings.recording_summary import result_title
 from crane.simulation.recording_replay import Comparison
-from crane.view.plots.figure_text import envelope, escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    envelope,
+    escape_label,
+    figure_style,
 )
 
 HELD_OUT_COLOUR = "#f1efe8"
 _MAX_PANELS = 18  # panels
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def calibration_figure(calibration: Calibration) -> Figure:
     """Return a panel per channel; held-out instants have a darker background."""
     sensors = calibration.channels[:_MAX_PANELS]

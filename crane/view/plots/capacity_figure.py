@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Mapping, Sequence
 
-import matplotlib as mpl
 import numpy as np
 from contourpy import contour_generator
 from matplotlib.axes import Axes
@@ -12,15 +11,19 @@ from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.ratings.capacity_report import slew_labels
 from crane.ratings.lifting_capacity import Capacity
 from crane.recordings.recording_summary import result_title
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
+from crane.view.plots.figure_style import (
+    INK_COLOUR,
+    add_heading,
+    escape_label,
+    figure_style,
+    set_round_ticks,
+)
 from crane.view.sketches.mechanism_projection import MachineOutline, machine_outline
 
 FACTOR_COLOURS = (
@@ -44,7 +47,7 @@ _MAX_CONTOURS, _CONTOUR_QUANTILES = (
 _ROUND_VALUES = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def capacity_figure(chart: Capacity) -> Figure:
     """Return the figure of a load chart, a panel per slew angle."""
     lower, upper = drawing_extent(chart)
@@ -157,8 +160,7 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
     u, w = chart.section.coordinate_names
     axes.set(xlabel=f"{u} [m]", ylabel=f"{w} [m]")
     axes.set_title(slew_labels(chart)[k], fontsize=9.5, loc="left")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
+    set_round_ticks(axes, 8)
 
 
 def load_contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:

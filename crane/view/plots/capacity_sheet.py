@@ -3,7 +3,6 @@
 import textwrap
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -22,8 +21,13 @@ from crane.view.plots.capacity_figure import (
     drawing_extent,
     factor_colours,
 )
-from crane.view.plots.figure_text import escape_label, escape_text
-from crane.view.plots.recording_figure import FAINT_COLOUR, FIGURE_STYLE, INK_COLOUR
+from crane.view.plots.figure_style import (
+    FAINT_COLOUR,
+    INK_COLOUR,
+    escape_label,
+    escape_text,
+    figure_style,
+)
 
 _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
     11.69,
@@ -36,7 +40,7 @@ _FACTS_WIDTH = 3.5  # width of the facts beside the charts [inch]
 _HEADING_HEIGHT = 0.35  # height of the heading [inch]
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def capacity_sheet_figure(chart: Capacity) -> Figure:
     """Return the page as a figure."""
     table = chart.table

@@ -1,19 +1,13 @@
 """Figures of design optimizations: parameters of all solutions, Pareto front."""
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
 from crane.studies.optimization import Design
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
-    DASHED_STYLE,
-    FIGURE_STYLE,
-    RECORDED_COLOUR,
-)
+from crane.view.plots.figure_style import DASHED_STYLE, RECORDED_COLOUR, escape_label, figure_style
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def design_figure(result: Design) -> Figure:
     """Return solutions over their ranges, and of several objectives the first two."""
     is_multi_objective = len(result.objectives) > 1

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,18 +12,18 @@ from crane.identification.excitation.periodic_excitation import Excitation
 from crane.identification.excitation.signal_excitation import SignalExcitation
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.recording_summary import DISPLAY_UNITS
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
     FAINT_COLOUR,
-    FIGURE_STYLE,
     RECORDED_COLOUR,
+    escape_label,
+    figure_style,
 )
 
 _MAX_POINTS = 2000  # instants that a line needs
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def excitation_figure(excitation: Excitation) -> Figure:
     """Return the figure of a trajectory; limits are dashed, lead times shaded."""
     count = len(excitation.machine.active)
@@ -74,7 +73,7 @@ def _draw_joint(
     joint_axes[-1].set_xlabel("time [s]")
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def signals_figure(excitation: SignalExcitation) -> Figure:
     """Return the figure of valve signals: signal, stroke with dashed limits, pressures."""
     count = len(excitation.signals)

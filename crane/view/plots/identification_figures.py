@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,12 +14,13 @@ from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_result import Identification
 from crane.recordings.recording import FORCE_UNITS
-from crane.view.plots.figure_text import envelope, escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
+    envelope,
+    escape_label,
+    figure_style,
 )
 
 _SEGMENT_COUNT = 8  # of a recording, whose periodograms are averaged
@@ -135,7 +135,7 @@ _DOT_STYLE: Any = {
 _MAX_DOTS = 4000  # dots
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") -> Figure:
     """Return both sides of equation (29) over time, a row per recording.
 
@@ -176,7 +176,7 @@ def equation_sides_figure(runs: Mapping[str, EquationSides], unit: str = "m") ->
     return figure
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def _single_figure(draw: Callable[..., None], *values: object) -> Figure:
     figure = Figure(figsize=(4.6, 3.4), layout="constrained")
     draw(figure.subplots(), *values)

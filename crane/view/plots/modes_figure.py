@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,12 +13,12 @@ from crane.description.machine_lookup import CHANGES_SEPARATOR
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
 from crane.simulation.linear import LinearModel, Mode
 from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
-    FIGURE_STYLE,
+from crane.view.plots.figure_style import (
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    escape_label,
+    figure_style,
 )
 
 _CURVE_COLOURS = (
@@ -38,7 +37,7 @@ _MIN_MODAL_ASSURANCE = 0.2  # modal assurance of a mode that goes on
 _MIN_RESPONSE_SHARE = 1e-6  # share of the largest response that is not drawn
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def modes_figure(model: LinearModel) -> Figure:
     """Return poles with dominant states, and a panel of frequency responses per input."""
     frequencies = _frequency_grid(model)
@@ -60,7 +59,7 @@ def modes_figure(model: LinearModel) -> Figure:
     return figure
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]]) -> Figure:
     """Return frequency and damping over the first parameter; colours for the others."""
     names = list(models[0][0])
@@ -203,7 +202,7 @@ def _draw_response(
 _MAX_PANELS = 18  # panels
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
     """Return a panel per output with nonzero sensitivities, a line per parameter."""
     effects = sensitivities.derivatives * sensitivities.typical_changes

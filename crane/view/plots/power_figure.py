@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -19,8 +18,7 @@ from crane.studies.power_balance_result import (
     part_kind,
     part_owner,
 )
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
+from crane.view.plots.figure_style import INK_COLOUR, add_heading, escape_label, figure_style
 
 _CLASS_PALETTE = (
     "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
@@ -40,7 +38,7 @@ _OWNER_COLOURS = (
 _MAX_POINTS = 1500  # points of a stack
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def power_figure(balance: PowerBalance) -> Figure:
     """Return the power of the shafts over time, stacked by class and by joint.
 
@@ -133,7 +131,7 @@ _BAR_HEIGHT, _GROUP_GAP = 0.14, 0.12  # of a bar, between groups of them [inch]
 _MIN_BAR_SHARE = 1e-3  # share of the largest run's energy that has a bar
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def power_comparison_figure(comparison: PowerComparison) -> Figure:
     """Return shaft power over time, and energy by class with a bar per run."""
     runs = list(comparison.balances)

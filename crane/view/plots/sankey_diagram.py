@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,9 +19,8 @@ from crane.studies.power_balance_result import (
     part_kind,
     part_owner,
 )
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_style import INK_COLOUR, escape_label, figure_style
 from crane.view.plots.power_figure import CLASS_COLOURS
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
 
 _TOTAL_HEIGHT = 4.2  # of all that is given [inch]
 _LABEL_HEIGHT, _LABEL_GAP, _GROUP_GAP = (
@@ -84,7 +82,7 @@ class _SankeyGroup:
         return sum(item.energy for item in self.ribbons)
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def sankey_figure(balance: PowerBalance) -> Figure:
     """Return the energies from the shafts by pump and joint to losses and loads, in kJ and %.
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -13,12 +12,12 @@ from scipy.stats import rankdata
 from crane.common.samples import Array
 from crane.recordings.recording_summary import result_title
 from crane.studies.study_table import Study
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     RECORDED_COLOUR,
     add_heading,
+    escape_label,
+    figure_style,
 )
 
 _MAX_PANELS = 12  # measures of one picture
@@ -28,7 +27,7 @@ _TASK_COLORS = ("#2a9d6f", "#8a5fb0", "#c2452d", "#7f7f3f", "#3f8f9f")
 _INFEASIBLE_COLOUR = "#d9d9d9"
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def study_figure(study: Study) -> Figure:
     """Return the figure of a study, a panel per measure that varies.
 

@@ -1,6 +1,7 @@
 """Figures of tool forces: magnitude, direction and limiting factors."""
 
-import matplotlib as mpl
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -11,8 +12,13 @@ from matplotlib.ticker import MaxNLocator
 from crane.common.samples import Array
 from crane.ratings.tool_forces import ToolForce
 from crane.recordings.recording_summary import result_title
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR, add_heading
+from crane.view.plots.figure_style import (
+    INK_COLOUR,
+    add_heading,
+    add_side_colour_bar,
+    escape_label,
+    figure_style,
+)
 
 _FACTOR_COLOURS = (
     "#1f5fa8",
@@ -31,67 +37,54 @@ _FACTOR_COLOURS = (
 _MAX_ARROWS = 12  # along the larger side
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def tool_force_figure(chart: ToolForce) -> Figure:
     """Return a row per slew angle: forces with arrows, and limiting factors."""
-    count = len(chart.slews)
-    radius_range, height_range = float(np.ptp(chart.radii)), float(np.ptp(chart.heights))
-    directions = chart.section_directions()
-    largest_force = (
-        float(np.nanmax(np.where(np.isfinite(chart.forces), chart.forces, np.nan))) / 1e3
-    )
-    height = np.clip(4.2 * height_range / max(radius_range, 1e-9), 2.6, 6.5) * count + 2.0
-    figure = Figure(figsize=(9.6, float(height)), layout="constrained")
+    count, active_factors = len(chart.slews), chart.active_factors
+    all_forces, directions = chart.forces / 1e3, chart.section_directions()
+    largest_force = float(np.nanmax(np.where(np.isfinite(all_forces), all_forces, np.nan)))
+    aspect = float(np.ptp(chart.heights)) / max(float(np.ptp(chart.radii)), 1e-9)
+    height = float(np.clip(4.2 * aspect, 2.6, 6.5)) * count + 2.0
+    figure = Figure(figsize=(9.6, height), layout="constrained")
     grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
-    active_factors = chart.active_factors
     colors = {k: _FACTOR_COLOURS[j % len(_FACTOR_COLOURS)] for j, k in enumerate(active_factors)}
+    options: Any = {"shading": "nearest", "rasterized": True}
     for s, (left, right) in enumerate(grid):
-        forces = chart.forces[s] / 1e3
-        masked_forces = np.ma.masked_invalid(forces)
+        forces = np.ma.masked_invalid(all_forces[s])
         mesh = left.pcolormesh(
-            chart.radii,
-            chart.heights,
-            masked_forces,
-            shading="nearest",
-            cmap="viridis",
-            vmin=0.0,
-            vmax=largest_force,
-            rasterized=True,
-        )
-        if np.ptp(masked_forces.compressed()) > 0 and min(masked_forces.shape) > 1:
-            lines = left.contour(chart.radii, chart.heights, masked_forces,
+            chart.radii, chart.heights, forces, cmap="viridis", vmin=0.0, vmax=largest_force,
+            **options,
+        )  # fmt: skip
+        if np.ptp(forces.compressed()) > 0 and min(forces.shape) > 1:
+            lines = left.contour(chart.radii, chart.heights, forces,
                                  levels=MaxNLocator(8).tick_values(0, largest_force),
                                  colors="white", linewidths=0.7)  # fmt: skip
             left.clabel(lines, fmt="%g", fontsize=7)
-        _draw_arrows(left, chart, forces, directions[s], largest_force)
-        colour_bar = figure.colorbar(
-            mesh, cax=left.inset_axes((1.03, 0.03, 0.04, 0.94)), label="force [kN]"
-        )
-        colour_bar.outline.set_visible(False)
+        _draw_arrows(left, chart, all_forces[s], directions[s], largest_force)
+        add_side_colour_bar(left, mesh, "force [kN]")
         factor_index = np.full(forces.shape, np.nan)
         for j, k in enumerate(active_factors):
             factor_index[chart.limiting_factor_index[s] == k] = j
-        palette = ListedColormap([colors[k] for k in active_factors] or [INK_COLOUR])
+        palette = ListedColormap(list(colors.values()) or [INK_COLOUR])
         right.pcolormesh(chart.radii, chart.heights, np.ma.masked_invalid(factor_index),
-                         shading="nearest", cmap=palette, vmin=-0.5,
-                         vmax=max(len(active_factors), 1) - 0.5, rasterized=True)  # fmt: skip
+                         cmap=palette, vmin=-0.5, vmax=max(len(colors), 1) - 0.5,
+                         **options)  # fmt: skip
         slew_text = f", slewed {np.rad2deg(chart.slews[s]):.4g}°" if count > 1 else ""
-        left.set_title(f"largest force{slew_text}")
+        u, w = chart.section.coordinate_names
+        left.set(title=f"largest force{slew_text}", ylabel=f"{w} [m]")
         right.set_title("limiting factor")
-        left.set_ylabel(f"{chart.section.coordinate_names[1]} [m]")
         for axes in (left, right):
             axes.set_aspect("equal")
             axes.grid(False)
             if s == count - 1:
-                axes.set_xlabel(f"{chart.section.coordinate_names[0]} [m]")
+                axes.set_xlabel(f"{u} [m]")
     handles = [
-        Swatch(color=colors[k], label=escape_label(str(chart.limiting_factors[k])))
-        for k in active_factors
+        Swatch(color=color, label=escape_label(str(chart.limiting_factors[k])))
+        for k, color in colors.items()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
-    add_heading(
-        figure, escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
-    )
+    heading = result_title(chart.machine.name, f"tool force, {chart.direction}")
+    add_heading(figure, escape_label(heading))
     return figure
 
 

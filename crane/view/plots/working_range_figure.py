@@ -4,24 +4,23 @@ import string
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.motion.workspaces import Workspace
 from crane.ratings.working_range_dimensions import Dimension
 from crane.ratings.working_ranges import WorkingRange
 from crane.recordings.recording_summary import result_title
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    escape_label,
+    figure_style,
+    set_round_ticks,
 )
 from crane.view.plots.workspace_figure import skeleton_lines
 
@@ -29,7 +28,7 @@ _REGION_COLOUR, _SOIL_COLOUR, _LINE_COLOUR = "#e3ecf6", "#8a6d4b", "#666666"
 _LINE_GAP_SHARE = 0.055  # between dimension lines, of the drawing's larger extent
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def working_range_figure(result: WorkingRange) -> Figure:
     """Return the figure of a working range.
 
@@ -58,8 +57,7 @@ def working_range_figure(result: WorkingRange) -> Figure:
     axes.set(xlim=(lower[0] - gap, right), ylim=(bottom, top), aspect="equal",
              xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")  # fmt: skip
     axes.grid(False)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(9, steps=[1, 2, 2.5, 5, 10]))
+    set_round_ticks(axes, 9)
     digits = 2 if max(upper[0], upper[1]) > 2 else 3
     legend = [f"{a}  {x.name}  {x.value:.{digits}f} m" for a, x in letters.items()]
     axes.text(1.03, 1.0, "\n".join(legend), transform=axes.transAxes, va="top", linespacing=1.8)

@@ -1,6 +1,7 @@
 """Figures of workspaces: reach of the tip, and map of the strokes."""
 
-import matplotlib as mpl
+from collections.abc import Iterable
+
 import numpy as np
 import pinocchio as pin
 from matplotlib.axes import Axes
@@ -9,19 +10,20 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch as Swatch
-from matplotlib.ticker import MaxNLocator
 
 from crane.common.samples import Array
 from crane.motion.workspaces import Workspace
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import (
+from crane.view.plots.figure_style import (
     DASHED_STYLE,
-    FIGURE_STYLE,
     INK_COLOUR,
     RECORDED_COLOUR,
     add_heading,
+    add_side_colour_bar,
+    escape_label,
+    figure_style,
     joint_symbol,
+    set_round_ticks,
 )
 
 _REGION_COLOUR, _GRID_COLOUR, _OPEN_COLOUR = "#e3ecf6", "#a9c3e0", "#d9d9d9"
@@ -41,7 +43,7 @@ _CONDITION_TICKS = (1, 1.1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7, 10, 15, 20, 30)
 _GRID_LINE_COUNT = 10  # of the grid, per stroke
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def workspace_figure(reachable_space: Workspace) -> Figure:
     """Return the figure of a workspace.
 
@@ -50,36 +52,27 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     condition number of the drive and the smallest singular value of the tip's Jacobian, grey where
     the loops do not close.
     """
-    lower, upper = (
-        reachable_space.section_positions.min(axis=0),
-        reachable_space.section_positions.max(axis=0),
-    )
     skeleton = skeleton_lines(reachable_space)
-    lower = np.minimum(lower, skeleton.reshape(-1, 2).min(axis=0))
-    upper = np.maximum(upper, skeleton.reshape(-1, 2).max(axis=0))
-    aspect = np.clip((upper - lower)[1] / max((upper - lower)[0], 1e-9), 0.45, 1.5)
-    has_condition_panel = (
-        float(np.nanmax(reachable_space.stroke_map.condition)) > _MIN_SHOWN_CONDITION
-    )
-    height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
-    figure = Figure(figsize=(9.6, height), layout="constrained")
+    points = np.concatenate([reachable_space.section_positions, skeleton.reshape(-1, 2)])
+    width, height = np.ptp(points, axis=0)
+    stroke_map = reachable_space.stroke_map
+    has_condition_panel = float(np.nanmax(stroke_map.condition)) > _MIN_SHOWN_CONDITION
+    aspect = np.clip(height / max(width, 1e-9), 0.45, 1.5)
+    figure_height = float(np.clip(4.6 * aspect, 4.2, 6.2)) + 0.7
+    figure = Figure(figsize=(9.6, figure_height), layout="constrained")
     grid = figure.add_gridspec(1 + has_condition_panel, 2, width_ratios=[1.3, 1.0])
-    _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, (lower, upper))
+    _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, points)
     right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
     if has_condition_panel:
-        _draw_stroke_map(
-            right[0],
-            reachable_space,
-            reachable_space.stroke_map.condition,
-            "condition number of the drive",
-        )
+        condition_label = "condition number of the drive"
+        _draw_stroke_map(right[0], reachable_space, stroke_map.condition, condition_label)
         right[0].sharex(right[1])
         right[0].tick_params(labelbottom=False)
         right[0].set_xlabel("")
     _draw_stroke_map(
         right[-1],
         reachable_space,
-        reachable_space.stroke_map.least_singular_value,
+        stroke_map.least_singular_value,
         "smallest singular value, tip [m]",
     )
     right[0].set_title(_stroke_title(reachable_space))
@@ -87,9 +80,7 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     return figure
 
 
-def _draw_section(
-    axes: Axes, reachable_space: Workspace, skeleton: Array, limits: tuple[Array, Array]
-) -> None:
+def _draw_section(axes: Axes, reachable_space: Workspace, skeleton: Array, points: Array) -> None:
     if reachable_space.area:
         raster = reachable_space.raster
         covered = raster.fill_cracks(2 if reachable_space.is_complete else 6)
@@ -100,65 +91,48 @@ def _draw_section(
             raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=1.1, zorder=3
         )
     else:
-        path = reachable_space.section_positions[
-            np.argsort(
-                reachable_space.q_a[
-                    :, reachable_space.machine.active.index(reachable_space.strokes[0])
-                ]
-            )
-        ]
+        stroke = reachable_space.machine.active.index(reachable_space.strokes[0])
+        path = reachable_space.section_positions[np.argsort(reachable_space.q_a[:, stroke])]
         axes.plot(*path.T, color=RECORDED_COLOUR, linewidth=1.8, zorder=3)
         axes.plot(*path[[0, -1]].T, "o", ms=4.5, color=RECORDED_COLOUR, mfc="white", zorder=4)
     for curve in reachable_space.curves:
+        style = _CURVE_STYLES[curve.kind]
         if len(curve.section_positions) > 1:
-            axes.plot(*curve.section_positions.T, zorder=4, **_CURVE_STYLES[curve.kind])
+            axes.plot(*curve.section_positions.T, zorder=4, **style)
         else:
-            axes.plot(
-                *curve.section_positions.T,
-                "o",
-                ms=5,
-                color=_CURVE_STYLES[curve.kind]["color"],
-                zorder=5,
-            )
+            axes.plot(*curve.section_positions.T, "o", ms=5, color=style["color"], zorder=5)
     axes.add_collection(LineCollection(list(skeleton), colors=INK_COLOUR, linewidths=1.6, zorder=5,
                                        capstyle="round", alpha=0.75))  # fmt: skip
     axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5, alpha=0.75)
-    home_position = reachable_space.section.coordinates(_home_tip(reachable_space)[None])[0]
-    axes.plot(*home_position, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3, zorder=6)
-    axes.set_aspect("equal")
-    margin = 0.05 * float((limits[1] - limits[0]).max())
-    axes.set(
-        xlim=(limits[0][0] - margin, limits[1][0] + margin),
-        ylim=(limits[0][1] - margin, limits[1][1] + margin),
-        anchor="N",
-    )
+    home = _section_positions(reachable_space, [reachable_space.machine.home])
+    axes.plot(*home[0], "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3, zorder=6)
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    margin = 0.05 * float((upper - lower).max())
     u, w = reachable_space.section.coordinate_names
     axes.set(
+        aspect="equal",
+        xlim=(lower[0] - margin, upper[0] + margin),
+        ylim=(lower[1] - margin, upper[1] + margin),
+        anchor="N",
         xlabel=f"{u} [m]",
         ylabel=f"{w} [m]",
         title=f"reach of {escape_label(reachable_space.frame)}",
     )
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]))
+    set_round_ticks(axes, 7)
 
 
 def _grid_images(reachable_space: Workspace) -> list[Array]:
     """Return images (k, 2) in the section of grid lines of the two strokes."""
     patch = reachable_space.stroke_map.patch
-    section_positions = np.full((*patch.is_closed.shape, 2), np.nan)
-    tip_positions = [
-        _tip_position(reachable_space, q) for q in patch.configurations[patch.is_closed]
-    ]
-    section_positions[patch.is_closed] = reachable_space.section.coordinates(
-        np.array(tip_positions)
+    positions = np.full((*patch.is_closed.shape, 2), np.nan)
+    positions[patch.is_closed] = _section_positions(
+        reachable_space, patch.configurations[patch.is_closed]
     )
     extent = float(np.ptp(reachable_space.section_positions, axis=0).max())
     lines: list[Array] = []
-    for rows in (section_positions, section_positions.swapaxes(0, 1)):
-        row_indices = np.unique(
-            np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int)
-        )
-        for row in rows[row_indices]:
+    for rows in (positions, positions.swapaxes(0, 1)):
+        row_indices = np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int)
+        for row in rows[np.unique(row_indices)]:
             steps = np.linalg.norm(np.diff(row, axis=0), axis=1)
             gap_indices = np.flatnonzero(~(steps < _MAX_GAP_SHARE * extent)) + 1
             lines += [
@@ -167,15 +141,16 @@ def _grid_images(reachable_space: Workspace) -> list[Array]:
     return [line for line in lines if len(line) > 1]
 
 
-def _tip_position(reachable_space: Workspace, q: Array) -> Array:
-    model, data = reachable_space.machine.model, reachable_space.machine.model.createData()
-    pin.forwardKinematics(model, data, reachable_space.machine.coordinates.configuration(q))
-    frame = reachable_space.machine.frame(reachable_space.frame)
-    return np.array(pin.updateFramePlacement(model, data, frame).translation)
-
-
-def _home_tip(reachable_space: Workspace) -> Array:
-    return _tip_position(reachable_space, reachable_space.machine.home)
+def _section_positions(reachable_space: Workspace, configurations: Iterable[Array]) -> Array:
+    """Return the positions (N, 2) of the frame in the section."""
+    machine = reachable_space.machine
+    data, frame = machine.model.createData(), machine.frame(reachable_space.frame)
+    positions = []
+    for q in configurations:
+        pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
+        placement = pin.updateFramePlacement(machine.model, data, frame)
+        positions.append(np.array(placement.translation))
+    return reachable_space.section.coordinates(np.array(positions))
 
 
 def skeleton_lines(reachable_space: Workspace) -> Array:
@@ -183,76 +158,63 @@ def skeleton_lines(reachable_space: Workspace) -> Array:
     machine, model = reachable_space.machine, reachable_space.machine.model
     data = model.createData()
     pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
-    line_ends = []
-    for joint in range(1, model.njoints):
-        if model.parents[joint] > 0:
-            line_ends.append(
-                (data.oMi[model.parents[joint]].translation, data.oMi[joint].translation)
-            )
+    line_ends = [
+        (data.oMi[parent].translation, data.oMi[joint].translation)
+        for joint, parent in enumerate(model.parents)
+        if parent > 0
+    ]
     loops = machine.closure.equations.loops
-    for name in [name for loop in loops for name in (loop.predecessor, loop.successor)]:
+    names = [name for loop in loops for name in (loop.predecessor, loop.successor)]
+    for name in [*names, reachable_space.frame]:
         frame = machine.frame(name)
         parent = model.frames[frame].parentJoint
-        if parent > 0:
+        if parent > 0 or name == reachable_space.frame:
             line_ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
-    frame = machine.frame(reachable_space.frame)
-    parent = model.frames[frame].parentJoint
-    line_ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
-    return reachable_space.section.coordinates(np.array(line_ends).reshape(-1, 3)).reshape(
-        -1, 2, 2
-    )
+    points = np.array(line_ends).reshape(-1, 3)
+    return reachable_space.section.coordinates(points).reshape(-1, 2, 2)
 
 
 def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, label: str) -> None:
     """Draw values (a, b) over the two strokes of the map, or over the single stroke."""
     machine, stroke_map = reachable_space.machine, reachable_space.stroke_map
-    patch = stroke_map.patch
-    names = [machine.active[i] for i in patch.stroke_pair]
+    patch, strokes = stroke_map.patch, list(stroke_map.patch.stroke_pair)
+    names = [machine.active[i] for i in strokes]
     units = [DISPLAY_UNITS[machine.unit(name)] for name in names]
     factors = np.array([factor for _, factor in units])
     labels = [f"{joint_symbol(n)} [{u}]" for n, (u, _) in zip(names, units, strict=True)]
-    home = machine.home[machine.closure.active][list(patch.stroke_pair)] * factors
+    home = machine.home[machine.closure.active][strokes] * factors
     x = patch.axes[0] * factors[0]
     axes.set(xlabel=labels[0], anchor="N")
-    if patch.stroke_pair[0] == patch.stroke_pair[1]:
+    if strokes[0] == strokes[1]:
         axes.plot(x, values[:, 0], color=RECORDED_COLOUR)
         for curve in stroke_map.curves:
-            axes.axvline(
-                curve.q_a[0, patch.stroke_pair[0]] * factors[0], **_CURVE_STYLES[curve.kind]
-            )
+            axes.axvline(curve.q_a[0, strokes[0]] * factors[0], **_CURVE_STYLES[curve.kind])
         home_value = np.interp(home[0], x, values[:, 0])
         axes.plot(home[0], home_value, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
-        axes.set(xlim=(x[0], x[-1]), ylabel=label)
         top = min(float(np.nanmax(values)), _MAX_SHOWN_CONDITION * float(np.nanmin(values)) + 1)
-        axes.set_ylim(0, 1.1 * top)
+        axes.set(xlim=(x[0], x[-1]), ylabel=label, ylim=(0, 1.1 * top))
         return
     y = patch.axes[1] * factors[1]
     axes.grid(False)
     axes.set_facecolor(_OPEN_COLOUR)
-    largest = float(np.nanmax(values))
-    is_truncated = values is stroke_map.condition and largest > _MAX_SHOWN_CONDITION
+    largest, is_condition = float(np.nanmax(values)), values is stroke_map.condition
     norm: Normalize = Normalize(0.0, largest)
-    if values is stroke_map.condition:
+    if is_condition:
         bottom = float(np.nanmin(values))
         norm = LogNorm(bottom, max(min(largest, _MAX_SHOWN_CONDITION), 1.5 * bottom))
     mesh = axes.pcolormesh(
         x, y, np.ma.masked_invalid(values.T), norm=norm, shading="nearest", rasterized=True,
-        cmap="viridis" if values is stroke_map.condition else "cividis_r",
+        cmap="viridis" if is_condition else "cividis_r",
     )  # fmt: skip
     for curve in stroke_map.curves:
-        axes.plot(
-            *(curve.q_a[:, list(patch.stroke_pair)] * factors).T, **_CURVE_STYLES[curve.kind]
-        )
+        axes.plot(*(curve.q_a[:, strokes] * factors).T, **_CURVE_STYLES[curve.kind])
     axes.plot(*home, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), ylabel=labels[1])
-    figure = axes.get_figure()
-    assert figure is not None, "axes belong to a figure"
-    colour_bar_axes = axes.inset_axes((1.03, 0.03, 0.04, 0.94))
-    colour_bar = figure.colorbar(
-        mesh, cax=colour_bar_axes, label=label, extend="max" if is_truncated else "neither"
+    is_truncated = is_condition and largest > _MAX_SHOWN_CONDITION
+    colour_bar = add_side_colour_bar(
+        axes, mesh, label, extend="max" if is_truncated else "neither"
     )
-    colour_bar.outline.set_visible(False)
-    if values is stroke_map.condition:
+    if is_condition:
         ticks = [
             value for value in _CONDITION_TICKS if (norm.vmin or 0) <= value <= (norm.vmax or 0)
         ]
@@ -261,12 +223,8 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
 
 
 def _stroke_title(reachable_space: Workspace) -> str:
-    mapped_strokes = [
-        reachable_space.machine.active[i] for i in reachable_space.stroke_map.patch.stroke_pair
-    ]
-    others = [
-        joint_symbol(joint) for joint in reachable_space.strokes if joint not in mapped_strokes
-    ]
+    active, pair = reachable_space.machine.active, reachable_space.stroke_map.patch.stroke_pair
+    others = [joint_symbol(x) for x in reachable_space.strokes if active.index(x) not in pair]
     if not others:
         return "strokes" if len(reachable_space.strokes) > 1 else "along the stroke"
     return f"strokes, {', '.join(others) if len(others) < 3 else 'others'} at home"
@@ -274,21 +232,20 @@ def _stroke_title(reachable_space: Workspace) -> str:
 
 def _add_caption(figure: Figure, reachable_space: Workspace) -> None:
     heading = escape_label(result_title(reachable_space.machine.name, "workspace"))
-    if reachable_space.slewing_joint_name is not None:
-        i = reachable_space.machine.active.index(reachable_space.slewing_joint_name)
-        slewing_range = np.rad2deg([reachable_space.lower[i], reachable_space.upper[i]])
-        heading += (
-            f", turned by {joint_symbol(reachable_space.slewing_joint_name)} from "
-            f"{slewing_range[0]:.4g}° to {slewing_range[1]:.4g}°"
-        )
+    if (slewing := reachable_space.slewing_joint_name) is not None:
+        i = reachable_space.machine.active.index(slewing)
+        lower, upper = np.rad2deg([reachable_space.lower[i], reachable_space.upper[i]])
+        heading += f", turned by {joint_symbol(slewing)} from {lower:.4g}° to {upper:.4g}°"
     add_heading(figure, heading)
     handles: list[Line2D | Swatch] = [
         Line2D([], [], marker="o", ls="", color=INK_COLOUR, mfc="white", mew=1.3, label="home")
     ]
     kinds = {curve.kind for curve in (*reachable_space.curves, *reachable_space.stroke_map.curves)}
-    for kind, heading in _CURVE_LABELS.items():
-        if kind in kinds:
-            handles.append(Line2D([], [], label=heading, **_CURVE_STYLES[kind]))
+    handles += [
+        Line2D([], [], label=label, **_CURVE_STYLES[kind])
+        for kind, label in _CURVE_LABELS.items()
+        if kind in kinds
+    ]
     if not reachable_space.stroke_map.patch.is_closed.all() and reachable_space.area:
         handles.append(Swatch(color=_OPEN_COLOUR, label="loops do not close"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

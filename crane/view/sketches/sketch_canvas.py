@@ -16,8 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from crane.common.samples import Array
 from crane.machine.machine import Machine
 from crane.recordings.recording_summary import DISPLAY_UNITS
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import INK_COLOUR
+from crane.view.plots.figure_style import INK_COLOUR, escape_label
 from crane.view.sketches.sketch_elements import DrawingPlane, SketchMechanism
 
 HullCorner = tuple[float, ...]

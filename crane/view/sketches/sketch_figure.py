@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -15,8 +14,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.machine.machine import Machine
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
+from crane.view.plots.figure_style import escape_label, figure_style, write_figure
 from crane.view.sketches.label_placement import SketchLabel, find_clear_point, place_labels
 from crane.view.sketches.mechanism_projection import COINCIDENCE_TOLERANCE, project_mechanism
 from crane.view.sketches.sketch_canvas import (
@@ -91,7 +89,7 @@ def sketch(
     )
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def sketch_figure(
     machine: Machine,
     q_a: ArrayLike | None = None,

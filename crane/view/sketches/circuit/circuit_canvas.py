@@ -13,7 +13,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
 
 from crane.common.samples import Array
-from crane.view.plots.recording_figure import INK_COLOUR
+from crane.view.plots.figure_style import INK_COLOUR
 
 SheetPoint = tuple[float, float]
 _COORDINATE_TOLERANCE = 1e-6  # [points]

@@ -4,15 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from crane.common.errors import InputError
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine
-from crane.view.plots.figure_text import escape_label
-from crane.view.plots.recording_figure import FIGURE_STYLE, write_figure
+from crane.view.plots.figure_style import escape_label, figure_style, write_figure
 from crane.view.sketches.circuit import circuit_section
 from crane.view.sketches.circuit.circuit_canvas import SMALL_TEXT_SIZE, CircuitCanvas
 from crane.view.sketches.circuit.circuit_functions import (
@@ -45,7 +43,7 @@ def sketch_circuit(machine: Machine, path: str | Path) -> None:
     write_figure(path, lambda: circuit_figure(machine)[0])
 
 
-@mpl.rc_context(FIGURE_STYLE)
+@figure_style
 def circuit_figure(machine: Machine) -> tuple[Figure, CircuitCanvas]:
     """Return the figure of a circuit and its canvas; see `sketch_circuit`.
 

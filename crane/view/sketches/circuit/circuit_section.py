@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from crane.hydraulics.circuit_elements import TANK_NODE
 from crane.hydraulics.components import CounterbalanceValve
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_style import escape_label
 from crane.view.sketches.circuit import machine_symbols, valve_symbols
 from crane.view.sketches.circuit.circuit_canvas import (
     NAME_TEXT_SIZE,

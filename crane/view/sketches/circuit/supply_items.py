@@ -11,7 +11,7 @@ from crane.hydraulics.circuit_elements import (
     Supply,
 )
 from crane.hydraulics.hydraulic_circuit import Hydraulics
-from crane.view.plots.figure_text import escape_label
+from crane.view.plots.figure_style import escape_label
 from crane.view.sketches.circuit import machine_symbols, valve_symbols
 from crane.view.sketches.circuit.circuit_canvas import NAME_TEXT_SIZE, CircuitCanvas, SymbolPose
 from crane.view.sketches.circuit.circuit_functions import CircuitFunction
