@@ -76,8 +76,11 @@ def write_result(
     """Write a result into a folder, see `Result.write`."""
     files, folder = _checked_files(result, options), Path(folder)
     check_folder_is_writable(folder, overwrite)
-    stale = [*files.more_files, *(files.stale(result, folder) if files.stale else ())]
-    with replace_folder(folder, overwrite, stale) as part:
+    with replace_folder(
+        folder,
+        overwrite,
+        [*files.more_files, *(files.stale(result, folder) if files.stale else ())],
+    ) as part:
         text = files.text(result, **options)
         if files.summary:
             (part / files.summary).write_text(text, encoding="utf-8")
@@ -261,8 +264,10 @@ def _write_machine(write: Callable[[], object], consequence: str) -> None:
 def _machine_files(machine: Machine, folder: Path) -> Sequence[str]:
     """Machine files of an earlier result in a folder, unless the machine was read from them."""
     target = (folder / MACHINE_FOLDER).resolve()
-    read_files = (machine.path, *(chain.urdf for chain in machine.chains))
-    is_read = any(file.resolve().is_relative_to(target) for file in read_files)
+    is_read = any(
+        file.resolve().is_relative_to(target)
+        for file in (machine.path, *(chain.urdf for chain in machine.chains))
+    )
     if is_read or not (folder / REPORT).is_file():
         return ()
     return [f"{MACHINE_FOLDER}/**/*.{suffix}" for suffix in ("yaml", "urdf")]

@@ -142,9 +142,12 @@ class LivePage:
                 machine.active, session.lower, session.upper, session.posture.q_a, strict=True
             ):
                 unit, scale = DISPLAY_UNITS[machine.unit(joint)]
-                label = f"{joint} [{unit}]"
                 self._add_slider(
-                    f"joint {joint}", label, scale * lower, scale * upper, scale * value
+                    f"joint {joint}",
+                    f"{joint} [{unit}]",
+                    scale * lower,
+                    scale * upper,
+                    scale * value,
                 )
             self._add_button(_HOME_KEY, "Home")
         if machine.tip is not None:
@@ -180,8 +183,7 @@ class LivePage:
         """Process requests; of several requests of one widget only the last."""
         for key, value in dict(pending_requests).items():
             try:
-                readout = self._process_request(key, value)
-                self._update_widgets(readout)
+                self._update_widgets(self._process_request(key, value))
             except Exception as error:  # one window's mistake does not end it for the others
                 message = str(error) if isinstance(error, CraneError) else f"not done: {error!r}"
                 self._warning_html.content = warning_html(message)

@@ -53,8 +53,7 @@ class LiveScene:
 
     def update_poses(self) -> None:
         """Update the poses of all links from the session."""
-        poses = self._session.link_poses(self._links)
-        for frame, pose in zip(self._frames, poses, strict=True):
+        for frame, pose in zip(self._frames, self._session.link_poses(self._links), strict=True):
             x, y, z, w = pin.Quaternion(pose[:3, :3]).coeffs()
             frame.position = pose[:3, 3]
             frame.wxyz = np.array([w, x, y, z])

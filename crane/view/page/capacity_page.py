@@ -75,9 +75,6 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
         for joint in machine.active
     ]
     shapes: dict[str, int] = {}
-    standing_outlines = [
-        _round_points(home_outline.stationary_hull, unit) for home_outline in home_outlines(chart)
-    ]
     return {
         "facts": capacity_facts(chart),
         "names": chart.section.coordinate_names,
@@ -89,7 +86,10 @@ def capacity_page_data(chart: Capacity) -> dict[str, Any]:
         "causes": [str(cause) for cause in chart.limiting_factors],
         "tints": factor_colours(chart),
         "drives": drives,
-        "standing": standing_outlines,
+        "standing": [
+            _round_points(home_outline.stationary_hull, unit)
+            for home_outline in home_outlines(chart)
+        ],
         "cells": [_cell_rows(chart, k, pressures, unit, shapes) for k in range(len(chart.slews))],
         "contours": [_contour_rows(chart, k, unit) for k in range(len(chart.slews))],
         "shapes": [json.loads(shape) for shape in shapes],

@@ -98,8 +98,10 @@ def load_markers(machine: Machine, recording: Recording, rows: np.ndarray) -> li
     for column in channels:
         name = column.removeprefix("load_").removesuffix("_force_x")
         if column == f"load_{name}_force_x" and name in frames:
-            axes = (channels.get(f"load_{name}_force_{axis}") for axis in "xyz")
-            forces[name] = [np.zeros(len(recording.time)) if x is None else x for x in axes]
+            forces[name] = [
+                np.zeros(len(recording.time)) if x is None else x
+                for x in (channels.get(f"load_{name}_force_{axis}") for axis in "xyz")
+            ]
     for name in machine.supports:
         if f"support_{name}" in channels and name not in forces:
             forces[name] = [np.zeros(len(recording.time))] * 2 + [channels[f"support_{name}"]]

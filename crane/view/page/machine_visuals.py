@@ -51,11 +51,12 @@ def read_visuals(machine: Machine) -> list[Visual]:
         _warn(f"{problems[0]}{more_text}")
     frames = machine.model.frames
     shown_joints = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
-    bare = all(visual.shape is box for visual in visuals)
     long = {joint for joint, end, _ in _body_points(machine) if joint and end.any()}
     masses = machine.model.inertias
     bodies = {joint for joint in long - shown_joints if masses[joint].mass}
-    visuals += skeleton_visuals(machine, None if bare else bodies)
+    visuals += skeleton_visuals(
+        machine, None if all(visual.shape is box for visual in visuals) else bodies
+    )
     return visuals + sliding_body_visuals(machine, shown_joints)
 
 
@@ -65,9 +66,12 @@ def _warn(text: str) -> None:
 
 def _largest_joint_distance(machine: Machine) -> float:
     """Return the largest distance between two joints on one body [m]; 1 if all are 0."""
-    joint_placements = machine.model.jointPlacements
     return (
-        max(float(np.linalg.norm(placement.translation)) for placement in joint_placements) or 1.0
+        max(
+            float(np.linalg.norm(placement.translation))
+            for placement in machine.model.jointPlacements
+        )
+        or 1.0
     )
 
 
@@ -77,8 +81,9 @@ def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
     bodies = (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
     points = [(frame.parentJoint, frame.placement.translation, frame.name) for frame in bodies]
     for joint in range(1, model.njoints):
-        point = model.jointPlacements[joint].translation
-        points.append((model.parents[joint], point, model.names[joint]))
+        points.append(
+            (model.parents[joint], model.jointPlacements[joint].translation, model.names[joint])
+        )
     return points
 
 

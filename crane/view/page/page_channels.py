@@ -207,9 +207,8 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
     for i, joint in enumerate(recording.joints):
         unit = recording.units[joint]
         is_angle, is_passive = unit == "rad", joint not in machine.active
-        column = machine.column(joint)
         lower, upper = (
-            float(limits[column])
+            float(limits[machine.column(joint)])
             for limits in (machine.coordinates.lower, machine.coordinates.upper)
         )
         group_titles = (
@@ -232,13 +231,12 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
             reference(joint),
             (lower, upper),
         )
-        velocity_unit = VELOCITY_UNITS[unit]
         reference_velocity = reference(f"velocity_{joint}")
         yield PageColumn(
             joint + VELOCITY_SUFFIX,
             group_titles[1],
             joint,
-            velocity_unit,
+            VELOCITY_UNITS[unit],
             recording.v[:, i],
             reference_velocity,
         )

@@ -203,8 +203,9 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
     frames = {link: machine.frame(link) for link in links}
     poses = {link: np.empty((len(q), 4, 4)) for link in frames}
     for i, configuration in enumerate(q):
-        pinocchio_configuration = machine.coordinates.configuration(configuration)
-        pin.framesForwardKinematics(machine.model, data, pinocchio_configuration)
+        pin.framesForwardKinematics(
+            machine.model, data, machine.coordinates.configuration(configuration)
+        )
         for link, frame in frames.items():
             poses[link][i] = data.oMf[frame].homogeneous
     for link, pose in poses.items():
@@ -219,13 +220,15 @@ def ground_height(machine: Machine, visuals: Sequence[Visual]) -> float:
     Without fixed visuals this is the height of the origin, because the reach of the tip does not
     determine the ground.
     """
-    heights = [
-        float((frame.placement * corner)[2])
-        for visual in visuals
-        if not (frame := machine.model.frames[machine.frame(visual.link)]).parentJoint
-        for corner in visual.bounding_corners()
-    ]
-    return min(heights, default=0.0)
+    return min(
+        [
+            float((frame.placement * corner)[2])
+            for visual in visuals
+            if not (frame := machine.model.frames[machine.frame(visual.link)]).parentJoint
+            for corner in visual.bounding_corners()
+        ],
+        default=0.0,
+    )
 
 
 def _tip_heading(machine: Machine, q: Array, size: float) -> float:

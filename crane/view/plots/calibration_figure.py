@@ -35,8 +35,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
     sensors = calibration.channels[:_MAX_PANELS]
     columns = 2 if len(sensors) > 1 else 1
     rows = -(-len(sensors) // columns)
-    size = (5.6 * columns, 1.9 * rows + 0.8)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(5.6 * columns, 1.9 * rows + 0.8), layout="constrained")
     has_several_recordings = len({sensor.recording for sensor in sensors}) > 1
     for i, sensor in enumerate(sensors):
         axes = figure.add_subplot(rows, columns, i + 1)
@@ -189,9 +188,9 @@ def comparison_figure(comparison: Comparison) -> Figure:
     stride = -(-len(comparison.time) // _MAX_POINTS)
     time = comparison.time[::stride]
     for axes, channel in zip(panels, comparison.channels, strict=False):
-        channel_values = channel.measured, channel.simulated
         unit, scale = display_unit(
-            channel.unit, max(float(np.abs(x).max()) for x in channel_values)
+            channel.unit,
+            max(float(np.abs(x).max()) for x in (channel.measured, channel.simulated)),
         )
         axes.plot(
             time, scale * channel.measured[::stride], color=RECORDED_COLOUR, label="measured"

@@ -58,8 +58,7 @@ def capacity_figure(chart: Capacity) -> Figure:
     height = float(np.clip(8.6 / columns * content_height / content_width, 3.0, 6.5))
     width = float(np.clip(columns * height * content_width / content_height + 1.0, 5.0, 10.0))
     figure = Figure(figsize=(width, lines * height + 1.3), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for k, axes in enumerate(panels):
+    for k, axes in enumerate(figure.subplots(lines, columns, squeeze=False).ravel()):
         if k < panel_count:
             draw_capacity_panel(axes, chart, k)
             if k % columns:
@@ -150,9 +149,13 @@ def draw_capacity_panel(axes: Axes, chart: Capacity, k: int) -> None:
         _draw_contours(axes, chart, k)
     else:
         b, a = np.nonzero(np.isfinite(index))
-        faces = [factor_tints[int(i)] for i in index[b, a]]
         axes.scatter(
-            chart.radii[a], chart.heights[b], c=faces, edgecolors=INK_COLOUR, s=30, zorder=3
+            chart.radii[a],
+            chart.heights[b],
+            c=[factor_tints[int(i)] for i in index[b, a]],
+            edgecolors=INK_COLOUR,
+            s=30,
+            zorder=3,
         )
     if lower[1] < 0 < upper[1] and chart.section.coordinate_names[1] == "height":
         axes.axhline(0.0, color=INK_COLOUR, linewidth=1.0, zorder=2)

@@ -55,8 +55,7 @@ def capacity_sheet_figure(chart: Capacity) -> Figure:
         fontweight="bold",
     )
     _write_text(figure, _PAGE_MARGIN, _PAGE_MARGIN, table_note(chart, table), colour="#555555")
-    table_bottom = _PAGE_MARGIN + 1.6 * _LINE_HEIGHT
-    table_top = _draw_table(figure, chart, table, table_bottom)
+    table_top = _draw_table(figure, chart, table, _PAGE_MARGIN + 1.6 * _LINE_HEIGHT)
     charts_right = _draw_charts(figure, chart, table_top + 0.2, top - _HEADING_HEIGHT)
     _draw_facts(figure, chart, charts_right, top - _HEADING_HEIGHT)
     return figure
@@ -174,27 +173,34 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
                 colour="#555555",
             )
         y += _LINE_HEIGHT
-    headings = [f"{radius:g} m" for radius in table.radii] + ["farthest"]
-    for j, heading_text in enumerate(headings):
+    for j, heading_text in enumerate([f"{radius:g} m" for radius in table.radii] + ["farthest"]):
         middle = right_edges[slew_count * j : slew_count * (j + 1)].mean() - (
             width / 2 - 0.08 if slew_count > 1 else 0.0
         )
-        side = "center" if slew_count > 1 else "right"
-        _write_text(figure, middle, y, heading_text, size=size, ha=side, fontweight="bold")
+        _write_text(
+            figure,
+            middle,
+            y,
+            heading_text,
+            size=size,
+            ha="center" if slew_count > 1 else "right",
+            fontweight="bold",
+        )
     _write_text(figure, right_edges[-1], y, "at [m]", size=size, ha="right", fontweight="bold")
     return top
 
 
 def _draw_row_band(figure: Figure, y: float, right: float) -> None:
     """Draw a tinted band behind a row."""
-    patch = Rectangle(
-        (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
-        (right - _PAGE_MARGIN) / _PAGE_WIDTH,
-        _LINE_HEIGHT / _PAGE_HEIGHT,
-        facecolor=FAINT_COLOUR,
-        alpha=0.45,
-        transform=figure.transFigure,
-        linewidth=0,
-        zorder=-1,
+    figure.add_artist(
+        Rectangle(
+            (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
+            (right - _PAGE_MARGIN) / _PAGE_WIDTH,
+            _LINE_HEIGHT / _PAGE_HEIGHT,
+            facecolor=FAINT_COLOUR,
+            alpha=0.45,
+            transform=figure.transFigure,
+            linewidth=0,
+            zorder=-1,
+        )
     )
-    figure.add_artist(patch)

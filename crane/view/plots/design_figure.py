@@ -46,9 +46,8 @@ def design_figure(result: Design) -> Figure:
     )
     parameter_axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, frameon=False)
     if is_multi_objective:
-        front = np.array([x.objectives[:2] for x in result.solutions])
         axes[0].plot(
-            *front.T,
+            *np.array([x.objectives[:2] for x in result.solutions]).T,
             "o",
             linestyle=DASHED_STYLE,
             color=RECORDED_COLOUR,

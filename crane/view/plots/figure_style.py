@@ -75,8 +75,9 @@ def escape_label(text: str) -> str:
 
 def escape_text(text: str) -> str:
     """Escape a text of any length that is not in a legend, see `escape_label`."""
-    printable = "".join(c if c.isprintable() or c == "\u00a0" else " " for c in text)
-    return printable.replace("$", r"\$")
+    return "".join(c if c.isprintable() or c == "\u00a0" else " " for c in text).replace(
+        "$", r"\$"
+    )
 
 
 def joint_symbol(name: str) -> str:
@@ -101,8 +102,9 @@ def add_side_colour_bar(axes: Axes, mesh: ScalarMappable, label: str, **options:
     """Add a narrow colour bar on the right of axes."""
     figure = axes.get_figure()
     assert figure is not None, "axes belong to a figure"
-    bar_axes = axes.inset_axes((1.03, 0.03, 0.04, 0.94))
-    colour_bar = figure.colorbar(mesh, cax=bar_axes, label=label, **options)
+    colour_bar = figure.colorbar(
+        mesh, cax=axes.inset_axes((1.03, 0.03, 0.04, 0.94)), label=label, **options
+    )
     colour_bar.outline.set_visible(False)
     return colour_bar
 

@@ -34,8 +34,12 @@ def force_time_figure(
     grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
     moving_mask = np.where(comparison.is_moving[:, drive_index], 1.0, np.nan)
-    measured = envelope(comparison.time, comparison.measured[:, drive_index])
-    upper.plot(*measured, color="#9db8d6", linewidth=1.6, label="measured")
+    upper.plot(
+        *envelope(comparison.time, comparison.measured[:, drive_index]),
+        color="#9db8d6",
+        linewidth=1.6,
+        label="measured",
+    )
     upper.plot(
         comparison.time,
         comparison.modelled[:, drive_index] * moving_mask,
@@ -81,9 +85,10 @@ def residual_spectrum_figure(
         moving_residuals = np.where(
             fit.is_moving[:, drive_index], fit.residuals[:, drive_index], 0.0
         )
-        rate = 1 / float(np.median(np.diff(fit.time)))
         frequency, power = welch(
-            moving_residuals, rate, nperseg=-(-len(moving_residuals) // _SEGMENT_COUNT)
+            moving_residuals,
+            1 / float(np.median(np.diff(fit.time))),
+            nperseg=-(-len(moving_residuals) // _SEGMENT_COUNT),
         )
         axes.loglog(frequency[1:], np.sqrt(power[1:]), color=color, linewidth=1.1, label=name)
     axes.set(xlabel="frequency [Hz]", ylabel=f"residual [{unit}/√Hz]")
@@ -109,8 +114,11 @@ def correlation_figure(R: Array, names: Sequence[str]) -> Figure:
     axes.tick_params(length=0)
     axes.grid(False)
     axes.spines[:].set_visible(False)
-    colour_bar_box = ((label_width + size + 0.15) / width, 0.35, 0.12 / width, 0.3)
-    figure.colorbar(image, cax=figure.add_axes(colour_bar_box), ticks=(-1, 0, 1))
+    figure.colorbar(
+        image,
+        cax=figure.add_axes(((label_width + size + 0.15) / width, 0.35, 0.12 / width, 0.3)),
+        ticks=(-1, 0, 1),
+    )
     return figure
 
 
@@ -219,13 +227,15 @@ def draw_friction(axes: Axes, friction: CylinderFriction, unit: str = "m") -> No
         label="steady samples",
         **_DOT_STYLE,
     )
-    extreme_speeds = friction.speed.min(), friction.speed.max()
     lowest_speed = np.abs(friction.speed).min()
-    for direction, extreme_speed in zip((-1, 1), extreme_speeds, strict=True):
+    for direction, extreme_speed in zip(
+        (-1, 1), (friction.speed.min(), friction.speed.max()), strict=True
+    ):
         v = direction * np.geomspace(
             lowest_speed, max(abs(extreme_speed), 1.01 * lowest_speed), 200
         )
-        label = "fit" if direction > 0 else None
-        axes.plot(scale * v, friction.predict(v), label=label, **DASHED_STYLE)
+        axes.plot(
+            scale * v, friction.predict(v), label="fit" if direction > 0 else None, **DASHED_STYLE
+        )
     axes.set(xlabel=f"speed [{text}]", ylabel=f"friction [{force}]")
     axes.legend(loc="upper left", markerscale=2)

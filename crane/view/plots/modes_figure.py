@@ -72,12 +72,19 @@ def parameter_modes_figure(models: Sequence[tuple[dict[str, float], LinearModel]
     for color, (family_values, family) in zip(
         _cycle_colours(len(families)), families.items(), strict=True
     ):
-        pairs = zip(names[1:], family_values, strict=True)
-        label_text = ", ".join(f"{name} {value:g}" for name, value in pairs)
+        label_text = ", ".join(
+            f"{name} {value:g}" for name, value in zip(names[1:], family_values, strict=True)
+        )
         family.sort(key=lambda pair: pair[0])
         for k, (x, frequency, damping) in enumerate(_track_modes(family)):
-            label = escape_label(label_text) if label_text and not k else "_"
-            upper.plot(x, frequency, color=color, marker="o", ms=2.5, label=label)
+            upper.plot(
+                x,
+                frequency,
+                color=color,
+                marker="o",
+                ms=2.5,
+                label=escape_label(label_text) if label_text and not k else "_",
+            )
             lower.plot(x, 100 * damping, color=color, marker="o", ms=2.5)
     upper.set(yscale="log", ylabel="frequency [Hz]")
     lower.set_ylabel("damping [%]")
@@ -174,8 +181,9 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
     axes.set_xlim(10 ** np.floor(powers.min()), 10 ** (np.floor(powers.max()) + 1))
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set(xlabel="frequency [Hz]", ylabel="damping [%]")
-    lowest = min((100 * mode.damping for mode in drawn_modes), default=0.0)
-    axes.set_ylim(min(0.0, 1.5 * lowest), 200.0)
+    axes.set_ylim(
+        min(0.0, 1.5 * min((100 * mode.damping for mode in drawn_modes), default=0.0)), 200.0
+    )
     zero_count = sum(mode.frequency == 0 for mode in model.modes)
     axes.set_title("poles" + (f" ({zero_count} more at zero)" if zero_count else ""))
 
@@ -193,8 +201,13 @@ def _draw_response(
         joint = model.outputs[i]
         unit, factor = DISPLAY_UNITS[model.machine.unit(joint)]
         if response[:, i].max() > _MIN_RESPONSE_SHARE * response[:, position_outputs].max():
-            label = escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]")
-            axes.loglog(frequencies, factor * response[:, i], color=color, lw=1.1, label=label)
+            axes.loglog(
+                frequencies,
+                factor * response[:, i],
+                color=color,
+                lw=1.1,
+                label=escape_label(f"{joint} [{unit}/{model.units[model.inputs[input_index]]}]"),
+            )
     axes.set(title=escape_label(f"per {model.inputs[input_index]}"), xlabel="frequency [Hz]")
     axes.legend(fontsize=6.5)
 
@@ -219,8 +232,12 @@ def sensitivities_figure(sensitivities: Sensitivities) -> Figure:
     for k, (output, unit, values) in enumerate(panels):
         axes = figure.add_subplot(rows, columns, k + 1)
         for i, name in enumerate(sensitivities.parameters):
-            label = escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}")
-            axes.plot(sensitivities.recording.time, values[:, i], linewidth=1.0, label=label)
+            axes.plot(
+                sensitivities.recording.time,
+                values[:, i],
+                linewidth=1.0,
+                label=escape_label(f"{name} + {sensitivities.typical_changes[i]:.3g}"),
+            )
         axes.set_title(escape_label(f"{output} [{unit}]"), fontsize=8.5)
         if k >= len(panels) - columns:
             axes.set_xlabel("time [s]")

@@ -68,8 +68,10 @@ def power_figure(balance: PowerBalance) -> Figure:
     for axes in (upper_axes, lower_axes):
         axes.set_ylabel(f"power [{unit}]")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
-    heading = result_title(balance.machine_name, f"{balance.task_name} power".strip())
-    add_heading(figure, escape_label(heading))
+    add_heading(
+        figure,
+        escape_label(result_title(balance.machine_name, f"{balance.task_name} power".strip())),
+    )
     return figure
 
 
@@ -163,12 +165,18 @@ def power_comparison_figure(comparison: PowerComparison) -> Figure:
     time_axes.set_ylim(bottom=min(0.0, time_axes.get_ylim()[0]))
     figure.legend(loc="outside upper left", ncols=2)
     for i, (run, color) in enumerate(zip(runs, _run_colours(len(runs)), strict=True)):
-        bar_positions = [group_height * k + _BAR_HEIGHT * i for k in range(len(classes))]
         values = [scale * energies[run][kind] for kind in classes]
-        bars = bar_axes.barh(bar_positions, values, height=0.92 * _BAR_HEIGHT, color=color)
+        bars = bar_axes.barh(
+            [group_height * k + _BAR_HEIGHT * i for k in range(len(classes))],
+            values,
+            height=0.92 * _BAR_HEIGHT,
+            color=color,
+        )
         bar_axes.bar_label(bars, [format_number(x) for x in values], padding=2, fontsize=6.5)
-    group_centre = 0.5 * _BAR_HEIGHT * (len(runs) - 1)
-    bar_axes.set_yticks([group_height * k + group_centre for k in range(len(classes))], classes)
+    bar_axes.set_yticks(
+        [group_height * k + (0.5 * _BAR_HEIGHT * (len(runs) - 1)) for k in range(len(classes))],
+        classes,
+    )
     bar_axes.tick_params(axis="y", length=0)
     bar_axes.grid(visible=False, axis="y")
     bar_axes.invert_yaxis()

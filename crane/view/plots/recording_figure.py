@@ -88,8 +88,13 @@ def recording_figure(recording: Recording) -> Figure:
     displacement) have a separate row, and the tip its distance from the reference.
     """
     tip, joints = point_channel(recording, "tip"), recording.joints
-    panels_by_joint = [_joint_panels(recording, index) for index in range(len(joints))]
-    panels = [row for row in zip(*panels_by_joint, strict=True) if any(x.lines for x in row)]
+    panels = [
+        row
+        for row in zip(
+            *[_joint_panels(recording, index) for index in range(len(joints))], strict=True
+        )
+        if any(x.lines for x in row)
+    ]
     rows, bands = len(panels), -(-len(joints) // MAX_COLUMNS)
     columns = -(-len(joints) // bands)
     widths = [1.0] * columns
@@ -104,8 +109,10 @@ def recording_figure(recording: Recording) -> Figure:
         widths.append(1.0 if plane else 1.6)
         margin = 0.0 if plane else 0.3  # the layout overlooks the label of the z axis
     width = 2.4 * sum(widths) + 0.3
-    layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
-    figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
+    figure = Figure(
+        figsize=(width, 2.0 * rows * bands),
+        layout=ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0)),
+    )
     grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
     letters = iter(ascii_lowercase)
     for band, row in itertools.product(range(bands), range(rows)):
@@ -113,14 +120,20 @@ def recording_figure(recording: Recording) -> Figure:
         grid_cells = {i: grid[rows * band + row, i - joints_in_band.start] for i in joints_in_band}
         _draw_row(figure, grid_cells, recording, panels, row, letters)
     if tip is not None:
-        cell = grid[: 3 if reference is None else 2, -1]
-        axes = figure.add_subplot(cell, projection=None if plane else "3d")
+        axes = figure.add_subplot(
+            grid[: 3 if reference is None else 2, -1], projection=None if plane else "3d"
+        )
         _draw_path(axes, [thin_path(x) for x in paths], bounds, plane)
         _add_panel_letter(axes, letters)
         if (distance := tip_error(recording)) is not None:
             axes = figure.add_subplot(grid[2, -1])
-            panel = _TimePanel("tip to reference", "m", {"recording": distance})
-            _draw_panel(axes, recording.time, panel, "mm", 1e3)
+            _draw_panel(
+                axes,
+                recording.time,
+                _TimePanel("tip to reference", "m", {"recording": distance}),
+                "mm",
+                1e3,
+            )
             _add_panel_letter(axes, letters)
             axes.set_xlabel("time [s]")
     _add_caption(figure, heading(recording))

@@ -40,8 +40,10 @@ def study_figure(study: Study) -> Figure:
         figure = _draw_scatter(study, shown_measures[:_MAX_SCATTER_ROWS])
     else:
         figure = _draw_panels(study, shown_measures)
-    heading = result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))
-    add_heading(figure, escape_label(heading))
+    add_heading(
+        figure,
+        escape_label(result_title(Path(study.machine_reference).stem, ", ".join(study.tasks))),
+    )
     return figure
 
 
@@ -61,8 +63,7 @@ def _column_label(study: Study, name: str) -> str:
 def _draw_panels(study: Study, shown_measures: list[str]) -> Figure:
     columns = 2 if len(shown_measures) == 4 else min(_MAX_COLUMNS, len(shown_measures))
     rows = -(-len(shown_measures) // columns)
-    size = (max(5.2, 4.0 * columns), 3.3 * rows + 0.5)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(max(5.2, 4.0 * columns), 3.3 * rows + 0.5), layout="constrained")
     for index, name in enumerate(shown_measures):
         axes = figure.add_subplot(rows, columns, index + 1)
         if len(study.parameters) == 1:
@@ -196,11 +197,9 @@ def _draw_scatter(study: Study, shown_measures: list[str]) -> Figure:
         len(shown_measures), len(study.parameters), sharex="col", sharey="row", squeeze=False
     )
     for row, name in zip(panels, shown_measures, strict=True):
-        values = study.columns[name]
         best_variant = study.rank(name)[:1]
         for axes, parameter in zip(row, study.parameters, strict=True):
-            x = study.columns[parameter]
-            _draw_cloud(axes, x, values, best_variant)
+            _draw_cloud(axes, study.columns[parameter], study.columns[name], best_variant)
         row[0].set_ylabel(_column_label(study, name))
     for axes, parameter in zip(panels[-1], study.parameters, strict=True):
         axes.set_xlabel(_column_label(study, parameter))

@@ -78,13 +78,18 @@ def tool_force_figure(chart: ToolForce) -> Figure:
             axes.grid(False)
             if s == count - 1:
                 axes.set_xlabel(f"{u} [m]")
-    handles = [
-        Swatch(color=color, label=escape_label(str(chart.limiting_factors[k])))
-        for k, color in colors.items()
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
-    heading = result_title(chart.machine.name, f"tool force, {chart.direction}")
-    add_heading(figure, escape_label(heading))
+    figure.legend(
+        handles=[
+            Swatch(color=color, label=escape_label(str(chart.limiting_factors[k])))
+            for k, color in colors.items()
+        ],
+        loc="outside lower center",
+        ncols=2,
+        fontsize=8,
+    )
+    add_heading(
+        figure, escape_label(result_title(chart.machine.name, f"tool force, {chart.direction}"))
+    )
     return figure
 
 

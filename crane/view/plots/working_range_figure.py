@@ -128,8 +128,10 @@ def _dimension_columns(
         )
         for is_above in (False, True)
     ]
-    count = max(len(side) for side in sides)
-    return [[side[k] for side in sides if k < len(side)] for k in range(count)]
+    return [
+        [side[k] for side in sides if k < len(side)]
+        for k in range(max(len(side) for side in sides))
+    ]
 
 
 def _draw_dimension_line(
