@@ -88,8 +88,11 @@ class CircuitWire:
         tolerance = _COORDINATE_TOLERANCE
         is_within_x = min(a, c) - tolerance <= x <= max(a, c) + tolerance
         is_within_y = min(b, d) - tolerance <= y <= max(b, d) + tolerance
-        distance = abs((c - a) * (y - b) - (d - b) * (x - a))
-        return is_within_x and is_within_y and distance < tolerance * 100
+        return (
+            is_within_x
+            and is_within_y
+            and abs((c - a) * (y - b) - (d - b) * (x - a)) < tolerance * 100
+        )
 
 
 @dataclass(frozen=True)
@@ -132,8 +135,9 @@ class CircuitCanvas:
         style: dict[str, Any] = {"linewidth": 1.0}
         if is_signal:
             style = {"linewidth": 0.7, "linestyle": _SIGNAL_DASHES}
-        distinct_points = [segments[0][0], *(end for _, end in segments)]
-        self.draw_line(distinct_points, zorder=2.0, gid=f"wire {net}", **style)
+        self.draw_line(
+            [segments[0][0], *(end for _, end in segments)], zorder=2.0, gid=f"wire {net}", **style
+        )
 
     def add_port(self, component: str, net: str, position: SheetPoint) -> None:
         """Add a port of a symbol."""
@@ -184,18 +188,27 @@ class CircuitCanvas:
         half_width = 0.38 * size * np.array([-direction[1], direction[0]])
         base = second - size * direction
         self.draw_line([first, base], solid_capstyle="butt", **options)
-        corners = [second, base + half_width, base - half_width]
-        self.draw_shape(corners, is_filled=True, linewidth=0.0, zorder=3.3)
+        self.draw_shape(
+            [second, base + half_width, base - half_width],
+            is_filled=True,
+            linewidth=0.0,
+            zorder=3.3,
+        )
 
     def draw_spring(self, start: SheetPoint, end: SheetPoint, *, half_width: float = 2.2) -> None:
         """Draw a spring."""
         first, direction = np.array(start), np.array(end) - np.array(start)
-        normal = np.array([-direction[1], direction[0]]) / float(np.linalg.norm(direction))
-        points = [
-            first + share * direction + side * half_width * normal
-            for share, side in zip(np.linspace(0, 1, 7), (0, 1, -1, 1, -1, 1, 0), strict=True)
-        ]
-        self.draw_line(points, linewidth=0.7)
+        self.draw_line(
+            [
+                first
+                + share * direction
+                + side
+                * half_width
+                * (np.array([-direction[1], direction[0]]) / float(np.linalg.norm(direction)))
+                for share, side in zip(np.linspace(0, 1, 7), (0, 1, -1, 1, -1, 1, 0), strict=True)
+            ],
+            linewidth=0.7,
+        )
 
     def draw_text(
         self, x: float, y: float, text: str, gid: str, size: float = SMALL_TEXT_SIZE,
@@ -205,8 +218,15 @@ class CircuitCanvas:
         if len(text) * size > available_width:  # no letter is wider than its height
             text, size = _fit_text(text, size, available_width, options.get("weight", "normal"))
         style: dict[str, Any] = {"ha": "center", "va": "center", "zorder": 9} | options
-        halo = [withStroke(linewidth=1.6, foreground="white")]
-        self.axes.text(x, y, text, fontsize=size, gid=gid, path_effects=halo, **style)
+        self.axes.text(
+            x,
+            y,
+            text,
+            fontsize=size,
+            gid=gid,
+            path_effects=[withStroke(linewidth=1.6, foreground="white")],
+            **style,
+        )
 
     def draw_texts(
         self, x: float, y: float, texts: Iterable[str], gid: str, **options: Any
@@ -233,15 +253,20 @@ class CircuitCanvas:
     def draw_junctions(self) -> None:
         """Mark points where three or more wires of a net meet."""
         shuttles = {x.position for x in self.ports if x.component.startswith("shuttle")}
-        ends = sorted({(w.net, at) for w in self.wires for at in (w.start, w.end)})
-        for net, position in ends:
+        for net, position in sorted({(w.net, at) for w in self.wires for at in (w.start, w.end)}):
             if position in shuttles:
                 continue
-            branch_count = sum(
-                1 if position in (wire.start, wire.end) else 2
-                for wire in self.wires
-                if wire.net == net and wire.contains(position)
-            )
-            if branch_count > 2:
-                style = {"facecolor": INK_COLOUR, "linewidth": 0.0, "zorder": 4.0}
-                self.draw_circle(position, 1.5, gid=f"dot {net}", **style)
+            if (
+                sum(
+                    1 if position in (wire.start, wire.end) else 2
+                    for wire in self.wires
+                    if wire.net == net and wire.contains(position)
+                )
+                > 2
+            ):
+                self.draw_circle(
+                    position,
+                    1.5,
+                    gid=f"dot {net}",
+                    **{"facecolor": INK_COLOUR, "linewidth": 0.0, "zorder": 4.0},
+                )

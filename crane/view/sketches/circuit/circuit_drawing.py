@@ -75,14 +75,20 @@ class _CircuitDrawing:
         )
         items_width = max(sum(item.width for item in row) + 16 for row in self._item_rows)
         self._content_width = max(functions_width, items_width)
-        signals = [f"{kind} {name}" for kind in ("LS", "N") for name in hydraulics.pumps]
-        nodes = [TANK_NODE, *hydraulics.pumps, *hydraulics.lines, *hydraulics.accumulators]
-        chambers = [f"{x.joint}.{side}" for x in functions for side in "ab"]
         # all nets that may have a rail, from the top
-        net_names = [*signals, *self._open_centres.row_nets, *nodes, *chambers]
-        self._rail_labels = {net: _rail_label(hydraulics, net) for net in net_names}
-        longest_label = max(map(len, self._rail_labels.values()))
-        self._label_width = 4 + 0.62 * SMALL_TEXT_SIZE * longest_label
+        self._rail_labels = {
+            net: _rail_label(hydraulics, net)
+            for net in [
+                *[f"{kind} {name}" for kind in ("LS", "N") for name in hydraulics.pumps],
+                *self._open_centres.row_nets,
+                TANK_NODE,
+                *hydraulics.pumps,
+                *hydraulics.lines,
+                *hydraulics.accumulators,
+                *[f"{x.joint}.{side}" for x in functions for side in "ab"],
+            ]
+        }
+        self._label_width = 4 + 0.62 * SMALL_TEXT_SIZE * max(map(len, self._rail_labels.values()))
 
     def draw(self) -> tuple[Figure, CircuitCanvas]:
         nets_by_row = self._used_nets()
@@ -129,23 +135,31 @@ class _CircuitDrawing:
     def _valve_height(self, row: int) -> float:
         """Return the height of the valves above the highest rail."""
         functions = self._function_rows[row]
-        text_height = 4 + LINE_HEIGHT * max(len(x.valve_texts) for x in functions)
-        required_height = 12 + max(max(x.height_below for x in functions), text_height)
+        required_height = 12 + max(
+            max(x.height_below for x in functions),
+            4 + LINE_HEIGHT * max(len(x.valve_texts) for x in functions),
+        )
         return required_height + 4.0 * self._open_centres.line_count(row) + 2
 
     def _actuator_height(self, row: int) -> float:
         """Return the height of the actuators' middle above the lower edge of the valves."""
-        height = max(sum(h for _, h in valve_rows(x)) for x in self._function_rows[row])
-        return SPOOL_HEIGHT + height + 20 + (6 if self._open_centres.line_count(row) else 0)
+        return (
+            SPOOL_HEIGHT
+            + max(sum(h for _, h in valve_rows(x)) for x in self._function_rows[row])
+            + 20
+            + (6 if self._open_centres.line_count(row) else 0)
+        )
 
     def _items_below(self, row: int) -> list[SupplyItem]:
         item_row = row - len(self._function_rows) + 1
         return self._item_rows[item_row] if item_row >= 0 else []
 
     def _row_height(self, row: int, rail_count: int) -> float:
-        items = self._items_below(row)
-        height_below = _ITEM_DISTANCE + max((x.height for x in items), default=0.0) + 6
-        return self._height_above_rail(row) + _RAIL_SPACING * (rail_count - 1) + height_below
+        return (
+            self._height_above_rail(row)
+            + _RAIL_SPACING * (rail_count - 1)
+            + (_ITEM_DISTANCE + max((x.height for x in self._items_below(row)), default=0.0) + 6)
+        )
 
     def _draw_row(
         self,
@@ -159,15 +173,23 @@ class _CircuitDrawing:
         if row < len(self._function_rows):
             functions = self._function_rows[row]
             valve = top_rail + self._valve_height(row)
-            actuator = valve + self._actuator_height(row)
             spare_width = max(self._content_width - len(functions) * SECTION_WIDTH, 0.0)
-            spare_share = 0.5 if spare_width < SECTION_WIDTH else 0.25
             levels = self._open_centres.line_heights(row, valve)
             centre_ends = {}
             for i, function in enumerate(functions):
-                x = left + spare_share * spare_width + (i + 0.5) * SECTION_WIDTH
+                x = (
+                    left
+                    + (0.5 if spare_width < SECTION_WIDTH else 0.25) * spare_width
+                    + (i + 0.5) * SECTION_WIDTH
+                )
                 centre_ports = CircuitSection(
-                    canvas, function, x, valve, actuator, rail_heights, levels
+                    canvas,
+                    function,
+                    x,
+                    valve,
+                    valve + self._actuator_height(row),
+                    rail_heights,
+                    levels,
                 ).draw()
                 if centre_ports is not None:
                     centre_ends[function.joint] = x, *centre_ports
@@ -202,8 +224,9 @@ class _CircuitDrawing:
                     canvas.draw_wire(net, (first, y), (second, y), is_signal=is_signal)
                 canvas.draw_text(left - 4, y, label, f"rail {net}", ha="right")
                 if lane > left:
-                    line = [(left - 2, y), (lane, y)]
-                    canvas.draw_line(line, linewidth=0.4, color="#8a8a8a", zorder=1)
+                    canvas.draw_line(
+                        [(left - 2, y), (lane, y)], linewidth=0.4, color="#8a8a8a", zorder=1
+                    )
             for first, second in itertools.pairwise(heights):
                 canvas.draw_wire(net, (lane, first), (lane, second), is_signal=is_signal)
 
@@ -249,8 +272,11 @@ def _pack_items(items: Sequence[SupplyItem], max_width: float) -> list[list[Supp
     """Pack items into rows of limited width; items with `stays_in_row` stay together."""
     rows: list[list[SupplyItem]] = [[]]
     for item in items:
-        width = sum(x.width for x in (*rows[-1], item)) + 16
-        if rows[-1] and not item.stays_in_row and width > max_width:
+        if (
+            rows[-1]
+            and not item.stays_in_row
+            and (sum(x.width for x in (*rows[-1], item)) + 16) > max_width
+        ):
             rows.append([])
         rows[-1].append(item)
     return rows

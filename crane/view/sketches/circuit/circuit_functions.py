@@ -97,8 +97,9 @@ class CircuitFunction:
 
 def port_lane(function: CircuitFunction, port: str) -> float:
     """Return the offset of a port's lane from the middle of the section."""
-    is_beside_centre = port == "P" and function.centre_nets
-    return _SUPPLY_LANE_BESIDE_CENTRE if is_beside_centre else _PORT_LANES[port]
+    return (
+        _SUPPLY_LANE_BESIDE_CENTRE if (port == "P" and function.centre_nets) else _PORT_LANES[port]
+    )
 
 
 def valve_rows(function: CircuitFunction) -> list[tuple[str, float]]:
@@ -218,11 +219,20 @@ class OpenCentreLines:
             canvas.draw_wire(TANK_NODE, end, (lane, tank_rail))
             return
         component = f"throttle {name}"
-        pose = SymbolPose(lane, end[1] - 5 - valve_symbols.THROTTLE_HALF_LENGTH, 2)
-        paths = [end], [(lane, tank_rail)]
-        valve_symbols.draw_throttle(canvas, pose, component, (net, TANK_NODE), paths)
+        valve_symbols.draw_throttle(
+            canvas,
+            SymbolPose(lane, end[1] - 5 - valve_symbols.THROTTLE_HALF_LENGTH, 2),
+            component,
+            (net, TANK_NODE),
+            ([end], [(lane, tank_rail)]),
+        )
         if supply.control == "negative":
             signal, signal_lane = f"N {name}", lane + _SIGNAL_OFFSET
             canvas.add_port(component, signal, end)
-            rail = (signal_lane, rail_heights[signal])
-            canvas.draw_wire(signal, end, (signal_lane, end[1]), rail, is_signal=True)
+            canvas.draw_wire(
+                signal,
+                end,
+                (signal_lane, end[1]),
+                ((signal_lane, rail_heights[signal])),
+                is_signal=True,
+            )

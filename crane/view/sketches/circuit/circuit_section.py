@@ -58,18 +58,21 @@ class CircuitSection:
         self._canvas, self._function, self._x = canvas, function, x
         self._valve_bottom, self._actuator_middle = valve_bottom, actuator_middle
         self._rail_heights = rail_heights
-        levels = [valve_bottom - 8.5, *(level - 7.0 for level in line_heights.values())]
-        self._text_top = min(levels)
+        self._text_top = min(
+            [valve_bottom - 8.5, *(level - 7.0 for level in line_heights.values())]
+        )
         self._nets = {side: f"{function.joint}.{side}" for side in _SIGNS}
         self._lanes = {side: x + sign * CHAMBER_LANE for side, sign in _SIGNS.items()}
 
     def draw(self) -> tuple[SheetPoint, SheetPoint] | None:
         """Draw the section, and return the ends of its open centre if it has one."""
         function, canvas = self._function, self._canvas
-        upper_ports = ["A", "C'", "B"] if function.centre_nets else ["A", "B"]
-        has_float_position = function.valve.float_from > 0
         spool = SpoolSymbol(
-            self._x, self._valve_bottom, function.ports, upper_ports, has_float_position
+            self._x,
+            self._valve_bottom,
+            function.ports,
+            ["A", "C'", "B"] if function.centre_nets else ["A", "B"],
+            function.valve.float_from > 0,
         )
         component, ports = f"valve {function.joint}", spool.port_positions
         spool.draw(canvas, component)
@@ -86,17 +89,22 @@ class CircuitSection:
             has_counterbalance = getattr(function.cylinder, f"counterbalance_{side}") is not None
             if has_counterbalance or getattr(function.cylinder, f"rupture_{side}") > 0:
                 current_nets[side] += " valve"
-            port = ports[side.upper()]
-            canvas.add_port(component, current_nets[side], port)
-            bend = (port[0], top + 4), (lane, top + 4)
-            canvas.draw_wire(current_nets[side], port, *bend, (lane, top + 8))
-        if function.centre_nets:
-            self._draw_chamber_lines(current_nets, top + 8, y)
+            port_x, _ = ports[side.upper()]
+            canvas.add_port(component, current_nets[side], (port_x, top))
+            canvas.draw_wire(
+                current_nets[side],
+                (port_x, top),
+                (port_x, top + 4),
+                (lane, top + 4),
+                (lane, top + 8),
+                (lane, y),
+            )
         for name, height in valve_rows(function):
             self._draw_valve_row(name, y, height, current_nets)
             y += height
-        actuator_bottom = self._actuator_middle - machine_symbols.BARREL_HALF_HEIGHT
-        self._draw_chamber_lines(current_nets, y, actuator_bottom)
+        self._draw_chamber_lines(
+            current_nets, y, self._actuator_middle - machine_symbols.BARREL_HALF_HEIGHT
+        )
         self._draw_actuator()
         if not function.centre_nets:
             return None
@@ -128,16 +136,23 @@ class CircuitSection:
         inlet_net, inlet_path = net, [rail]
         if valve.sharing:
             inlet_net, inlet_path = f"{function.joint} inlet", []
-            metering_pose = SymbolPose(lane, pose.y - valve_symbols.COMPENSATOR_HALF_LENGTH - 9)
-            outlet = (lane, pose.y - valve_symbols.COMPENSATOR_HALF_LENGTH)
+            bottom = pose.y - valve_symbols.COMPENSATOR_HALF_LENGTH
             valve_symbols.draw_throttle(
-                canvas, metering_pose, f"metering {function.joint}", (net, inlet_net),
-                ([rail], [outlet]), is_adjustable=True,
-            )  # fmt: skip
+                canvas,
+                SymbolPose(lane, bottom - 9),
+                f"metering {function.joint}",
+                (net, inlet_net),
+                ([rail], [(lane, bottom)]),
+                is_adjustable=True,
+            )
         valve_symbols.draw_compensator(
-            canvas, pose, f"compensator {function.joint}", (inlet_net, metered_net),
-            (inlet_path, bend), valve.sharing,
-        )  # fmt: skip
+            canvas,
+            pose,
+            f"compensator {function.joint}",
+            (inlet_net, metered_net),
+            (inlet_path, bend),
+            valve.sharing,
+        )
 
     def _draw_valve_row(
         self, name: str, y: float, height: float, current_nets: dict[str, str]
@@ -175,8 +190,12 @@ class CircuitSection:
         elif kind == "tap":
             for side in self._function.tapped_chambers:
                 net, lane = self._nets[side], x + _SIGNS[side] * _TAP_LANE
-                rail = (lane, self._rail_heights[net])
-                canvas.draw_wire(net, (self._lanes[side], y + 2), (lane, y + 2), rail)
+                canvas.draw_wire(
+                    net,
+                    (self._lanes[side], y + 2),
+                    (lane, y + 2),
+                    ((lane, self._rail_heights[net])),
+                )
 
     def _draw_port_valves(self, side: str, row_top: float) -> None:
         """Draw relief and suction valve of a chamber, each with a tank."""
@@ -191,17 +210,30 @@ class CircuitSection:
             pose = SymbolPose(position, middle, 2, is_mirrored=sign < 0)
             nets = net, TANK_NODE
             valve_symbols.draw_relief_valve(canvas, pose, component, nets, (path, []))
-            outlet = (position, middle - valve_symbols.RELIEF_HALF_LENGTH)
-            valve_symbols.draw_tank(canvas, outlet, f"tank {component}", TANK_NODE, 4.5, drop=3)
+            valve_symbols.draw_tank(
+                canvas,
+                ((position, middle - valve_symbols.RELIEF_HALF_LENGTH)),
+                f"tank {component}",
+                TANK_NODE,
+                4.5,
+                drop=3,
+            )
             text, alignment = format_pressure(cylinder.relief), "left" if sign > 0 else "right"
             canvas.draw_text(lane + sign * 4, top + 6, text, f"label {component}", ha=alignment)
         if cylinder.refill:
             position, component = lane + sign * (34 if cylinder.relief else 15), f"suction {net}"
             pose = SymbolPose(position, top - valve_symbols.CHECK_HALF_LENGTH - 5)
-            nets, paths = (TANK_NODE, net), ([], [path[-1], (position, top)])
-            valve_symbols.draw_check_valve(canvas, pose, component, nets, paths)
-            inlet = (position, pose.y - valve_symbols.CHECK_HALF_LENGTH)
-            valve_symbols.draw_tank(canvas, inlet, f"tank {component}", TANK_NODE, 4.5, drop=3)
+            valve_symbols.draw_check_valve(
+                canvas, pose, component, (TANK_NODE, net), ([], [path[-1], (position, top)])
+            )
+            valve_symbols.draw_tank(
+                canvas,
+                ((position, pose.y - valve_symbols.CHECK_HALF_LENGTH)),
+                f"tank {component}",
+                TANK_NODE,
+                4.5,
+                drop=3,
+            )
 
     def _draw_counterbalance_valve(
         self, side: str, y: float, height: float, current_nets: dict[str, str]
@@ -227,9 +259,14 @@ class CircuitSection:
         canvas.draw_wire(pilot_net, (other_lane, middle), pilot, is_signal=True)
         canvas.add_port(component, pilot_net, pilot)
         valve: CounterbalanceValve = getattr(cylinder, f"counterbalance_{side}")
-        texts = [format_pressure(valve.pressure), f"{format_number(valve.pilot_ratio)} : 1"]
         text_x, alignment = other_lane - sign * 5, "right" if sign > 0 else "left"
-        canvas.draw_texts(text_x, middle + 4, texts, f"label {component}", ha=alignment)
+        canvas.draw_texts(
+            text_x,
+            middle + 4,
+            [format_pressure(valve.pressure), f"{format_number(valve.pilot_ratio)} : 1"],
+            f"label {component}",
+            ha=alignment,
+        )
         current_nets[side] = chamber_net
 
     def _draw_rupture_valves(self, y: float, height: float, current_nets: dict[str, str]) -> None:
@@ -240,9 +277,8 @@ class CircuitSection:
                 canvas.draw_wire(current_nets[side], (lane, y), (lane, top))
                 continue
             component, nets = f"rupture {self._nets[side]}", (self._nets[side], current_nets[side])
-            paths = [(lane, top)], [(lane, y)]
             valve_symbols.draw_rupture_valve(
-                canvas, SymbolPose(lane, middle, 2), component, nets, paths
+                canvas, SymbolPose(lane, middle, 2), component, nets, ([(lane, top)], [(lane, y)])
             )
             texts, alignment = (format_flow(flow), "l/min"), "left" if sign > 0 else "right"
             canvas.draw_texts(
@@ -262,12 +298,18 @@ class CircuitSection:
         elif function.is_revolute:
             component = f"rotary drive {function.joint}"
             machine_symbols.draw_rotary_drive(canvas, (x, y), component, nets)
-            sizes = {format_displacement(area) for area in (cylinder.area_a, cylinder.area_b)}
-            texts = [" | ".join(sorted(sizes))]
+            texts = [
+                " | ".join(
+                    sorted(
+                        {format_displacement(area) for area in (cylinder.area_a, cylinder.area_b)}
+                    )
+                )
+            ]
         else:
             component = f"cylinder {function.joint}"
-            area_ratio = cylinder.area_b / cylinder.area_a
-            machine_symbols.draw_cylinder(canvas, (x, y), component, nets, area_ratio)
+            machine_symbols.draw_cylinder(
+                canvas, (x, y), component, nets, cylinder.area_b / cylinder.area_a
+            )
             texts = [f"{format_area(cylinder.area_a)} | {format_area(cylinder.area_b)} cm²"]
         if function.stroke < 1e6 and not cylinder.motor:
             stroke_text = f"stroke {format_number(1e3 * function.stroke)} mm"

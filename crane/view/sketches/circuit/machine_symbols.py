@@ -35,8 +35,9 @@ def draw_regulator(
     canvas.draw_text(x, y, name, f"label {component}")
     if has_power_limit:
         left = x - 27
-        axes = [(left, y + 6), (left, y - 6), (left + 13, y - 6)]
-        canvas.draw_line(axes, gid=f"{component} power")
+        canvas.draw_line(
+            [(left, y + 6), (left, y - 6), (left + 13, y - 6)], gid=f"{component} power"
+        )
         values = [1.5 + 1.2 * k for k in range(9)]
         canvas.draw_line([(left + s, y - 6 + 15.0 / s) for s in values], linewidth=1.1)
 
@@ -63,11 +64,15 @@ def draw_motor(
     _draw_ports(canvas, pose, component, nets)
     for sign in (-1, 1):
         port = sign * PORT_OFFSET
-        line = pose((port, -BARREL_HALF_HEIGHT), (port, 0), (sign * radius, 0))
-        canvas.draw_line(line, linewidth=1.0)
+        canvas.draw_line(
+            pose((port, -BARREL_HALF_HEIGHT), (port, 0), (sign * radius, 0)), linewidth=1.0
+        )
         base = sign * (radius - 0.4)
-        triangle = pose((sign * (radius - 6.5), 0), (base, 3.6), (base, -3.6))
-        canvas.draw_shape(triangle, is_filled=True, linewidth=0)
+        canvas.draw_shape(
+            pose((sign * (radius - 6.5), 0), (base, 3.6), (base, -3.6)),
+            is_filled=True,
+            linewidth=0,
+        )
     _draw_rotating_shaft(canvas, pose, radius)
 
 
@@ -77,13 +82,17 @@ def draw_rotary_drive(
     """Draw a rotary drive of limited angle, its shaft upwards."""
     pose, half_height = SymbolPose(*position), BARREL_HALF_HEIGHT
     angles = [k * math.pi / 24 for k in range(25)]
-    semicircle = [(18 * math.cos(t), -half_height + 16 * math.sin(t)) for t in angles]
-    canvas.draw_shape(pose(*semicircle), gid=component)
+    canvas.draw_shape(
+        pose(*[(18 * math.cos(t), -half_height + 16 * math.sin(t)) for t in angles]), gid=component
+    )
     _draw_ports(canvas, pose, component, nets)
     for sign in (-1, 1):
         x = sign * PORT_OFFSET * 0.78
-        triangle = pose((x, -1.5), (x - 3.2, -half_height), (x + 3.2, -half_height))
-        canvas.draw_shape(triangle, is_filled=True, linewidth=0)
+        canvas.draw_shape(
+            pose((x, -1.5), (x - 3.2, -half_height), (x + 3.2, -half_height)),
+            is_filled=True,
+            linewidth=0,
+        )
     _draw_rotating_shaft(canvas, pose, half_height)
 
 

@@ -69,8 +69,14 @@ def create_supply_items(
             x.has_load_sensing for x in functions if x.valve.supply == name
         )
         # to the previous pump, to the engine, or to an unknown drive
-        shaft = 116.0 if i else 64.0 if hydraulics.engine is not None else 24.0
-        items.append(_create_pump(name, supply, has_load_sensing, shaft))
+        items.append(
+            _create_pump(
+                name,
+                supply,
+                has_load_sensing,
+                116.0 if i else 64.0 if hydraulics.engine is not None else 24.0,
+            )
+        )
     items += [_create_accumulator(name, x) for name, x in hydraulics.accumulators.items()]
     items += [_create_element(name, x) for name, x in hydraulics.elements.items()]
     return items
@@ -92,10 +98,16 @@ def _create_engine(engine: Engine) -> SupplyItem:
         # the shaft goes on into the first pump
         machine_symbols.draw_shaft(canvas, middle, (x + 44, middle[1]))
         machine_symbols.draw_engine(canvas, middle, "engine")
-        speed_text = f"{format_number(engine.speed * 9.5492966)} rpm"
-        power_text = f"{format_number(engine.torque * engine.speed / 1e3)} kW"
-        label_position = (middle[0], middle[1] - 20)
-        canvas.draw_labels(label_position, "engine", "engine", [speed_text, power_text], 38)
+        canvas.draw_labels(
+            ((middle[0], middle[1] - 20)),
+            "engine",
+            "engine",
+            [
+                f"{format_number(engine.speed * 9.5492966)} rpm",
+                f"{format_number(engine.torque * engine.speed / 1e3)} kW",
+            ],
+            38,
+        )
 
     return SupplyItem(44.0, _SHAFT_DEPTH + 40, [], True, draw)
 
@@ -114,14 +126,20 @@ def _create_pump(
 
     def draw(canvas: CircuitCanvas, x: float, y: float, rails: Rails) -> None:
         component, (position, middle) = f"pump {name}", (x + 52, y - _SHAFT_DEPTH)
-        shaft_start = (position - shaft_length, middle)
-        machine_symbols.draw_shaft(canvas, shaft_start, (position, middle))
-        is_variable = supply.control != "fixed"
-        machine_symbols.draw_pump(canvas, (position, middle), component, name, is_variable)
-        delivery = (position, middle + machine_symbols.PUMP_RADIUS)
-        canvas.draw_wire(name, delivery, (position, rails[name]))
-        label_position = (position, middle - machine_symbols.PUMP_RADIUS - 16)
-        canvas.draw_labels(label_position, component, escape_label(name), texts, 122)
+        machine_symbols.draw_shaft(canvas, ((position - shaft_length, middle)), (position, middle))
+        machine_symbols.draw_pump(
+            canvas, (position, middle), component, name, supply.control != "fixed"
+        )
+        canvas.draw_wire(
+            name, ((position, middle + machine_symbols.PUMP_RADIUS)), (position, rails[name])
+        )
+        canvas.draw_labels(
+            ((position, middle - machine_symbols.PUMP_RADIUS - 16)),
+            component,
+            escape_label(name),
+            texts,
+            122,
+        )
         _draw_regulator(canvas, name, supply, (x + 20, y - 30), (position - 14.5, middle - 12))
         for net, offset in wires:
             if net != name:
@@ -131,15 +149,28 @@ def _create_pump(
         if supply.relief > 0:
             relief, lane, top = f"relief {name}", position + 22, y - 8
             pose = SymbolPose(lane, top - 3 - RELIEF_HALF_LENGTH, 2, True)
-            paths = [(position, top), (lane, top)], ()
-            valve_symbols.draw_relief_valve(canvas, pose, relief, (name, TANK_NODE), paths)
-            outlet = (lane, pose.y - RELIEF_HALF_LENGTH)
-            valve_symbols.draw_tank(canvas, outlet, f"tank {relief}", TANK_NODE, 4.5, drop=3)
-            text = format_pressure(supply.relief)
-            canvas.draw_text(lane + 14, pose.y + 4, text, f"label {relief}", ha="left")
+            valve_symbols.draw_relief_valve(
+                canvas, pose, relief, (name, TANK_NODE), ([(position, top), (lane, top)], ())
+            )
+            valve_symbols.draw_tank(
+                canvas,
+                ((lane, pose.y - RELIEF_HALF_LENGTH)),
+                f"tank {relief}",
+                TANK_NODE,
+                4.5,
+                drop=3,
+            )
+            canvas.draw_text(
+                lane + 14, pose.y + 4, format_pressure(supply.relief), f"label {relief}", ha="left"
+            )
 
-    height = _SHAFT_DEPTH + machine_symbols.PUMP_RADIUS + 21 + LINE_HEIGHT * len(texts)
-    return SupplyItem(116.0, height, wires, True, draw)
+    return SupplyItem(
+        116.0,
+        _SHAFT_DEPTH + machine_symbols.PUMP_RADIUS + 21 + LINE_HEIGHT * len(texts),
+        wires,
+        True,
+        draw,
+    )
 
 
 def _draw_regulator(
@@ -152,8 +183,7 @@ def _draw_regulator(
         machine_symbols.draw_regulator(canvas, middle, control or "P", component, has_power_limit)
     if control:
         height = middle[1] - 2
-        line = [(middle[0] + 11, height), (pump[0], height), pump]
-        canvas.draw_line(line, linewidth=0.6)
+        canvas.draw_line([(middle[0] + 11, height), (pump[0], height), pump], linewidth=0.6)
 
 
 def _pump_texts(supply: Supply) -> list[str]:
@@ -177,8 +207,13 @@ def _create_accumulator(name: str, gas: Accumulator) -> SupplyItem:
         bottom, port = middle - 22, (position, middle - 17)
         canvas.draw_wire(name, (lane, rails[name]), (lane, bottom), (position, bottom), port)
         machine_symbols.draw_accumulator(canvas, (position, middle), component, name)
-        texts = format_volume(gas.volume), f"p₀ {format_pressure(gas.precharge)}"
-        canvas.draw_labels((position, middle - 32), component, escape_label(name), texts, 62)
+        canvas.draw_labels(
+            (position, middle - 32),
+            component,
+            escape_label(name),
+            (format_volume(gas.volume), f"p₀ {format_pressure(gas.precharge)}"),
+            62,
+        )
 
     return SupplyItem(68.0, 72.0, [(name, 14.0)], False, draw)
 
@@ -234,8 +269,7 @@ def _draw_element(
     if element.kind == "relief":
         valve_symbols.draw_relief_valve(canvas, pose, component, nets, paths)
     elif element.kind == "check":
-        has_spring = element.pressure > 0
-        valve_symbols.draw_check_valve(canvas, pose, component, nets, paths, has_spring)
+        valve_symbols.draw_check_valve(canvas, pose, component, nets, paths, element.pressure > 0)
     else:
         is_leak, is_adjustable = element.kind == "leak", bool(element.joints)
         valve_symbols.draw_throttle(canvas, pose, component, nets, paths, is_leak, is_adjustable)

@@ -99,12 +99,15 @@ class SpoolSymbol:
             left, right = sorted((end_x, outer_x))
             canvas.draw_box((left, bottom), (right, top))
             canvas.draw_arrow((left - 0.5, bottom - 1.5), (right + 0.5, top + 1.5), size=3.0)
-            diagonal = [(end_x + sign * 0.3 * _END_WIDTH, bottom)]
-            canvas.draw_line([*diagonal, (end_x + sign * 0.7 * _END_WIDTH, top)])
-        tank_a = "Ta" if "Ta" in ports else "T"
+            canvas.draw_line(
+                [
+                    *[(end_x + sign * 0.3 * _END_WIDTH, bottom)],
+                    (end_x + sign * 0.7 * _END_WIDTH, top),
+                ]
+            )
         self._draw_position(canvas, -w, [("P", "A"), ("B", "T")])
         self._draw_position(canvas, 0.0, [("C", "C'")] if "C" in ports else [])
-        self._draw_position(canvas, w, [("P", "B"), ("A", tank_a)])
+        self._draw_position(canvas, w, [("P", "B"), ("A", ("Ta" if "Ta" in ports else "T"))])
         if self._has_float_position:
             connected = [name for name in ("A", "B", "Ta", "T") if name in ports]
             level = y + 0.55 * SPOOL_HEIGHT
@@ -174,8 +177,11 @@ def _draw_spool_valve(
     canvas.draw_box(*pose((-half_width, -half_width), (half_width, half_width)), gid=component)
     canvas.draw_arrow(*pose((arrow_x, -half_width), (arrow_x, half_width)))
     canvas.draw_spring(*pose((half_width, 0), (spring_end, 0)))
-    pilot_line = pose((0, pilot_y), (-8.5, pilot_y), (-8.5, 0), (-half_width, 0))
-    canvas.draw_line(pilot_line, linewidth=0.6, linestyle=_PILOT_DASHES)
+    canvas.draw_line(
+        pose((0, pilot_y), (-8.5, pilot_y), (-8.5, 0), (-half_width, 0)),
+        linewidth=0.6,
+        linestyle=_PILOT_DASHES,
+    )
 
 
 def draw_relief_valve(
@@ -296,5 +302,8 @@ def draw_tank(
     canvas.draw_wire(net, position, (x, y))
     canvas.add_port(component, net, (x, y))
     left, right = x - half_width, x + half_width
-    outline = [(left, y + 3.2), (left, y - 2), (right, y - 2), (right, y + 3.2)]
-    canvas.draw_line(outline, linewidth=1.0, gid=component)
+    canvas.draw_line(
+        [(left, y + 3.2), (left, y - 2), (right, y - 2), (right, y + 3.2)],
+        linewidth=1.0,
+        gid=component,
+    )
