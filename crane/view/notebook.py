@@ -89,8 +89,10 @@ def _figure_images(value: Any) -> Iterator[str]:
                 yield svg_tag(sketch_figure(value), f"sketch of {value.name}")
             for name in notebook_figures(value):
                 result = figure_function(name)(value)
-                figures = result if isinstance(result, list) else [result]
-                yield from (image_tag(figure, repr(value)) for figure in figures[:_MAX_FIGURES])
+                yield from (
+                    image_tag(figure, repr(value))
+                    for figure in (result if isinstance(result, list) else [result])[:_MAX_FIGURES]
+                )
     except CraneError as error:
         yield _note_paragraph(f"no picture: {error}")
 
@@ -130,8 +132,11 @@ def _split_blocks(text: str, render_text: Callable[[str], str]) -> Iterator[str]
 
 def _render_markdown(text: str) -> str:
     """Markdown of lists, tables, bold words and code; HTML, links and images are but text."""
-    rules = ["backticks", "emphasis", "heading", "list", "table"]
-    return MarkdownIt("zero").enable(rules).render(text)
+    return (
+        MarkdownIt("zero")
+        .enable(["backticks", "emphasis", "heading", "list", "table"])
+        .render(text)
+    )
 
 
 def _preformatted(text: str) -> str:

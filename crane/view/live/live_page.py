@@ -51,8 +51,12 @@ def readout_html(
     for i, joint in enumerate(machine.active):
         unit = FORCE_UNITS[machine.unit(joint)]
         forces = [readout.gravity[i], *([] if recorded_forces is None else [recorded_forces[i]])]
-        is_free = joint in machine.free
-        rows.append([joint, *("free" if is_free else format_quantity(x, unit) for x in forces)])
+        rows.append(
+            [
+                joint,
+                *("free" if (joint in machine.free) else format_quantity(x, unit) for x in forces),
+            ]
+        )
     parts = [_html_table(headings, rows)]
     if readout.tip is not None:
         x, y, z = (f"{round(1e3 * value, 1) + 0.0:.1f}" for value in readout.tip)
@@ -204,9 +208,8 @@ class LivePage:
             slider = self._sliders[key]
             value = float(np.clip(value, slider.min, slider.max))
         if key == _LOAD_KEY:
-            readout = session.set_payload(value)
             self._scene.show_payload()
-            return readout
+            return session.set_payload(value)
         if key == _TIME_KEY:
             return self._seek(value)
         if key == _PLAY_KEY:

@@ -246,8 +246,9 @@ class Session:
             self.posture.configuration
         )
         pin.framesForwardKinematics(model, data, pinocchio_configuration)
-        frames = [self.machine.frame(link) for link in links]
-        return np.array([data.oMf[i].homogeneous for i in frames]).reshape(-1, 4, 4)
+        return np.array(
+            [data.oMf[i].homogeneous for i in [self.machine.frame(link) for link in links]]
+        ).reshape(-1, 4, 4)
 
     def tip_positions(self, q: Array) -> Array:
         """Return tip positions (N, 3) [m] at closed configurations (N, nq); (0, 3) if no tip."""
@@ -325,9 +326,14 @@ class Session:
         left_singular_vectors, singular_values, _ = np.linalg.svd(
             equations.evaluate_scaled(q)[1][rows][:, closure.passive]
         )
-        shares = np.bincount(equations.loop_of_row[rows], left_singular_vectors[:, -1] ** 2)
         condition = singular_values[0] / singular_values[-1] if singular_values[-1] > 0 else np.inf
-        return float(condition), equations.names[int(shares.argmax())]
+        return float(condition), equations.names[
+            int(
+                np.bincount(
+                    equations.loop_of_row[rows], left_singular_vectors[:, -1] ** 2
+                ).argmax()
+            )
+        ]
 
 
 def round_up_to_nice(value: float) -> float:

@@ -53,9 +53,11 @@ def read_visuals(machine: Machine) -> list[Visual]:
     shown_joints = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
     long = {joint for joint, end, _ in _body_points(machine) if joint and end.any()}
     masses = machine.model.inertias
-    bodies = {joint for joint in long - shown_joints if masses[joint].mass}
     visuals += skeleton_visuals(
-        machine, None if all(visual.shape is box for visual in visuals) else bodies
+        machine,
+        None
+        if all(visual.shape is box for visual in visuals)
+        else {joint for joint in long - shown_joints if masses[joint].mass},
     )
     return visuals + sliding_body_visuals(machine, shown_joints)
 
@@ -78,8 +80,10 @@ def _largest_joint_distance(machine: Machine) -> float:
 def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
     """Return parent joint, position (3,) [m] and name of all frames and joints on bodies."""
     model = machine.model
-    bodies = (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
-    points = [(frame.parentJoint, frame.placement.translation, frame.name) for frame in bodies]
+    points = [
+        (frame.parentJoint, frame.placement.translation, frame.name)
+        for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
+    ]
     for joint in range(1, model.njoints):
         points.append(
             (model.parents[joint], model.jointPlacements[joint].translation, model.names[joint])
@@ -122,8 +126,9 @@ def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> lis
             CylinderShape(0.2 * width, stroke) if is_rod else BoxShape((1.5 * width, width, width))
         )
         rotation = pin.Quaternion.FromTwoVectors(pin.ZAxis if is_rod else pin.XAxis, axis)
-        placement = pin.SE3(rotation, -0.5 * stroke * axis if is_rod else np.zeros(3))
-        link_placement = model.frames[machine.frame(links[joint])].placement.inverse() * placement
+        link_placement = model.frames[machine.frame(links[joint])].placement.inverse() * pin.SE3(
+            rotation, -0.5 * stroke * axis if is_rod else np.zeros(3)
+        )
         visuals.append(Visual(links[joint], shape, link_placement.homogeneous, DEFAULT_COLOUR))
     return visuals
 

@@ -104,9 +104,15 @@ class ThinningGrid:
                 "time": pack_base64(self.time, "f8"),
                 "rows": pack_base64(self.frame_rows, "u4"),
             }
-        span_ends = np.append(self.span_starts[1:], len(self.time)) - 1
         return {
-            "time": pack_base64((self.time[self.span_starts] + self.time[span_ends]) / 2, "f8"),
+            "time": pack_base64(
+                (
+                    self.time[self.span_starts]
+                    + self.time[(np.append(self.span_starts[1:], len(self.time)) - 1)]
+                )
+                / 2,
+                "f8",
+            ),
             "rows": "",
         }
 

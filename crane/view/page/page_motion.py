@@ -74,8 +74,13 @@ def joint_tree(machine: Machine) -> dict[str, Any]:
                 "lever": model.inertias[i].lever.tolist(),
             }
         )
-    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-    return {"joints": joints, "links": {link: frame_data(machine, link) for link in links}}
+    return {
+        "joints": joints,
+        "links": {
+            link: frame_data(machine, link)
+            for link in [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+        },
+    }
 
 
 def frame_data(machine: Machine, link: str) -> dict[str, Any]:

@@ -189,15 +189,15 @@ def _render_page(page_data: dict[str, Any], scene: Scene) -> str:
     import umsgpack  # type: ignore[import-untyped]
 
     assets = files("crane.view.page") / "assets"
-    encoded_commands = [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
     viewer = files(meshcat) / "viewer" / "dist" / "main.min.js"
-    template = Template((assets / "page.html").read_text(encoding="utf-8"))
-    return template.substitute(
+    return Template((assets / "page.html").read_text(encoding="utf-8")).substitute(
         title=escape(result_title(page_data["machine"], page_data["task"])),
         style=(assets / "page.css").read_text(encoding="utf-8"),
         viewer=viewer.read_text(encoding="utf-8"),
         data=_script_json(page_data),
-        commands=_script_json(encoded_commands),
+        commands=_script_json(
+            [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
+        ),
         script="\n".join(
             (assets / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPT_NAMES
         ),

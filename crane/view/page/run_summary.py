@@ -22,8 +22,14 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
         facts: pairs of name and text; forces: rows (joint, range, peak and RMS force); limits:
             sentences.
     """
-    moving_masses = [inertia.mass for inertia in list(machine.model.inertias)[1:]]
-    facts = [("moving mass", format_quantity(sum(moving_masses), "kg", 4))]
+    facts = [
+        (
+            "moving mass",
+            format_quantity(
+                sum([inertia.mass for inertia in list(machine.model.inertias)[1:]]), "kg", 4
+            ),
+        )
+    ]
     if machine.parameter_changes:
         changed_text = ", ".join(
             f"{name} = {value:g}" for name, value in machine.parameter_changes.items()

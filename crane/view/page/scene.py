@@ -56,7 +56,6 @@ def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
 
     for index, visual in enumerate(visuals):
         red, green, blue, opacity = (min(max(value, 0.0), 1.0) for value in visual.colour)
-        colour = (round(255 * red) << 16) + (round(255 * green) << 8) + round(255 * blue)
         placement = visual.placement
         match visual.shape:
             case BoxShape(size):
@@ -69,7 +68,13 @@ def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
             case MeshShape(vertices, faces):
                 geometry = g.TriangularMeshGeometry(vertices, faces)
         shape = viewer[visual.link][f"visual_{index}"]
-        shape.set_object(geometry, g.MeshPhongMaterial(color=colour, opacity=opacity))
+        shape.set_object(
+            geometry,
+            g.MeshPhongMaterial(
+                color=(round(255 * red) << 16) + (round(255 * green) << 8) + round(255 * blue),
+                opacity=opacity,
+            ),
+        )
         shape.set_transform(placement)
 
 
@@ -93,9 +98,13 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array, ground_height: fl
     )
     centre = np.round((lower + upper)[:2] / 2 / spacing) * spacing
     grid_points = np.concatenate([line_ends, line_ends[:, ::-1]]) + centre
-    points = np.column_stack([grid_points, np.full(len(grid_points), ground_height)])
     viewer.set_object(
-        g.LineSegments(_points_geometry(points), g.LineBasicMaterial(color=_GRID_COLOUR))
+        g.LineSegments(
+            _points_geometry(
+                np.column_stack([grid_points, np.full(len(grid_points), ground_height)])
+            ),
+            g.LineBasicMaterial(color=_GRID_COLOUR),
+        )
     )
 
 

@@ -46,7 +46,6 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
     axes, point = canvas.axes, canvas.point_size
     figure = axes.figure
     assert isinstance(figure, Figure)
-    renderer = FigureCanvasAgg(figure).get_renderer()
     texts: list[Text] = []
     boxes, costs = [], []
     for label in labels:
@@ -61,7 +60,7 @@ def place_labels(canvas: SketchCanvas, labels: Sequence[SketchLabel]) -> None:
             gid=label.gid,
             path_effects=[withStroke(linewidth=2.0, foreground="white")],
         )
-        text_extent = text.get_window_extent(renderer)
+        text_extent = text.get_window_extent(FigureCanvasAgg(figure).get_renderer())
         half_size = np.array([text_extent.width, text_extent.height]) / 2 * 72 / figure.dpi * point
         texts.append(text)
         candidates, gaps = _candidates(label, half_size, point)
@@ -107,8 +106,9 @@ def _placement_costs(canvas: SketchCanvas, label: SketchLabel, boxes: Array, gap
         ):  # closer to another symbol than to its own
             cost = cost + np.where(distance - radius < gaps + 2.0, 5.0, 0)
     limits = np.array([canvas.axes.get_xlim(), canvas.axes.get_ylim()])
-    outside = (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1)
-    return cost + np.where(outside, 500.0, 0)
+    return cost + np.where(
+        (lower < limits[:, 0]).any(axis=1) | (upper > limits[:, 1]).any(axis=1), 500.0, 0
+    )
 
 
 def _costs_with_labels(
@@ -116,8 +116,11 @@ def _costs_with_labels(
 ) -> Array:
     """Return costs (k,) of boxes (k, 2, 2) of a label, with other labels in boxes (2, 2)."""
     for lower, upper in other_boxes:
-        box_gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
-        cost = cost + np.where(box_gap < 4 * point_size, 1000.0, 0)
+        cost = cost + np.where(
+            np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1) < 4 * point_size,
+            1000.0,
+            0,
+        )
     return cost
 
 
@@ -130,9 +133,13 @@ def _choose_candidates(
     for sweep in range(_MAX_SWEEPS):
         previous = dict(chosen)
         for i in order:
-            other_boxes = [boxes[j][best_index] for j, best_index in chosen.items() if j != i]
             chosen[i] = int(
-                _costs_with_labels(other_boxes, boxes[i], costs[i], point_size).argmin()
+                _costs_with_labels(
+                    [boxes[j][best_index] for j, best_index in chosen.items() if j != i],
+                    boxes[i],
+                    costs[i],
+                    point_size,
+                ).argmin()
             )
         if sweep and chosen == previous:
             break
@@ -151,11 +158,14 @@ def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:
         np.fmin(first_parameters, second_parameters),
         np.fmax(first_parameters, second_parameters),
     )
-    is_parallel_outside = (direction == 0) & ((start < lower) | (start > upper))
     entry = np.where(direction == 0, -np.inf, entry).max(axis=1)
     exit_parameter = np.where(direction == 0, np.inf, exit_parameter).min(axis=1)
     share = np.minimum(exit_parameter, 1.0) - np.maximum(entry, 0.0)
-    share = np.where(is_parallel_outside.any(axis=1), 0.0, np.maximum(share, 0.0))
+    share = np.where(
+        ((direction == 0) & ((start < lower) | (start > upper))).any(axis=1),
+        0.0,
+        np.maximum(share, 0.0),
+    )
     return np.asarray(share * np.linalg.norm(direction))
 
 
@@ -178,11 +188,17 @@ def find_clear_point(
     distance = np.full(len(grid), np.inf)
     for start, end in segments:
         direction = end - start
-        share = np.clip(
-            (grid - start) @ direction / max(float(direction @ direction), 1e-30), 0, 1
-        )
         distance = np.minimum(
-            distance, np.linalg.norm(grid - start - share[:, None] * direction, axis=1)
+            distance,
+            np.linalg.norm(
+                grid
+                - start
+                - np.clip(
+                    (grid - start) @ direction / max(float(direction @ direction), 1e-30), 0, 1
+                )[:, None]
+                * direction,
+                axis=1,
+            ),
         )
     return grid[distance.argmax()], float(distance.max())
 
@@ -192,7 +208,6 @@ def _is_within_polygon(points: Array, corners: Array) -> NDArray[np.bool_]:
     inside = np.zeros(len(points), dtype=bool)
     x, y = points.T
     for (a, b), (c, d) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        is_crossing = (b > y) != (d > y)
         if b != d:
-            inside ^= is_crossing & (x < a + (y - b) * (c - a) / (d - b))
+            inside ^= ((b > y) != (d > y)) & (x < a + (y - b) * (c - a) / (d - b))
     return inside

@@ -47,8 +47,10 @@ class _MechanismProjection:
         self.axes, self.axis_cosines = plane.project(axes), np.abs(axes @ plane.normal)
         self.parents = [int(parent) for parent in model.parents]
         self.turns = [False] + [machine.unit(name) == "rad" for name in machine.joints]
-        chain_of = {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}
-        self.chains = [-1] + [chain_of.get(name, 0) for name in machine.joints]
+        self.chains = [-1] + [
+            {x: i for i, chain in enumerate(machine.chains) for x in chain.joints}.get(name, 0)
+            for name in machine.joints
+        ]
         self.tip_body, self.tip = 0, None
         if machine.tip is not None:
             frame = model.frames[machine.frame(machine.tip)]
@@ -89,8 +91,13 @@ class _MechanismProjection:
         if self._has_base():
             base_point, collar = self.outer[0][0], collars[0]
             ground = [item for item in ground if np.abs(item[0] - collar.position).max() > 0]
-            upward_distance = collar.axis @ (self._farthest_point(1) - base_point)
-            ground.append((base_point, -np.sign(upward_distance or 1.0) * collar.axis))
+            ground.append(
+                (
+                    base_point,
+                    -np.sign((collar.axis @ (self._farthest_point(1) - base_point)) or 1.0)
+                    * collar.axis,
+                )
+            )
             if len(base_line := _distinct_points([base_point, collar.position], self.size)) > 1:
                 bodies.append(SketchBody(base_line, -1, False, base_point))
         return SketchMechanism(
@@ -157,9 +164,8 @@ class _MechanismProjection:
         axial_distances = [float((point - previous_origin) @ axis) for point in self.outer[joint]]
         length = max(axial_distances, key=abs, default=0.0)
         min_distance = _COLLAR_DISTANCE_SHARE * self.size
-        is_isolated = parent == 0 and not (joint == 1 and self._has_base())
         if (
-            is_isolated
+            (parent == 0 and not (joint == 1 and self._has_base()))
             or abs(length) < min_distance
             or all(np.linalg.norm(point - position) > min_distance for point in pins)
         ):
@@ -210,9 +216,10 @@ class _MechanismProjection:
         sign, length = (1.0 if end >= inner_coordinate else -1.0), abs(end - inner_coordinate)
         offsets = [sign * (limit - value) for limit in (lower, upper) if np.isfinite(limit)]
         min_length = length + min(offsets) if offsets else 0.6 * length
-        max_length = length + max(offsets) if offsets else 1.4 * length
         barrel = (
-            _BARREL_LENGTH_SHARE * min_length if min_length > 0.25 * max_length else 0.5 * length
+            _BARREL_LENGTH_SHARE * min_length
+            if min_length > 0.25 * (length + max(offsets) if offsets else 1.4 * length)
+            else 0.5 * length
         )
         inner_length = max(length - 0.9 * min_length, 0.0) + 0.05 * barrel
         inner_length = min(inner_length, 0.94 * barrel)
@@ -231,12 +238,11 @@ class _MechanismProjection:
         )
 
     def _create_body(self, joint: int) -> SketchBody:
-        centre_of_mass = self.data.oMi[joint].act(self.model.inertias[joint].lever)
         return SketchBody(
             _distinct_points(self.points[joint], self.size),
             self.chains[joint],
             joint in self.tip_supports,
-            self.plane.project(centre_of_mass),
+            self.plane.project(self.data.oMi[joint].act(self.model.inertias[joint].lever)),
         )
 
     def _regions(self) -> dict[int, Array]:
@@ -349,5 +355,6 @@ def _forward_direction(
         machine.model, home_data, machine.coordinates.configuration(machine.home)
     )
     joint = machine.model.getJointId(machine.active[section.slewing_joint])
-    slew_rotation = data.oMi[joint].rotation @ home_data.oMi[joint].rotation.T
-    return np.asarray(slew_rotation @ section.first_direction)
+    return np.asarray(
+        (data.oMi[joint].rotation @ home_data.oMi[joint].rotation.T) @ section.first_direction
+    )

@@ -60,11 +60,10 @@ class SketchCanvas:
         self, points: Array, colour: str, width: float, fill_opacity: float, z_order: float
     ) -> None:
         """Draw a polygon with corners (k, 2) [m], filled with a tint of its colour."""
-        closed = np.vstack([points, points[:1]])
         self.axes.add_patch(
             Polygon(points, facecolor=colour, alpha=fill_opacity, linewidth=0, zorder=z_order)
         )
-        self.draw_line(closed, colour, width, zorder=z_order)
+        self.draw_line(np.vstack([points, points[:1]]), colour, width, zorder=z_order)
 
     def draw_box(
         self, start: Array, end: Array, width: float, colour: str, z_order: float
@@ -186,13 +185,12 @@ class SketchCanvas:
 
 def marker_options(style: dict[str, Any]) -> dict[str, Any]:
     """Return options of a line that shows only its marker."""
-    default_style = {
+    return {
         "linestyle": "none",
         "color": INK_COLOUR,
         "markeredgecolor": INK_COLOUR,
         "markeredgewidth": 1.2,
-    }
-    return default_style | style
+    } | style
 
 
 def convex_hull(points: Array) -> Array:
@@ -248,8 +246,7 @@ def create_sketch_layout(
     corners = np.array([_mechanism_bounds(fitted) for fitted in (mechanism, *other_mechanisms)])
     lower, upper = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
     span = np.maximum(upper - lower, 0.05 * mechanism.size)
-    available = np.array([_MAX_WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN
-    point_size = float((span / available).max())  # [m]
+    point_size = float((span / (np.array([_MAX_WIDTH, _MAX_HEIGHT]) - 2 * _MARGIN)).max())  # [m]
     axes_width, axes_height = np.maximum(span / point_size + 2 * _MARGIN, [_MIN_WIDTH, 0.0])
     coordinate_lines = _coordinate_lines(machine, q, int((axes_width + _LEFT_MARGIN) / 5.2))
     columns = max(int((axes_width + _LEFT_MARGIN) / 92), 1)
@@ -274,11 +271,23 @@ def create_sketch_layout(
     for axis, length in ((axes.xaxis, axes_width), (axes.yaxis, axes_height)):
         axis.set_major_locator(MaxNLocator(max(int(length / 55), 2), steps=[1, 2, 5, 10]))
     left = 12 / width
-    name = escape_label(machine.name.replace("_", " "))
-    figure.text(left, 1 - 8 / height, name, va="top", fontsize=11, fontweight="bold")
+    figure.text(
+        left,
+        1 - 8 / height,
+        escape_label(machine.name.replace("_", " ")),
+        va="top",
+        fontsize=11,
+        fontweight="bold",
+    )
     for row, line in enumerate(coordinate_lines):
-        line_y = 1 - (23 + _LINE_HEIGHT * row) / height
-        figure.text(left, line_y, line, va="top", fontsize=8, color="#555555")
+        figure.text(
+            left,
+            1 - (23 + _LINE_HEIGHT * row) / height,
+            line,
+            va="top",
+            fontsize=8,
+            color="#555555",
+        )
     figure.legend(
         handles=list(legend),
         labels=[str(entry[0].get_label()) for entry in legend],

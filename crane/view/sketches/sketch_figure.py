@@ -116,10 +116,14 @@ def sketch_figure(
     drawing_plane = find_plane(machine, q, plane)
     mechanism = project_mechanism(machine, q, drawing_plane)
     ghosts = [project_mechanism(machine, other, drawing_plane) for other in other_configurations]
-    legend = _legend(machine, show_centres_of_mass) + [
-        (_ghost_line(i),) for i in range(len(ghosts))
-    ]
-    figure, canvas = create_sketch_layout(mechanism, drawing_plane, machine, q, legend, ghosts)
+    figure, canvas = create_sketch_layout(
+        mechanism,
+        drawing_plane,
+        machine,
+        q,
+        (_legend(machine, show_centres_of_mass) + [(_ghost_line(i),) for i in range(len(ghosts))]),
+        ghosts,
+    )
     _draw_regions(canvas, mechanism)
     for i, ghost in enumerate(ghosts):
         _draw_ghost(canvas, ghost, mechanism, i)
@@ -149,9 +153,16 @@ def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, 
     for i, chain in enumerate(machine.chains):
         if not chain.joints:
             continue  # nothing has its colour
-        colour = CHAIN_COLOURS[i % len(CHAIN_COLOURS)]
         entries.append(
-            (Line2D([], [], color=colour, linewidth=3.0, label=escape_label(chain.name)),)
+            (
+                Line2D(
+                    [],
+                    [],
+                    color=CHAIN_COLOURS[i % len(CHAIN_COLOURS)],
+                    linewidth=3.0,
+                    label=escape_label(chain.name),
+                ),
+            )
         )
     symbols: dict[str, list[Any]] = {"joint": [JOINT_MARKER], "loop": [LOOP_MARKER, DOT_MARKER]}
     if show_centres_of_mass:
@@ -167,10 +178,14 @@ def _legend(machine: Machine, show_centres_of_mass: bool) -> list[tuple[Line2D, 
 def _ghost_line(index: int, points: Array | None = None) -> Line2D:
     """Return a dashed line of another assembly mode; without points for the legend."""
     x, y = np.zeros((2, 0)) if points is None else points.T
-    label = f"other assembly {index + 1}"
-    style = _GHOST_DASHES[index % len(_GHOST_DASHES)]
     return Line2D(
-        x, y, color=GHOST_COLOUR, linewidth=1.1, linestyle=style, label=label, zorder=2.2
+        x,
+        y,
+        color=GHOST_COLOUR,
+        linewidth=1.1,
+        linestyle=_GHOST_DASHES[index % len(_GHOST_DASHES)],
+        label=f"other assembly {index + 1}",
+        zorder=2.2,
     )
 
 
@@ -207,8 +222,14 @@ def _draw_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
     for number, corners in sorted(
         mechanism.regions.items(), key=lambda item: -_polygon_area(item[1])
     ):
-        colour = REGION_COLOURS[(number - 1) % len(REGION_COLOURS)]
-        canvas.axes.add_patch(Polygon(corners, facecolor=colour, linewidth=0, zorder=1))
+        canvas.axes.add_patch(
+            Polygon(
+                corners,
+                facecolor=REGION_COLOURS[(number - 1) % len(REGION_COLOURS)],
+                linewidth=0,
+                zorder=1,
+            )
+        )
 
 
 def _number_regions(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
@@ -236,10 +257,11 @@ def _ground_gap(
         np.abs(drawn_pin.position - position).max() < tolerance for drawn_pin in mechanism.pins
     ):
         return None
-    is_on_collar = any(
-        np.abs(item.position - position).max() < tolerance for item in mechanism.collars
+    return (
+        7.0
+        if any(np.abs(item.position - position).max() < tolerance for item in mechanism.collars)
+        else 0.0
     )
-    return 7.0 if is_on_collar else 0.0
 
 
 def _draw_centres(canvas: SketchCanvas, mechanism: SketchMechanism) -> None:
@@ -267,8 +289,10 @@ def _draw_body(canvas: SketchCanvas, body: SketchBody) -> None:
         )
         return
     direction = np.linalg.svd(points - points.mean(axis=0))[2][0]
-    length = float(np.ptp(points @ direction)) / canvas.point_size
-    width = min(4.2 if body.carries_tip else 2.6, length / 2)
+    width = min(
+        4.2 if body.carries_tip else 2.6,
+        (float(np.ptp(points @ direction)) / canvas.point_size) / 2,
+    )
     canvas.draw_line(points[np.argsort(points @ direction)], colour, width, zorder=z_order)
 
 
@@ -307,8 +331,13 @@ def _draw_slide(canvas: SketchCanvas, slide: SketchSlide) -> None:
         zorder=3.2,
     )
     piston_half = np.array([-direction[1], direction[0]]) * (width / 2 - 1.4) * point
-    piston = np.array([slide.rod_inner_end - piston_half, slide.rod_inner_end + piston_half])
-    canvas.axes.plot(*piston.T, color=rod_colour, linewidth=3.0, solid_capstyle="butt", zorder=3.3)
+    canvas.axes.plot(
+        *np.array([slide.rod_inner_end - piston_half, slide.rod_inner_end + piston_half]).T,
+        color=rod_colour,
+        linewidth=3.0,
+        solid_capstyle="butt",
+        zorder=3.3,
+    )
 
 
 def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
@@ -322,8 +351,14 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
             for other in remaining
             if np.abs(other.position - remaining[0].position).max() < tolerance
         ]
-        text = ", ".join(format_joint_symbol(name) for name in _sorted_names(coincident))
-        labels.append(SketchLabel(text, remaining[0].position, 4.0, "label"))
+        labels.append(
+            SketchLabel(
+                ", ".join(format_joint_symbol(name) for name in _sorted_names(coincident)),
+                remaining[0].position,
+                4.0,
+                "label",
+            )
+        )
         remaining = [other for other in remaining if other not in coincident]
     for drawn_pin in mechanism.pins:
         if drawn_pin.loop_number:
@@ -345,8 +380,14 @@ def _create_labels(mechanism: SketchMechanism) -> list[SketchLabel]:
         for item in mechanism.collars
     ]
     for slide in mechanism.slides:
-        middle = slide.rod_inner_end if slide.is_rail else (slide.start + slide.mouth) / 2
-        labels.append(SketchLabel(format_joint_symbol(slide.name), middle, 6.0, "label"))
+        labels.append(
+            SketchLabel(
+                format_joint_symbol(slide.name),
+                slide.rod_inner_end if slide.is_rail else (slide.start + slide.mouth) / 2,
+                6.0,
+                "label",
+            )
+        )
     if mechanism.tip is not None:
         labels.append(SketchLabel("tip", mechanism.tip, 7.0, "label tip"))
     return labels
@@ -362,8 +403,7 @@ def _sorted_names(pins: Sequence[SketchPin]) -> list[str]:
 
 def _extent_across(points: Array) -> float:
     """Return the extent [m] of points (k, 2) across the line through them."""
-    normal = np.linalg.svd(points - points.mean(axis=0))[2][-1]
-    return float(np.ptp(points @ normal))
+    return float(np.ptp(points @ np.linalg.svd(points - points.mean(axis=0))[2][-1]))
 
 
 def _polygon_area(corners: Array) -> float:
