@@ -47,12 +47,17 @@ def machine_facts(machine: Machine) -> Iterator[MachineFact]:
 
 
 def _chain_fact(machine: Machine) -> MachineFact:
-    folder, chains, rows = machine.path.parent, machine.chains, []
-    for chain in chains:
-        is_inside = chain.urdf.is_relative_to(folder)
-        file = chain.urdf.relative_to(folder) if is_inside else chain.urdf
-        rows.append((chain.name, str(file), chain.parent or ""))
-    return MachineFact("chains", ", ".join(x.name for x in chains), ("", "", "on"), tuple(rows))
+    folder, chains = machine.path.parent, machine.chains
+    return MachineFact(
+        "chains",
+        ", ".join(x.name for x in chains),
+        ("", "", "on"),
+        tuple((x.name, _relative_path(x.urdf, folder), x.parent or "") for x in chains),
+    )
+
+
+def _relative_path(file: Path, folder: Path) -> str:
+    return str(file.relative_to(folder) if file.is_relative_to(folder) else file)
 
 
 def _joint_fact(machine: Machine) -> MachineFact:
@@ -73,19 +78,21 @@ def _joint_fact(machine: Machine) -> MachineFact:
 
 def _joint_row(machine: Machine, joint_index: int) -> tuple[str, ...]:
     """Return limits, home coordinate, largest effort and role of a joint."""
-    joint, limits = machine.joints[joint_index], machine.coordinates
+    joint = machine.joints[joint_index]
     unit, effort = machine.unit(joint), machine.model.effortLimit[joint_index]
-    role, max_effort = "passive", ""
-    if joint in machine.active:
-        role = "free" if joint in machine.free else "driven"
-        if isfinite(effort) and effort:
-            max_effort = format_quantity(effort, FORCE_UNITS[unit], 4)
+    driven = joint in machine.active
+    max_effort = (
+        format_quantity(effort, FORCE_UNITS[unit], 4)
+        if driven and isfinite(effort) and effort
+        else ""
+    )
+    lower, upper = machine.coordinates.lower[joint_index], machine.coordinates.upper[joint_index]
     return (
         joint,
-        _format_limits(limits.lower[joint_index], limits.upper[joint_index], unit),
+        _format_limits(lower, upper, unit),
         f"{machine.home[joint_index]:.5g} {unit}",
         max_effort,
-        role,
+        ("passive" if not driven else "free" if joint in machine.free else "driven"),
     )
 
 
@@ -99,8 +106,9 @@ def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
         ("", "", ""),
         tuple((x.name, x.type, f"{x.predecessor} to {x.successor}") for x in loops),
     )
-    for x in closure.equations.couplings:
-        yield MachineFact("coupling", f"{x.name}, {_format_sum(x.factors)} = {x.offset:g}")
+    for coupling in closure.equations.couplings:
+        terms = _format_sum(coupling.factors)
+        yield MachineFact("coupling", f"{coupling.name}, {terms} = {coupling.offset:g}")
     if structure.blocks:
         order = [
             "+".join(machine.joints[closure.passive[i]] for i in columns)
@@ -111,24 +119,30 @@ def _loop_facts(machine: Machine) -> Iterator[MachineFact]:
 
 def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
     closure = machine.closure
-    elements = [(item.kind, item.between) for item in machine.force_elements if item.between]
-    distances = FrameDistances(machine, [ends for _, ends in elements])
-    lengths, _ = distances.evaluate(machine.home)
-    for (kind, (first, second)), length in zip(elements, lengths, strict=True):
-        text = f"{first} and {second}: {kind}, ends {length:.5g} m apart at home"
-        yield MachineFact("between", text)
+    elements = [item for item in machine.force_elements if item.between is not None]
+    lengths, _ = FrameDistances(
+        machine, [item.between for item in elements if item.between]
+    ).evaluate(machine.home)
+    for element, length in zip(elements, lengths, strict=True):
+        first_frame, second_frame = element.between or ("", "")
+        yield MachineFact(
+            "between",
+            f"{first_frame} and {second_frame}: {element.kind}, ends {length:.5g} m apart at home",
+        )
     for motor in machine.explicit_drives:
         yield MachineFact("drive", f"{motor.name}, along {_format_sum(motor.factors)}")
     if closure.equations.loops:
         condition_number = float(closure.condition_number(machine.home))
-        text = f"coordinates: condition {condition_number:.3g} at home"
-        if condition_number > 10:
-            for proposal in closure.proposed_active_joints:
-                if proposal.condition_number < condition_number / 2:
-                    text += f"; better with {proposal}"
-                    break
+        better_selections = [
+            c
+            for c in closure.proposed_active_joints
+            if condition_number > 10 and c.condition_number < condition_number / 2
+        ]
+        hint = f"; better with {better_selections[0]}" if better_selections else ""
         # of free ones too, which nothing drives
-        yield MachineFact("independent", text)
+        yield MachineFact(
+            "independent", f"coordinates: condition {condition_number:.3g} at home{hint}"
+        )
     if any(inertia.mass for inertia in list(machine.model.inertias)[1:]):
         backend = Dynamics(machine).backend_of("forward")
         reason = "" if backend == "compiled" else ", too large for machine code"
@@ -138,7 +152,8 @@ def _drive_facts(machine: Machine) -> Iterator[MachineFact]:
 def _circuit_fact(machine: Machine) -> Iterator[MachineFact]:
     if machine.hydraulics is None:
         return
-    rows = []
+    supply, rows = machine.hydraulics.supply, []
+    flow = f", {6e4 * supply.flow:.4g} l/min at most" if supply.flow else ""
     for joint, cylinder in machine.hydraulics.cylinders.items():
         valve = machine.hydraulics.valves[joint]
         kind = "sharing" if valve.sharing else "compensated" if valve.margin else "orifice"
@@ -146,21 +161,21 @@ def _circuit_fact(machine: Machine) -> Iterator[MachineFact]:
         unit, size = ("cm2", 1e4) if machine.unit(joint) == "m" else ("cm3/rad", 1e6)
         areas = f"{size * cylinder.area_a:.4g} and {size * cylinder.area_b:.4g} {unit}"
         rows.append((joint, f"{kind} valve{spool_text}", areas))
-    supply = machine.hydraulics.supply
-    text = f"{1e-5 * supply.pressure:.4g} bar"
-    if supply.flow:
-        text += f", {6e4 * supply.flow:.4g} l/min at most"
+    text = f"{1e-5 * supply.pressure:.4g} bar{flow}"
     yield MachineFact("hydraulics", text, ("", "", ""), tuple(rows))
 
 
 def _sensor_facts(machine: Machine) -> Iterator[MachineFact]:
     ideal_values = Sensor().parameters()
     for name, sensor in machine.sensors.items():
-        texts = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
-        texts += [
-            f"{key} {x:g}" for key, x in sensor.parameters().items() if x != ideal_values[key]
+        differing_values = [
+            f"{quantity_name} {x:g}"
+            for quantity_name, x in sensor.parameters().items()
+            if x != ideal_values[quantity_name]
         ]
-        yield MachineFact("sensor", f"{name}: {', '.join(filter(None, texts)) or 'ideal'}")
+        column_text = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
+        text = ", ".join([x for x in column_text if x] + differing_values) or "ideal"
+        yield MachineFact("sensor", f"{name}: {text}")
 
 
 def _format_sum(factors: Mapping[str, float]) -> str:

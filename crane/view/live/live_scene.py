@@ -15,8 +15,7 @@ from crane.formats.visuals.urdf_shapes import (
     Visual,
 )
 from crane.view.live.live_session import Session, round_up_to_nice
-from crane.view.page.machine_visuals import read_visuals
-from crane.view.page.scene import ground_height
+from crane.view.page.scene import ground_height, read_visuals
 
 _CAMERA_DIRECTION = np.array(
     [0.55, -1.0, 0.45]

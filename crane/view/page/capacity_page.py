@@ -15,7 +15,7 @@ from crane.ratings.capacity_report import capacity_facts, slew_labels
 from crane.ratings.drive_force_limits import drive_force_limits
 from crane.ratings.lifting_capacity import Capacity
 from crane.view.page.html_document import check_page_suffix, write_page
-from crane.view.plots.capacity_figure import (
+from crane.view.plots.rating_figures import (
     capacity_heading,
     drawing_extent,
     factor_colours,

@@ -9,8 +9,8 @@ from crane.description.force_elements import ForceElement, GasSpring
 from crane.dynamics.frame_jacobians import FrameDistances
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
-from crane.view.page.machine_visuals import largest_body_extent
 from crane.view.page.page_motion import frame_data, pack_base64
+from crane.view.page.scene import largest_body_extent
 
 _FULL_ARROW_PERCENTILE = (
     99.5  # percentile of the forces that has a full arrow: a single spike does not count

@@ -15,18 +15,18 @@ from crane.ratings.capacity_report import (
     table_note,
 )
 from crane.ratings.lifting_capacity import Capacity
-from crane.view.plots.capacity_figure import (
-    capacity_heading,
-    draw_capacity_panel,
-    drawing_extent,
-    factor_colours,
-)
 from crane.view.plots.figure_style import (
     FAINT_COLOUR,
     INK_COLOUR,
     escape_label,
     escape_text,
     figure_style,
+)
+from crane.view.plots.rating_figures import (
+    capacity_heading,
+    draw_capacity_panel,
+    drawing_extent,
+    factor_colours,
 )
 
 _PAGE_WIDTH, _PAGE_HEIGHT, _PAGE_MARGIN = (
