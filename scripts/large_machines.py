@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from measuring import conditions, put, table
 
-from crane.view.plots.recording_figure import FIGURE_STYLE, INK_COLOUR
+from crane.view.plots.figure_style import FIGURE_STYLE, INK_COLOUR
 
 SIZES = {
     "chain": (10, 19, 28, 40, 61, 100, 151, 199),

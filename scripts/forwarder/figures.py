@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from crane.common.atomic_output import replace_file
 from crane.common.samples import Array
-from crane.view.plots.recording_figure import FIGURE_STYLE
+from crane.view.plots.figure_style import FIGURE_STYLE
 from forwarder.paper import JOINTS, SIGNALS, TASKS, published
 from forwarder.runs import Run
 

@@ -268,14 +268,8 @@ class CalibrationProblem:
             return base, SimulationConstants(*(np.array(x) for x in zip(*every, strict=True)))
 
         motion = SimulationProblem(dynamics, drive, initial, steps, step)
-<<<<<<< HEAD
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            run_motion, derivatives = integrate_sensitivities(
-=======
         with warnings.catch_warnings(action="ignore"):
-            solution = integrate_sensitivities(
->>>>>>> h-ident
+            run_motion, derivatives = integrate_sensitivities(
                 motion,
                 case.sensors,
                 setup,
@@ -287,20 +281,10 @@ class CalibrationProblem:
         curve = CubicSpline(run_time, read_simulation(machine, run, case.sensors))
         readings, sensor_derivatives = self._sensor_readings(case, curve, z)
         jacobian = np.zeros((*readings.shape, self.unknown_count))
-<<<<<<< HEAD
-        sensors = [self._fitted_sensor(case, name, self.values(z)) for name in case.sensors]
-        sensitivity_curve, last = (
-            CubicSpline(run_time, derivatives),
-            run_time[-1],
-        )
-        for k, sensor in enumerate(sensors):
-            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, last)
-=======
-        sensitivity_curve = CubicSpline(solution.time, solution.derivatives)
+        sensitivity_curve = CubicSpline(run_time, derivatives)
         for k, name in enumerate(case.sensors):
             sensor = self._fitted_sensor(case, name, self.values(z))
-            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, solution.time[-1])
->>>>>>> h-ident
+            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, run_time[-1])
             jacobian[:, k, simulated_unknowns] = (
                 sensor.scale * sensitivity_curve(delayed_time)[:, k]
             )
