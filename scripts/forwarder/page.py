@@ -1,4 +1,4 @@
-"""docs/validation/mini_forwarder.md: tables and what they mean."""
+"""Tables and text of docs/validation/mini_forwarder.md."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""What the reduced-scale forwarder paper prints: tables, facts in the text, misprints."""
+"""Published values of the reduced-scale forwarder paper: tables, facts in the text, misprints."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""docs/validation/hydraulic_forwarder.md: tables and what they mean."""
+"""Tables and text of docs/validation/hydraulic_forwarder.md."""
 
 import numpy as np
 

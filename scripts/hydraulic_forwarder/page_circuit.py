@@ -1,4 +1,4 @@
-"""The part of the page on (21) to (32), valve and friction."""
+"""Section of the page about (21) to (32), valve and friction."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The part of the page on (1) to (20)."""
+"""Section of the page about (1) to (20)."""
 
 import numpy as np
 
