@@ -12,8 +12,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array, as_number
 from crane.control.control_law import ControllerInputs
 from crane.control.valve_commands import ValveCommand, ValveSignals, lever_signals, require_circuit
-from crane.description.specification import DEFAULT_RAMP_TIME
-from crane.description.task_phases import Phase
+from crane.description.specification import DEFAULT_RAMP_TIME, Phase
 from crane.machine.machine import Machine
 
 _SAMPLING_PERIOD = 0.01  # sampling period of the joints [s]

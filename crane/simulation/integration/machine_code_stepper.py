@@ -10,7 +10,7 @@ from crane.codegen import (
     Scalar,
     Tape,
 )
-from crane.codegen.intermediate_representation import ArrayPointer, Routine
+from crane.codegen.llvm.routine_builder import ArrayPointer, Routine
 from crane.common.samples import Array
 from crane.control.control_law import ControllerInputs, TracedController
 from crane.dynamics import external_forces

@@ -7,12 +7,12 @@ Differential Equations II, IV.8, which has the coefficients).
 import numpy as np
 
 from crane.codegen import Program, RoutineValue, Scalar, Tape, select
-from crane.codegen.intermediate_representation import ArrayPointer
-from crane.codegen.matrix_factorization import lu_factorize
+from crane.codegen.llvm.routine_builder import ArrayPointer
 from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
     dot,
+    lu_factorize,
     maximum,
     scale_vector,
     subtract_vectors,

@@ -4,7 +4,7 @@ import numpy as np
 
 from crane.closure.kinematics_formulas import largest_scaled_value
 from crane.codegen import Program, Scalar, Tape, max_abs, maximum
-from crane.codegen.intermediate_representation import Routine
+from crane.codegen.llvm.routine_builder import Routine
 from crane.codegen.symbolic import add_vectors, scale_vector
 from crane.common.samples import Array
 from crane.control.control_law import TracedController

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from crane.codegen import Program, RoutineValue, select
-from crane.codegen.intermediate_representation import ArrayPointer, Routine
+from crane.codegen.llvm.routine_builder import ArrayPointer, Routine
 from crane.simulation.integration.machine_code_stepper import (
     HELD_INDEX,
     MachineCodeStepper,

@@ -4,7 +4,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from crane.studies.optimization import Design
+from crane.studies.optimization.design_optimization import Design
 from crane.view.plots.figure_text import escape_label
 from crane.view.plots.recording_figure import (
     DASHED_STYLE,
