@@ -1,4 +1,4 @@
-"""What the benchmark simulates: the mini forwarder in springs and dampers, and its own motions."""
+"""The machine of the benchmark, the mini forwarder in springs and dampers, and its motions."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Tip error over CPU time of all engines: table, interpolation and picture."""
+"""Tip error over CPU time of all engines: table, interpolation and figure."""
 
 from collections.abc import Callable
 from pathlib import Path
