@@ -107,18 +107,18 @@ class _OpenLoopSearch:
             first, second = (self.placements[end].translation for end in ends)
             return float(np.linalg.norm(second - first))
 
-        for group in (self._named_proposals(), self._slide_proposals(), self._meeting_proposals()):
-            for proposal in sorted(group, key=frame_distance):
-                ends = {proposal.loop.predecessor, proposal.loop.successor}
-                if self._bodies_of(ends) in closed_bodies or ends & used_frames:
-                    continue
-                stem = proposal.loop.name
-                numbered = (f"{stem}_{number}" for number in itertools.count(2))
-                name = next(x for x in itertools.chain([stem], numbered) if x not in names)
-                names.add(name)
-                proposed.append(replace(proposal, loop=replace(proposal.loop, name=name)))
-                closed_bodies.add(self._bodies_of(ends))
-                used_frames |= ends
+        groups = self._named_proposals(), self._slide_proposals(), self._meeting_proposals()
+        for proposal in [x for group in groups for x in sorted(group, key=frame_distance)]:
+            ends = {proposal.loop.predecessor, proposal.loop.successor}
+            if self._bodies_of(ends) in closed_bodies or ends & used_frames:
+                continue
+            stem = proposal.loop.name
+            numbered = (f"{stem}_{number}" for number in itertools.count(2))
+            name = next(x for x in itertools.chain([stem], numbered) if x not in names)
+            names.add(name)
+            proposed.append(replace(proposal, loop=replace(proposal.loop, name=name)))
+            closed_bodies.add(self._bodies_of(ends))
+            used_frames |= ends
         return proposed
 
     def _named_proposals(self) -> Iterator[LoopProposal]:

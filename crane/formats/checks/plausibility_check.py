@@ -16,7 +16,7 @@ from crane.common.plausible_ranges import LONGEST
 from crane.common.samples import Array
 from crane.description.kinematic_tree import inertia_problem
 from crane.description.specification import MachineSpec
-from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, read_shapes
+from crane.formats.visuals.urdf_shapes import MeshShape, UrdfShapes, Visual, read_shapes
 from crane.formats.xml_file import XmlFile
 from crane.hydraulics.circuit_elements import MAIN_PUMP, TANK_NODE
 from crane.hydraulics.components import Valve
@@ -71,20 +71,24 @@ def warn_about_implausible_values(files: Sequence[XmlFile], spec: MachineSpec | 
         if _warn_about_units(xml):  # inertias cannot be compared with sizes in other units
             continue
         joint_distances = _joint_distances(xml)
-        bounds: dict[str, Bounds] = {}
-        for tag in ("collision", "visual"):  # of visuals, or of collisions for links without them
-            corners: dict[str, list[Array]] = {}
-            for visual in shapes.shapes[tag]:
-                corners.setdefault(visual.link, []).append(visual.bounding_corners())
-            bounds |= {
-                link: (np.concatenate(found).min(axis=0), np.concatenate(found).max(axis=0))
-                for link, found in corners.items()
-            }
+        # of visuals, or of collisions for links without visuals
+        bounds = _bounds_by_link(shapes.shapes["collision"]) | _bounds_by_link(
+            shapes.shapes["visual"]
+        )
         for link in xml.root.iterfind("link"):
             name = link.get("name", "").strip()
             _warn_about_body(xml, link, joint_distances.get(name, 0.0), bounds.get(name))
     if spec is not None:
         _warn_about_home(spec)
+
+
+def _bounds_by_link(visuals: Sequence[Visual]) -> dict[str, Bounds]:
+    """Return lowest and highest corner (3,) [m] of the shapes of each link, in its frame."""
+    corners: dict[str, list[Array]] = {}
+    for visual in visuals:
+        corners.setdefault(visual.link, []).append(visual.bounding_corners())
+    points = {link: np.concatenate(found) for link, found in corners.items()}
+    return {link: (found.min(axis=0), found.max(axis=0)) for link, found in points.items()}
 
 
 def _warn(text: str) -> None:

@@ -104,9 +104,8 @@ def read_external_forces(
         with error_recovery():
             values = section.values()
             contact_law |= {key: values.pop(key) for key in CONTACT_LAW_KEYS if key in values}
-            if "profile" in section:
-                values["profile"] = tuple(map(tuple, section.rows("profile")))
-            ground = section.create(Ground, **values)
+            rows = section.rows("profile") if "profile" in section else ()
+            ground = section.create(Ground, profile=tuple(map(tuple, rows)), **values)
 
     def read_contact(item: YamlSection) -> Contact:
         frame = _read_moving_frame(item, tree)

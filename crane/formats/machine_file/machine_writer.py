@@ -117,17 +117,16 @@ class MachineDraft:
         chains = [chain for chain in machine.chains if chain.name != "payload"]
         chain_of_attachment = {chain.attachment_name: chain.name for chain in chains[1:]}
         self._chain_of_link = _chains_by_link(tree, chains[0].name, chain_of_attachment)
+        robots = {chain.name: etree.Element("robot", name=chain.name) for chain in chains}
+        for link in tree.links.values():
+            add_link(robots[self._chain_of_link[link.name]], link)
+        for joint in tree.joints.values():
+            if joint.name not in chain_of_attachment:
+                add_joint(robots[self._chain_of_link[joint.child]], joint)
         for chain in chains:
-            robot = etree.Element("robot", name=chain.name)
-            for link in tree.links.values():
-                if self._chain_of_link[link.name] == chain.name:
-                    add_link(robot, link)
-            for joint in tree.joints.values():
-                is_attachment = joint.name in chain_of_attachment
-                if self._chain_of_link[joint.child] == chain.name and not is_attachment:
-                    add_joint(robot, joint)
-            copy_shapes(robot, machine, [chain.name])
-            self.add_chain(chain.name, robot, {"parent": chain.parent} if self.urdfs else {})
+            copy_shapes(robots[chain.name], machine, [chain.name])
+            parent = {"parent": chain.parent} if self.urdfs else {}
+            self.add_chain(chain.name, robots[chain.name], parent)
         load = _payload_urdf(machine)
         self._payload_file = None if load is None else (load.name, load.read_bytes())
         if self._payload_file is not None:

@@ -142,12 +142,10 @@ class YamlValues:
             if reader is None or name in excluded:
                 continue
             alternatives = self.schema.alternatives(name)
-            if name in self._data or (
-                key.default is REQUIRED and not any(x in self._data for x in alternatives)
-            ):
-                value = reader(self, name)
-                if value is not None:
-                    found[key.attribute or name] = value
+            is_missing = key.default is REQUIRED and self._data.keys().isdisjoint(alternatives)
+            value = reader(self, name) if name in self._data or is_missing else None
+            if value is not None:
+                found[key.attribute or name] = value
         return found
 
     def check_exclusive_keys(self) -> None:
