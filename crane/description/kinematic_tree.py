@@ -244,11 +244,6 @@ def joint_freedoms(kind: str, axis: Sequence[float]) -> tuple[Freedom, ...]:
     )
 
 
-def series_joint_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
-    """Return the names of the joints of a composite joint."""
-    return [f"{name}_{suffix}" for suffix, _, _ in freedoms]
-
-
 def joint_series(
     name: str,
     freedoms: Sequence[Freedom],

@@ -193,7 +193,10 @@ def unknown_parameter_text(spec: MachineSpec, names: Iterable[str], unknown_name
 
 
 _INERTIAL_UNITS = {"com": "m", "inertia": "kg m2"}
-_PLACEMENT_UNITS = dict.fromkeys("xyz", "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
+_LINK_UNITS = {"mass": "kg"} | dict.fromkeys("xyz", "m") | dict.fromkeys(_ANGLE_NAMES, "rad")
+_JOINT_UNITS = {  # of a sliding and of a turning joint
+    "lower": ("m", "rad"), "upper": ("m", "rad"), "rotor_inertia": ("kg", "kg m2"),
+}  # fmt: skip
 _SECTIONS = {
     "friction": FRICTION, "spring": FORCE, "gas_spring": GAS_SPRING, "end_stop": END_STOP,
     "rope": ROPE, "cylinder": CYLINDER, "valve": VALVE, "valve_control": VALVE_CONTROL,
@@ -222,27 +225,18 @@ def parameter_unit(tree: Tree, name: str) -> str:
     if prefix == "control":  # gains of two kinds of controllers
         return ""
     if prefix not in _SECTIONS:
-        return _tree_parameter_unit(tree, part, key)
+        kind = part.rpartition(".")[2]
+        if kind in _INERTIAL_UNITS and part not in tree.links:
+            return _INERTIAL_UNITS[kind]
+        if part in tree.joints and key in _JOINT_UNITS:
+            return _JOINT_UNITS[key][tree.joints[part].kind == "revolute"]
+        return _LINK_UNITS.get(key, "")
     is_rotary = owner in tree.joints and tree.joints[owner].kind == "revolute"
     value = _SECTIONS[prefix].keys.get(key)
     value = next(iter(getattr(value, "types", ())), value)  # an edge, which may be a curve
     if not isinstance(value, NumberKey):
         return ""
     return value.rotary_unit or value.unit if is_rotary else value.unit
-
-
-def _tree_parameter_unit(tree: Tree, part: str, key: str) -> str:
-    kind = part.rpartition(".")[2]
-    if kind in _INERTIAL_UNITS and part not in tree.links:
-        return _INERTIAL_UNITS[kind]
-    if key == "mass":
-        return "kg"
-    if part in tree.joints and key in ("lower", "upper", "rotor_inertia"):
-        is_rotary = tree.joints[part].kind == "revolute"
-        if key == "rotor_inertia":
-            return "kg m2" if is_rotary else "kg"
-        return "rad" if is_rotary else "m"
-    return _PLACEMENT_UNITS.get(key, "")
 
 
 NamesByKind = dict[str, dict[str, str]]  # kind -> name -> short description

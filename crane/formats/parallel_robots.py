@@ -22,7 +22,7 @@ from crane.formats.urdf.link_joint_elements import MOVABLE_TYPES
 from crane.formats.urdf.urdf_reader import UrdfModel, read_urdf
 from crane.formats.xml_file import XmlFile
 
-URDF_FILE, YAML_FILE = "robot.urdf", "robot.yaml"
+URDF_FILE = "robot.urdf"
 
 _ROBOT_FILE = SectionSchema(
     "the machine file",

@@ -358,11 +358,6 @@ def _read_curve(item: YamlSection, key: str) -> tuple[float, OpeningCurve] | Non
         raise item.error_at(key, f"'{key}' of {item.title}: {error}") from None
 
 
-def curve_data(coefficient: float, curve: OpeningCurve) -> dict[str, object]:
-    """A curve as a machine file has it, to the last bit."""
-    return {"coefficient": coefficient, "shape": [list(point) for point in curve.points]}
-
-
 def _normalize_curve(points: Sequence[tuple[float, float]]) -> tuple[float, OpeningCurve]:
     coefficient = max((value for _, value in points), default=0.0)
     return coefficient, OpeningCurve(
