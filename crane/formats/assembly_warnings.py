@@ -211,9 +211,9 @@ def alternative_configurations(machine: Machine) -> list[Array]:
 
 
 def _alternative_text(spec: MachineSpec, closure: Closure, alternative: AssemblyMode) -> str:
-    loops = " and ".join(f"'{name}'" for name in alternative.loops[:_MAX_LISTED])
-    if more := len(alternative.loops) - _MAX_LISTED:
-        loops += f" and {more} more" if more > 0 else ""
+    more = len(alternative.loops) - _MAX_LISTED
+    listed = [f"'{name}'" for name in alternative.loops[:_MAX_LISTED]]
+    loops = " and ".join([*listed, *[f"{more} more"] * (more > 0)])
     location = spec.source_locations.get("home") or spec.source_locations.get(
         f"loop {alternative.loops[0]}", spec.path.name
     )

@@ -93,14 +93,14 @@ class _OpenLoopSearch:
         self.characteristic_length = float(np.linalg.norm(np.ptp(points, axis=0)))
         given = (link.inertial for link in spec.tree.links.values())
         self.largest_mass = max((one.mass for one in given if one is not None), default=0.0)
-        self.loop_frames = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
 
     def find_proposals(self) -> list[LoopProposal]:
         """Return all proposals, at most one for each pair of bodies."""
         proposed: list[LoopProposal] = []
         names = {loop.name for loop in self.spec.loops}
-        closed_bodies = {self._bodies_of(pair) for pair in self.loop_frames}
-        used_frames = {frame for pair in self.loop_frames for frame in pair}
+        loop_frames = [(loop.predecessor, loop.successor) for loop in self.spec.loops]
+        closed_bodies = {self._bodies_of(pair) for pair in loop_frames}
+        used_frames = {frame for pair in loop_frames for frame in pair}
 
         def frame_distance(proposal: LoopProposal) -> float:
             ends = proposal.loop.predecessor, proposal.loop.successor

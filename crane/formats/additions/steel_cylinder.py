@@ -319,13 +319,10 @@ def _plane_normal(
     jacobian = pin.computeJointJacobians(
         machine.model, data, machine.coordinates.configuration(q)
     ).reshape(6, -1)
-    revolute_axes, prismatic_axes = [], []
-    for joint in joints_between(machine.tree.parent_joints, points[0].link, points[1].link):
-        column = jacobian[:, machine.column(joint.name)]
-        if joint.kind == "revolute":
-            revolute_axes.append(column[3:])
-        else:
-            prismatic_axes.append(column[:3])
+    joints = joints_between(machine.tree.parent_joints, points[0].link, points[1].link)
+    columns = {joint.name: jacobian[:, machine.column(joint.name)] for joint in joints}
+    revolute_axes = [columns[joint.name][3:] for joint in joints if joint.kind == "revolute"]
+    prismatic_axes = [columns[joint.name][:3] for joint in joints if joint.kind == "prismatic"]
     if revolute_axes:
         normal = revolute_axes[0]
     else:
