@@ -78,9 +78,8 @@ def tree_parameters(
             yield f"{joint.child}.{angle}", joint, ("rpy", i)
         if not joint.is_movable:
             continue
-        for key in ("lower", "upper"):
-            if math.isfinite(getattr(joint.limits, key)):
-                yield f"{joint.name}.{key}", joint, ("limits", key)
+        for key in [x for x in ("lower", "upper") if math.isfinite(getattr(joint.limits, x))]:
+            yield f"{joint.name}.{key}", joint, ("limits", key)
         yield f"{joint.name}.rotor_inertia", joint, ("rotor_inertia",)
 
 

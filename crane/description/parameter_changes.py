@@ -280,16 +280,14 @@ def set_active_joints(
         InputError: A joint is unknown, named twice, or both active and free.
     """
     names = [joint.name for joint in spec.tree.moving_joints]
-    for what, given in (("active", active), ("free", free)):
-        for joint in given or ():
-            if joint not in names:
-                raise InputError(
-                    f"{what} joint '{joint}' is unknown, {suggest_names(names, joint)}"
-                )
-            if list(given or ()).count(joint) > 1:
-                raise InputError(f"{what} joint '{joint}' is named twice, once will do")
-            if joint in (active or ()) and joint in (free or ()):
-                raise InputError(f"joint '{joint}' is active and free, keep one of the two")
+    chosen = {"active": list(active or ()), "free": list(free or ())}
+    for what, joint in [(what, joint) for what, given in chosen.items() for joint in given]:
+        if joint not in names:
+            raise InputError(f"{what} joint '{joint}' is unknown, {suggest_names(names, joint)}")
+        if chosen[what].count(joint) > 1:
+            raise InputError(f"{what} joint '{joint}' is named twice, once will do")
+        if joint in chosen["active"] and joint in chosen["free"]:
+            raise InputError(f"joint '{joint}' is active and free, keep one of the two")
     free_names = tuple(spec.free if free is None else free)
     if active is None:
         drives = _drives_without(spec.drives, free_names)
