@@ -174,8 +174,9 @@ class Kinematics(FrameKinematics):
                 q_a = np.clip(q_a + step[:, :, 0], machine.lower, machine.upper)
         except (ClosureError, np.linalg.LinAlgError):
             return None
-        deviation = np.abs(best_solution - curve)
-        is_near_curve = (deviation <= _INTERPOLATION_TOLERANCE * self._stroke_scales).all()
+        is_near_curve = (
+            np.abs(best_solution - curve) <= _INTERPOLATION_TOLERANCE * self._stroke_scales
+        ).all()
         tolerance = 1e-2 * _POSITION_TOLERANCE * reference_distance
         return best_solution if is_near_curve and smallest_distance.max() <= tolerance else None
 

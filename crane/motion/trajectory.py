@@ -137,8 +137,9 @@ class AdaptedTrajectory(Trajectory):
 
     def position(self, time: ArrayLike) -> Array:
         """See `Trajectory`."""
-        x = self._reference.position(np.asarray(time) * self._time_scale)
-        return self._insert_driven(x, self._start)
+        return self._insert_driven(
+            self._reference.position(np.asarray(time) * self._time_scale), self._start
+        )
 
     def _derivative(self, order: int, time: ArrayLike) -> Array:
         x = self._reference._derivative(order, np.asarray(time) * self._time_scale)

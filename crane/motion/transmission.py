@@ -82,8 +82,7 @@ class Transmission(OneLineRepr):
     @property
     def unknown_actuators(self) -> tuple[str, ...]:
         """Active joints whose position is not known yet."""
-        is_unknown = np.isnan(self._received_values[0])
-        return tuple(np.array(self.actuators)[is_unknown].tolist())
+        return tuple(np.array(self.actuators)[np.isnan(self._received_values[0])].tolist())
 
     def update(
         self,

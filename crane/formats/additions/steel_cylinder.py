@@ -24,7 +24,7 @@ from crane.formats.additions.attachment_points import (
     vector_between,
 )
 from crane.formats.machine_file.machine_writer import MachineDraft
-from crane.formats.urdf_elements import add_joint, add_link, format_numbers
+from crane.formats.xml_file import add_joint, add_link, format_numbers
 from crane.machine.machine import Machine
 
 STEEL_DENSITY = 7850.0  # [kg/m3]

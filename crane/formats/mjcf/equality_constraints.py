@@ -96,8 +96,9 @@ def read_equality_constraints(
         if kind == "CONNECT":
             pending_connects.append((name, source_location, ends[0], ends[1]))
         elif kind == "WELD":
-            fixes_rotation = model.eq_data[index, _TORQUE_SCALE_INDEX] != 0
-            loop_type = "fixed" if fixes_rotation else "spherical"
+            loop_type = (
+                "fixed" if (model.eq_data[index, _TORQUE_SCALE_INDEX] != 0) else "spherical"
+            )
             loops.append(_create_loop(name, loop_type, ends[0], ends[1], frames, source_location))
         elif kind in ("JOINT", "TENDON"):
             couplings.append(

@@ -97,7 +97,7 @@ class _MjcfReader:
         for drive in drives if not active else ():
             # one joint of each drive: its other joints depend on that, or are other coordinates
             active += [x for x in drive.factors if x not in active][:1]
-        free = self._listed_joints("free")
+        free = tuple(self._listed_joints("free"))
         home, tip = self._read_home(), self._read_tip(tree)
         mjcf.warn_about_notes()
         home_locations = {f"home {joint}": self.joints[joint].source_location for joint in home}
@@ -116,7 +116,7 @@ class _MjcfReader:
             tip=tip,
             couplings=couplings,
             source_locations=source_locations(loops, couplings) | home_locations,
-            free=tuple(free),
+            free=free,
             drives=drives,
         )
         return with_rotation_vectors(spec)
@@ -133,9 +133,13 @@ class _MjcfReader:
         name = f"{link}_fixed"
         while name in self.joints or name in self.names:
             name += "_"
-        source_location = self.links[link].source_location
         self.joints[name] = Joint(
-            name, "fixed", parent, link, source_location, *xyz_rpy_from_se3(placement)
+            name,
+            "fixed",
+            parent,
+            link,
+            self.links[link].source_location,
+            *xyz_rpy_from_se3(placement),
         )
 
     def _read_body(self, body: int) -> None:
@@ -149,16 +153,12 @@ class _MjcfReader:
         rotation = inertia_pose.rotation
         tensor = rotation @ np.diag(model.body_inertia[body]) @ rotation.T
         first = model.body_jntadr[body]
-        joints = range(first, first + model.body_jntnum[body])
-        for joint in joints:
-            if self.mjcf.joint_type(joint) in ("BALL", "FREE"):
-                tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
-        inertia = pin.Inertia(float(model.body_mass[body]), inertia_pose.translation, tensor)
         parent = self.body_links[model.body_parentid[body]]
         placement = pose(model.body_quat[body], model.body_pos[body])
         series_joints: list[Joint] = []
         previous_anchor = np.zeros(3)  # anchor of the previous joint, in the body's frame
-        for joint in joints:
+        for joint in range(first, first + model.body_jntnum[body]):
+            tensor = tensor + isotropic_rotor_inertia(self.mjcf, joint) * np.eye(3)
             if model.jnt_type[joint] == 0:
                 placement = pin.SE3.Identity()
             offset = pin.SE3(np.eye(3), model.jnt_pos[joint] - previous_anchor)
@@ -166,14 +166,14 @@ class _MjcfReader:
             new_joints = self._read_joint(joint, offset if series_joints else placement * offset)
             self.series_joints[joint] = [part.name for part in new_joints]
             series_joints += new_joints
+        inertia = pin.Inertia(float(model.body_mass[body]), inertia_pose.translation, tensor)
         self.links[name] = Link(name, source_location, inertial_from_inertia(inertia))
-        for i, part in enumerate(series_joints):
-            last = i == len(series_joints) - 1
-            child = name
-            if not last or previous_anchor.any():
-                child = self._unique_link_name(f"{name}_{i + 1}")
+        for i, part in enumerate(series_joints, start=1):
+            child, is_last = name, i == len(series_joints)
+            if not is_last or previous_anchor.any():
+                child = self._unique_link_name(f"{name}_{i}")
                 self.links[child] = Link(
-                    child, source_location, composite_joint=None if last else name
+                    child, source_location, composite_joint=None if is_last else name
                 )
             if part.name in self.joints:
                 raise DescriptionError(

@@ -70,8 +70,9 @@ class JointEffects:
             if value:
                 values[joint] = values.get(joint, 0.0) + value
         if square * stiffness:
-            spring = ForceElement(joint, stiffness=square * stiffness, rest=rest / factor)
-            self.springs.append(spring)
+            self.springs.append(
+                ForceElement(joint, stiffness=square * stiffness, rest=rest / factor)
+            )
 
     @property
     def friction(self) -> dict[str, Friction]:
@@ -146,13 +147,15 @@ def straight_tendon_sites(mjcf: MujocoFile, tendon: int) -> tuple[int, int] | No
 
 
 def isotropic_rotor_inertia(mjcf: MujocoFile, joint: int) -> float:
-    """Return the rotor inertia [kg m2] that a ball or free joint adds to its body, isotropic.
+    """Return the rotor inertia [kg m2] that a ball or free joint adds to its body, else 0.
 
     Rotors turn with the body against its parent, so they belong to the body if the parent is
     fixed.
     """
     model, dof = mjcf.model, int(mjcf.model.jnt_dofadr[joint])
-    rotor = float(model.dof_armature[dof + 3 * (mjcf.joint_type(joint) == "FREE")])
+    if (kind := mjcf.joint_type(joint)) not in ("BALL", "FREE"):
+        return 0.0
+    rotor = float(model.dof_armature[dof + 3 * (kind == "FREE")])
     if rotor and model.body_weldid[model.body_parentid[model.jnt_bodyid[joint]]]:
         mjcf.note_unsupported_elements(
             "armature of ball joints on moving bodies", "JOINT", [joint]

@@ -357,8 +357,9 @@ def nonzero_rows(model: Any, field: str) -> list[int]:
     values = getattr(model, field, None)
     if values is None or not np.size(values):
         return []
-    is_nonzero = np.any(np.reshape(values, (len(values), -1)), axis=1)
-    return [int(row) for row in np.flatnonzero(is_nonzero)]
+    return [
+        int(row) for row in np.flatnonzero(np.any(np.reshape(values, (len(values), -1)), axis=1))
+    ]
 
 
 def pose(quaternion: np.ndarray, position: np.ndarray) -> pin.SE3:

@@ -101,8 +101,9 @@ class SdfElement:
 
     def parse_numbers(self, count: int, description: str) -> tuple[float, ...]:
         """Return the numbers in the text of this element."""
-        text = self.element.text or ""
-        return self.xml.parse_numbers(self.element, text, f"{description} of {self.label}", count)
+        return self.xml.parse_numbers(
+            self.element, self.element.text or "", f"{description} of {self.label}", count
+        )
 
     def direction(self, tag: str) -> np.ndarray:
         """Return the unit vector (3,) of a child, z without one.

@@ -149,8 +149,9 @@ class SdfJoints:
         placement_in_scope = self._frames.element_pose(
             scope, joint, "" if ends[1] == WORLD_NODE else joint.text("child")
         )
-        scope_pose = self._frames.nested_model_pose(self._top, scope, scope.item)
-        placement = scope_pose * placement_in_scope
+        placement = (
+            self._frames.nested_model_pose(self._top, scope, scope.item) * placement_in_scope
+        )
         tags = [] if kind in _AXISLESS_TYPES else ["axis"]
         if kind in (*_TWO_FREEDOM_TYPES, "gearbox"):
             tags = ["axis", "axis2"]
@@ -159,8 +160,11 @@ class SdfJoints:
         if kind == "gearbox":
             reference = self._end_node(scope, joint, "gearbox_reference_body")
             first, second = (np.asarray(placement.rotation @ axis.direction) for axis in axes)
-            ratio = joint.number("gearbox_ratio", 1.0)
-            self.gearboxes.append(Gearbox(reference, ends, (first, second), ratio, joint))
+            self.gearboxes.append(
+                Gearbox(
+                    reference, ends, (first, second), joint.number("gearbox_ratio", 1.0), joint
+                )
+            )
         elif kind in _TWO_FREEDOM_TYPES:
             parts = [f"{name}_1", f"{name}_2"]
             self._freedom_names[name] = parts
@@ -258,8 +262,11 @@ class SdfJoints:
 
     def _read_mimic(self, scope: ModelScope, joint: SdfElement) -> None:
         """Read axes that mimic an axis of another joint."""
-        own_freedoms = self._freedom_names.get(f"{scope.prefix}{joint.name}", [])
-        for name, tag in zip(own_freedoms, ("axis", "axis2"), strict=False):
+        for name, tag in zip(
+            self._freedom_names.get(f"{scope.prefix}{joint.name}", []),
+            ("axis", "axis2"),
+            strict=False,
+        ):
             axis = joint.single_child(tag)
             mimic = None if axis is None else axis.single_child("mimic")
             if mimic is None:

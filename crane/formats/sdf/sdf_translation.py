@@ -37,14 +37,15 @@ from crane.formats.sdf.spanning_tree import (
     ground_edges,
     spanning_tree,
 )
-from crane.formats.urdf_elements import (
+from crane.formats.xml_file import (
+    XmlFile,
     add_friction,
     add_joint,
     add_origin,
     finite_limits,
     format_numbers,
+    set_source_location,
 )
-from crane.formats.xml_file import XmlFile, set_source_location
 
 _IDENTITY_TOLERANCE = 1e-15
 _MAX_SHOWN_NAMES = 4  # of unsupported elements in a warning
@@ -174,8 +175,10 @@ class _SdfTranslation:
         if self._initial_positions:
             state = etree.SubElement(self._robot, "group_state", name="home", group="all")
             for name, axis in self._initial_positions:
-                initial = etree.SubElement(state, "joint", name=name, value=repr(axis.initial))
-                self._set_source_location(initial, axis.item)
+                self._set_source_location(
+                    etree.SubElement(state, "joint", name=name, value=repr(axis.initial)),
+                    axis.item,
+                )
         self._notes.warn_about_notes()
         return XmlFile(self._xml.file, self._robot, self._locations), tuple(self._springs)
 
@@ -186,8 +189,9 @@ class _SdfTranslation:
 
     def _add_links(self, edges: list[SdfJointEdge]) -> None:
         self._ground_link = self._unique_link_name("world")
-        ground = etree.SubElement(self._robot, "link", name=self._ground_link)
-        self._set_source_location(ground, self._top.item)
+        self._set_source_location(
+            etree.SubElement(self._robot, "link", name=self._ground_link), self._top.item
+        )
         bodies = _rigid_bodies(edges)
         for name, link in self._links.items():
             scope = self._scopes[name]
@@ -213,9 +217,10 @@ class _SdfTranslation:
         parent, child = (edge.parent, edge.child) if is_forward else (edge.child, edge.parent)
         axis = edge.axis
         placement = xyz_rpy_from_se3(self._link_poses[parent].actInv(edge.placement))
-        kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
         ends = self._link_name(parent), self._joint_child_link(edge, child)
-        joint = Joint(edge.name, kind, *ends, "", *placement)
+        joint = Joint(
+            edge.name, {"ball": "spherical"}.get(edge.kind, edge.kind), *ends, "", *placement
+        )
         if axis is not None:
             direction = to_vector(axis.direction if is_forward else -axis.direction)
             joint = dataclasses.replace(joint, axis=direction, limits=axis.limits)
@@ -239,8 +244,9 @@ class _SdfTranslation:
             return self._link_name(link)
         name = self._unique_link_name(f"{edge.name}_frame")
         self._set_source_location(etree.SubElement(self._robot, "link", name=name), edge.item)
-        placement = xyz_rpy_from_se3(offset)
-        fixed = Joint(f"{name}_fixed", "fixed", name, self._link_name(link), "", *placement)
+        fixed = Joint(
+            f"{name}_fixed", "fixed", name, self._link_name(link), "", *xyz_rpy_from_se3(offset)
+        )
         self._set_source_location(add_joint(self._robot, fixed), edge.item)
         return name
 

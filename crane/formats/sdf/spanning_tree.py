@@ -115,8 +115,11 @@ def gear_couplings(
             _gear_angle(edges, gear, bodies, link, direction)
             for link, direction in zip(gear.links, gear.directions, strict=True)
         )
-        multiplier = -gear.ratio * first_sign / second_sign
-        found.append(CoupledCoordinate(second, first, multiplier, 0.0, gear.item))
+        found.append(
+            CoupledCoordinate(
+                second, first, -gear.ratio * first_sign / second_sign, 0.0, gear.item
+            )
+        )
     return found
 
 

@@ -12,7 +12,6 @@ from crane.description.findings import (
     FollowUpError,
     error_recovery,
     record_parsed_file,
-    report_error,
 )
 from crane.description.force_elements import ForceElement, Friction
 from crane.description.kinematic_tree import Joint, Link, Tree
@@ -163,8 +162,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         if (same_named := joints.get(frame.name)) is None:
             parts.append(frame)
         else:
-            problem = f"joint '{frame.name}' has the name of a loop's, rename it"
-            report_error(xml.error_at(same_named, problem))
+            xml.report(same_named, f"joint '{frame.name}' has the name of a loop's, rename it")
     couplings = _read_mimics(xml, joints, independent_names)
     for name, element in _elements_by_name(xml, "coupling").items():
         with error_recovery():
@@ -199,8 +197,9 @@ def _check_elements(xml: XmlFile, edit: Callable[[XmlFile], None] | None) -> Non
         edit(xml)
     for tag, replacement_tag in _OBSOLETE_ELEMENTS.items():
         for element in xml.root.iterfind(tag):
-            problem = f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one"
-            report_error(xml.error_at(element, problem))
+            xml.report(
+                element, f"<{tag}> is not read, URDF+ has <{replacement_tag}> for it: write one"
+            )
 
 
 def _read_joint_series(
@@ -218,8 +217,7 @@ def _read_joint_series(
     for part in series_parts:
         kind, used_names = ("link", links) if isinstance(part, Link) else ("joint", joints)
         if part.name in used_names:
-            problem = f"its {kind} '{part.name}' is there already, rename one"
-            report_error(xml.error_at(joints[name], problem))
+            xml.report(joints[name], f"its {kind} '{part.name}' is there already, rename one")
         else:
             found.append(part)
     return found
@@ -277,12 +275,13 @@ def _elements_by_name(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
         name = element.get("name", "").strip()
         if not name:
             xml.unnamed_kinds.add(kind)
-            report_error(xml.error_at(element, f'a {kind} has no name, add name="..."'))
+            xml.report(element, f'a {kind} has no name, add name="..."')
         elif name in found:
             xml.unnamed_kinds.add(kind)
             first = xml.source_location(found[name]).rpartition(":")[2]
-            problem = f"{kind} '{name}' is there twice (first in line {first}), rename one"
-            report_error(xml.error_at(element, problem))
+            xml.report(
+                element, f"{kind} '{name}' is there twice (first in line {first}), rename one"
+            )
         else:
             found[name] = element
     return found

@@ -18,14 +18,14 @@ from crane.common.errors import CraneWarning, InputError, format_one_line
 from crane.description.kinematic_tree import Tree
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.robot_files import open_robots
-from crane.formats.urdf_elements import (
+from crane.formats.visuals.urdf_shapes import find_mesh_file
+from crane.formats.xml_file import (
     add_friction,
     add_joint,
     add_link,
     add_origin,
     format_numbers,
 )
-from crane.formats.visuals.mesh_files import find_mesh_file
 from crane.machine.machine import Machine
 
 

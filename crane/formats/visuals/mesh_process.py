@@ -1,6 +1,6 @@
 """A process that reads mesh files, so that a damaged file can crash only this process.
 
-`crane.formats.visuals.mesh_files` runs it and sends a JSON object {"files": paths, "triangles":
+`crane.formats.visuals.urdf_shapes` runs it and sends a JSON object {"files": paths, "triangles":
 largest number in all files}. For each file the process writes a line of JSON, {"parts":
 [{"vertices": V, "faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether no other file
 was opened for it} or {"wrong": "message"}, then the arrays of each part: V 3 float64, F 3 int64.
@@ -125,23 +125,18 @@ def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]
     parts: list[dict[str, Any]] = []
     arrays: list[Any] = []
     for colour, colour_parts in by_colour.items():
-        first = np.cumsum([0, *(len(vertices) for vertices, _ in colour_parts)])
-        vertices = np.concatenate([vertices for vertices, _ in colour_parts])
-        faces = np.concatenate(
-            [x + start for start, (_, x) in zip(first, colour_parts, strict=False)]
-        )
-        parts.append({"vertices": len(vertices), "faces": len(faces), "colour": colour})
-        arrays += [vertices, faces]
+        joined = trimesh.util.append_faces(*zip(*colour_parts, strict=True))
+        parts.append({"vertices": len(joined[0]), "faces": len(joined[1]), "colour": colour})
+        arrays += joined
     return {"parts": parts, "alone": not SiblingFileResolver.asked}, arrays
 
 
 def _part_colour(part: Any) -> tuple[float, ...] | None:
     """Return the colour of a part, None if it has no readable one."""
     try:
-        if not part.visual.defined:
-            return None
         material = getattr(part.visual, "material", part.visual)
-        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in material.main_color)
+        components = material.main_color if part.visual.defined else ()
+        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in components)
     except MemoryError:
         raise
     except Exception:  # such as a damaged texture

@@ -166,8 +166,9 @@ def _split_curve(kind: str, kinematics: WorkspaceKinematics, q: Array) -> list[S
     tips = kinematics.tip_positions(q)
     section_positions = kinematics.section.coordinates(tips)
     distances = np.linalg.norm(np.diff(section_positions, axis=0), axis=1)
-    jump_indices = np.flatnonzero(distances > _MAX_GAP_SHARE * kinematics.extent) + 1
-    rows = np.split(np.arange(len(q)), jump_indices)
+    rows = np.split(
+        np.arange(len(q)), np.flatnonzero(distances > _MAX_GAP_SHARE * kinematics.extent) + 1
+    )
     active = kinematics.machine.closure.active
     return [SingularCurve(kind, q[k][:, active], tips[k], section_positions[k]) for k in rows]
 
@@ -206,8 +207,9 @@ def covered_triangles(
         ring = [(patch.configurations[node], nodes[node]) for node in cell]
         is_reduced = len(kinematics.strokes) > _MAX_CURVE_STROKES
         subdivisions = _REDUCED_SUBDIVISIONS if is_reduced else _MAX_SUBDIVISIONS
-        triangles = _subdivide_cell(kinematics, ring, max_side, subdivisions)
-        out.append(np.array(triangles).reshape(-1, 3, 2))
+        out.append(
+            np.array(_subdivide_cell(kinematics, ring, max_side, subdivisions)).reshape(-1, 3, 2)
+        )
     if branch_edges:
         edge_positions = kinematics.section.coordinates(
             kinematics.tip_positions(np.array(list(branch_edges.values())))

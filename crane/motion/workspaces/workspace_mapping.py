@@ -153,8 +153,9 @@ def _map_patch(
     """Patch over the two strokes with the largest displacements (d,) of the tip."""
     first, second = sorted(strokes[int(i)] for i in np.argsort(displacements)[-2:])
     axes = tuple(np.linspace(lower[i], upper[i], _MAP_VALUES) for i in (first, second))
-    home = machine.home[machine.closure.active]
-    patch = fill_patch(machine, home, (first, second), (axes[0], axes[1]))
+    patch = fill_patch(
+        machine, machine.home[machine.closure.active], (first, second), (axes[0], axes[1])
+    )
     assert patch is not None, "home itself closes"
     return patch
 
@@ -188,9 +189,8 @@ def moving_strokes(
     tip_motion = np.zeros(len(machine.active))
     units = closure.units[closure.active] / closure.characteristic_length
     for q in configurations:
-        gamma = closure.gamma(q)
-        tip_derivatives = np.abs(kinematics.tree_jacobian(q) @ gamma * units).max(axis=0)
-        tip_motion = np.maximum(tip_motion, tip_derivatives)
+        tip_derivatives = np.abs(kinematics.tree_jacobian(q) @ closure.gamma(q) * units)
+        tip_motion = np.maximum(tip_motion, tip_derivatives.max(axis=0))
     is_coupled = np.abs(closure.gamma(machine.home)[closure.passive]).max(axis=0, initial=0.0) > 0
     tip_motion[~machine.is_driven] = 0.0
     if tip_motion.max() <= _MOTION_TOLERANCE:
