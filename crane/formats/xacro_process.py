@@ -56,8 +56,9 @@ class _LocationBuilder(expatbuilder.ExpatBuilderNS):
         super().start_element_handler(name, attributes)
         element: Any = self.curNode
         if not element.tagName.startswith(_XACRO_PREFIX):
-            location = f"{self._number}:{self.getParser().CurrentLineNumber}"
-            element.setAttribute(LOCATION_ATTRIBUTE, location)
+            element.setAttribute(
+                LOCATION_ATTRIBUTE, f"{self._number}:{self.getParser().CurrentLineNumber}"
+            )
         elif element.localName == "arg":
             self._arguments[element.getAttribute("name")] = None
 
@@ -76,8 +77,9 @@ def _expand(xacro: Any, request: dict[str, Any]) -> dict[str, Any]:
             return inp
         names.append(filename)
         try:
-            builder = _LocationBuilder(len(names) - 1, arguments)
-            return builder.parseString(Path(filename).read_bytes())
+            return _LocationBuilder(len(names) - 1, arguments).parseString(
+                Path(filename).read_bytes()
+            )
         except OSError as error:
             xacro.filestack.pop()
             raise xacro.XacroException(f"{error.strerror}: {filename}", exc=error) from None

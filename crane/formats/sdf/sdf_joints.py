@@ -14,7 +14,7 @@ import pinocchio as pin
 from crane.common.errors import suggest_names
 from crane.description.kinematic_tree import Limits, parse_limit
 from crane.formats.sdf.frame_poses import SdfFramePoses, find_link
-from crane.formats.sdf.model_scope import ModelScope, SdfElement
+from crane.formats.sdf.model_scope import ModelScope, SdfElement, sdf_version
 
 WORLD_NODE = "::world"  # not a possible name of a link
 _SINGLE_FREEDOM_TYPES = {
@@ -232,7 +232,7 @@ class SdfJoints:
         child = axis.single_child("xyz")
         frame_name = "" if child is None else child.attribute("expressed_in")
         is_in_model_frame = axis.text("use_parent_model_frame").lower() in ("true", "1")
-        if not frame_name and (scope.version <= (1, 4) or is_in_model_frame):
+        if not frame_name and (sdf_version(axis.xml.root) <= (1, 4) or is_in_model_frame):
             frame_name = "__model__"
         if not frame_name:
             return xyz

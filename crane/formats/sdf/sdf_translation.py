@@ -90,34 +90,31 @@ def translate_to_urdf(xml: XmlFile) -> tuple[XmlFile, tuple[ForceElement, ...]]:
 
 def _choose_model(xml: XmlFile, world: ModelScope) -> ModelScope:
     """Return the only movable model, or the model that the load argument `model` names."""
-    model_name = load_options().arguments.get("model")
+    model_name, problem = load_options().arguments.get("model"), "none of its models moves"
     names = list(world.models)
-    if model_name is not None:
-        if model_name in world.models:
-            return world.models[model_name]
-        raise DescriptionError(
-            f"{xml.file.name}: no model '{model_name}', {suggest_names(names, model_name)}"
+    candidates = [name for name in names if model_name in (None, name)]
+    if not candidates:
+        problem = f"no model '{model_name}', {suggest_names(names, model_name)}"
+    elif len(candidates) > 1:
+        problem += f" ({', '.join(names)})"
+        candidates = [
+            name
+            for name, model in world.models.items()
+            if not model.is_static
+            and any(
+                joint.element.get("type") != "fixed"
+                for scope in model.nested_scopes()
+                for joint in scope.joints.values()
+            )
+        ]
+    if len(candidates) == 1:
+        return world.models[candidates[0]]
+    if candidates:
+        problem = (
+            f"{len(candidates)} models move ({', '.join(candidates)}), choose one: "
+            "--arg model:=NAME, arguments={'model': NAME} in Python"
         )
-    if len(names) == 1:
-        return world.models[names[0]]
-    moving = [
-        name
-        for name, model in world.models.items()
-        if not model.is_static
-        and any(
-            joint.element.get("type") != "fixed"
-            for scope in model.nested_scopes()
-            for joint in scope.joints.values()
-        )
-    ]
-    if len(moving) == 1:
-        return world.models[moving[0]]
-    if not moving:
-        raise DescriptionError(f"{xml.file.name}: none of its models moves ({', '.join(names)})")
-    raise DescriptionError(
-        f"{xml.file.name}: {len(moving)} models move ({', '.join(moving)}), choose one: "
-        "--arg model:=NAME, arguments={'model': NAME} in Python"
-    )
+    raise DescriptionError(f"{xml.file.name}: {problem}")
 
 
 class _SdfTranslation:

@@ -75,8 +75,9 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     for name, value in zip(machine.joints, machine.home, strict=True):
         etree.SubElement(state, "joint", name=name, value=format_numbers([value]))
     if machine.tip is not None:
-        tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
-        etree.SubElement(robot, "end_effector", tip)
+        etree.SubElement(
+            robot, "end_effector", {"name": "tip", "parent_link": machine.tip, "group": "all"}
+        )
     copy_shapes(robot, machine)
     with replace_file(path) as temporary_file:
         temporary_file.write_bytes(format_document(robot, origin_text(machine)))
@@ -86,8 +87,9 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         "rotor inertias": rotor_inertias(machine),
         "drives along several joints": compound_drive_factors(machine),
     }
-    unsupported = [name for name, section in sections.items() if section]
-    warn_about_unsupported(machine, "URDF+", unsupported)
+    warn_about_unsupported(
+        machine, "URDF+", [name for name, section in sections.items() if section]
+    )
 
 
 def _add_joint_friction(element: etree._Element, machine: Machine, joint: str) -> None:
