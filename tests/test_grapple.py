@@ -436,4 +436,6 @@ def test_a_run_of_the_command_line(tmp_path):
     done = typed("simulate", NAME, "--duration", "1", "--sway", "flat", "--out", tmp_path / "x")
     assert done.stderr == "error: --sway changes a reference, name a --task or a --path\n"
     done = typed("simulate", NAME, "--task", "stir", "--sway", "flat", "--out", tmp_path / "x")
-    assert done.stderr == "error: task 'stir' moves levers, leave --sway out\n"
+    assert done.stderr == (
+        "error: --sway does not go with task 'stir', which moves levers, leave it out\n"
+    )

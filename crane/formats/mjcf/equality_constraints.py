@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import DescriptionError
-from crane.description.pinocchio_conversion import to_vector
+from crane.description.kinematic_tree import to_vector
 from crane.description.specification import Coupling, LoopSpec
 from crane.formats.mjcf.model_features import fixed_tendon_factors
 from crane.formats.mjcf.mujoco_file import MujocoFile, pose

@@ -13,17 +13,15 @@ from crane.description.kinematic_tree import (
     Limits,
     Link,
     Tree,
+    joint_freedoms,
+    joint_series,
     parse_limit,
+    to_vector,
     with_rotor_inertias,
 )
-from crane.description.pinocchio_conversion import (
-    inertial_from_inertia,
-    to_vector,
-    xyz_rpy_from_se3,
-)
+from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import Chain, MachineSpec, source_locations
-from crane.formats.joint_series import joint_freedoms, joint_series
-from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.machine_file.structure_sections import TreeBuilder
 from crane.formats.mjcf.equality_constraints import MjcfFrames, read_equality_constraints
 from crane.formats.mjcf.model_features import (
     isotropic_rotor_inertia,

@@ -17,8 +17,8 @@ from lxml import etree
 from crane.common.errors import CraneWarning, DescriptionError, suggest_names
 from crane.common.package_search import load_options
 from crane.description.force_elements import ForceElement
-from crane.description.kinematic_tree import Joint, Limits
-from crane.description.pinocchio_conversion import to_vector, xyz_rpy_from_se3
+from crane.description.kinematic_tree import Joint, Limits, to_vector
+from crane.description.pinocchio_conversion import xyz_rpy_from_se3
 from crane.formats.conversion_notes import ConversionNotes
 from crane.formats.sdf.frame_poses import SdfFramePoses, canonical_link
 from crane.formats.sdf.link_elements import add_link_inertial, add_shapes

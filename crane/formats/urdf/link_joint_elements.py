@@ -12,8 +12,16 @@ from crane.common.errors import CraneWarning, suggest_names
 from crane.description.findings import FollowUpError, error_recovery, is_strict, report_error
 from crane.description.force_elements import Friction
 from crane.description.inertia_feasibility import inertia_problem
-from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, parse_limit
-from crane.formats.joint_series import MULTI_FREEDOM_TYPES, joint_freedoms, joint_series
+from crane.description.kinematic_tree import (
+    MULTI_FREEDOM_TYPES,
+    Inertial,
+    Joint,
+    Limits,
+    Link,
+    joint_freedoms,
+    joint_series,
+    parse_limit,
+)
 from crane.formats.urdf.loop_elements import read_end_link
 from crane.formats.xml_file import XmlFile
 

@@ -28,9 +28,8 @@ from lxml import etree
 from crane.common.errors import CraneError, suggest_names
 from crane.common.package_search import URDF_CONSTRAINT, asked
 from crane.description.findings import FollowUpError, error_recovery, report_error
-from crane.description.kinematic_tree import Joint
+from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, joint_freedoms
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.joint_series import MULTI_FREEDOM_TYPES, joint_freedoms
 from crane.formats.xml_file import XmlFile
 
 # Types of URDF+, whose "continuous" is a revolute joint without limits, and cylindrical.

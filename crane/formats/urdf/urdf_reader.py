@@ -14,9 +14,8 @@ from crane.description.findings import (
     record_parsed_file,
 )
 from crane.description.force_elements import ForceElement, Friction
-from crane.description.kinematic_tree import Joint, Link, Tree
+from crane.description.kinematic_tree import MULTI_FREEDOM_TYPES, Joint, Link, Tree
 from crane.description.specification import Coupling, LoopSpec
-from crane.formats.joint_series import MULTI_FREEDOM_TYPES
 from crane.formats.robot_files import open_robot
 from crane.formats.urdf.link_joint_elements import (
     MOVABLE_TYPES,
