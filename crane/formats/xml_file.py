@@ -195,10 +195,10 @@ class XmlFile:
             similar = get_close_matches(key.lower(), known_attributes, 1, 0.75)
             is_correctable = bool(similar) and element.get(similar[0]) is None
             if element.tag in closed_elements or is_correctable:
-                hint = suggest_names(known_attributes, key.lower())
                 self.report(
                     element,
-                    f'unknown {key}="..." in <{element.tag}>, {hint}',
+                    f'unknown {key}="..." in <{element.tag}>, '
+                    f"{suggest_names(known_attributes, key.lower())}",
                     harmless=is_correctable,
                 )
             if is_correctable:
@@ -211,17 +211,17 @@ class XmlFile:
         tags = children.get(element.tag, set())
         similar = get_close_matches(child.tag.lower(), tags, 1, 0.75)
         if similar:
-            hint = suggest_names(tags, child.tag.lower())
             is_correctable = similar[0] in _REPEATABLE_ELEMENTS or element.find(similar[0]) is None
             self.report(
-                child, f"unknown <{child.tag}> in <{element.tag}>, {hint}", harmless=is_correctable
+                child,
+                f"unknown <{child.tag}> in <{element.tag}>, "
+                f"{suggest_names(tags, child.tag.lower())}",
+                harmless=is_correctable,
             )
             if is_correctable:
                 child.tag = similar[0]
         elif any(child.tag in x for x in children.values() if tags):
-            report_error(
-                self.error_at(child, f"<{child.tag}> has no place in <{element.tag}>, move it")
-            )
+            self.report(child, f"<{child.tag}> has no place in <{element.tag}>, move it")
 
     def single_child(self, element: etree._Element, tag: str, label: str) -> etree._Element | None:
         """Return the child with a tag, None if there is none.

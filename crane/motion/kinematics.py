@@ -111,14 +111,13 @@ class Kinematics(FrameKinematics):
         self, attitude: ArrayLike, positions: Array
     ) -> tuple[AttitudeCoordinates, Array]:
         """Attitude coordinates of a given attitude, and its targets as flat arrays."""
-        values = np.asarray(attitude)
         stack_shape, shape = positions.shape[:-1], np.shape(attitude)
         if shape not in (stack_shape, (*stack_shape, 3), (*stack_shape, 3, 3)):
             accepted_shapes = ", ".join(
                 str((*stack_shape, *trailing_shape)) for trailing_shape in ((), (3,), (3, 3))
             )
             raise InputError(f"attitude has the shape {shape}, give one of {accepted_shapes}")
-        flat_values = as_samples(values.ravel(), values.size, "attitude")
+        flat_values = as_samples(np.ravel(attitude), np.size(attitude), "attitude")
         if shape == stack_shape:
             return self._attitude_coordinates(INCLINATION), flat_values.reshape(*stack_shape, 1)
         rotations = flat_values.reshape(shape)

@@ -59,6 +59,13 @@ class _MjcfReader:
         self.joints: dict[str, Joint] = {}
         self.body_links: list[str] = []  # name of the link by index of the body
         self.series_joints: dict[int, list[str]] = {}  # names of joints by joint of MuJoCo
+        self.texts: dict[str, str] = {}  # of <text> under <custom>, by name
+        for i, start in enumerate(mjcf.model.text_adr):
+            end = start + mjcf.model.text_size[i]
+            raw = bytes(mjcf.model.text_data[start:end]).split(b"\0")[0]
+            self.texts.setdefault(
+                mjcf.element_name("TEXT", i), raw.decode("utf-8", "replace").strip()
+            )
 
     def read_spec(self) -> MachineSpec:
         """Return the machine."""
@@ -70,8 +77,8 @@ class _MjcfReader:
             raise DescriptionError(f"{mjcf.file.name}: no joint moves in this file, add one")
         frames = self._read_frames()
         loops, couplings = read_equality_constraints(mjcf, frames, self.series_joints)
-        for link, (body, placement) in frames.placements.items():
-            self.links[link] = Link(link, frames.source_locations[link])
+        for link, (body, placement, source_location) in frames.placements.items():
+            self.links[link] = Link(link, source_location)
             self._add_fixed_joint(link, self.body_links[body], placement)
         effects = read_joint_effects(mjcf, self.series_joints, frames.link_of_site)
         drives = read_drives(mjcf, self.series_joints)
@@ -100,8 +107,8 @@ class _MjcfReader:
         mjcf.warn_about_notes()
         home_locations = {f"home {joint}": self.joints[joint].source_location for joint in home}
         spec = MachineSpec(
-            name=self._custom_text("name") or mjcf.file.stem,
-            source=self._custom_text("source") or mjcf.file.name,
+            name=self.texts.get("name") or mjcf.file.stem,
+            source=self.texts.get("source") or mjcf.file.name,
             path=mjcf.file,
             chains=(chain,),
             tree=tree.tree,
@@ -250,26 +257,16 @@ class _MjcfReader:
                 )
         return home
 
-    def _custom_text(self, name: str) -> str:
-        """Return a `<text>` under `<custom>`, "" if there is none."""
-        model = self.model
-        for index in range(model.ntext):
-            if self.mjcf.element_name("TEXT", index) == name:
-                start = model.text_adr[index]
-                raw = bytes(model.text_data[start : start + model.text_size[index]])
-                return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
-        return ""
-
     def _listed_joints(self, name: str) -> list[str]:
         """Return the joints that a `<text>` lists, none if one of them is unknown."""
-        joints = [word for word in self._custom_text(name).split(", ") if word]
+        joints = [word for word in self.texts.get(name, "").split(", ") if word]
         if all(joint in self.joints for joint in joints):
             return joints
         self.mjcf.note_unsupported(f"the text '{name}', which names no joints", *joints)
         return []
 
     def _read_tip(self, tree: TreeBuilder) -> str | None:
-        if not (tip := self._custom_text("tip")):
+        if not (tip := self.texts.get("tip")):
             return tree.single_leaf_link()
         if tip in tree.links and tree.is_movable(tip):
             return tip

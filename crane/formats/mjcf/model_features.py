@@ -258,14 +258,14 @@ def read_drives(mjcf: MujocoFile, series_joints: Mapping[int, Sequence[str]]) ->
             tendon = fixed_tendon_factors(mjcf, target) or {}
             name = mjcf.name("TENDON", target)
             factors = {series_joints[joint][0]: factor for joint, factor in tendon.items()}
+        elif kind == "JOINT" and len(series_joints[target]) > 1:
+            used_joints = {joint for drive in found.values() for joint in drive.factors}
+            factors = _multi_freedom_factors(mjcf, actuator, series_joints[target], used_joints)
         elif kind == "JOINT":
             factors = dict.fromkeys(series_joints[target], 1.0)
-            if len(factors) > 1:
-                used_joints = {joint for drive in found.values() for joint in drive.factors}
-                factors = _multi_freedom_factors(mjcf, actuator, [*factors], used_joints)
-            if len(factors) == 1:
-                (name,) = factors
-                factors = {name: 1.0}
+        if kind == "JOINT" and len(factors) == 1:
+            (name,) = factors
+            factors = {name: 1.0}
         if factors:
             found.setdefault(name, Drive(name, factors))
         else:

@@ -138,10 +138,10 @@ class SdfJoints:
     def _read_joint(self, scope: ModelScope, joint: SdfElement) -> None:
         kind = joint.attribute("type")
         if kind not in JOINT_TYPES:
-            problem = "no type"
-            if kind:
-                problem = f"the type '{kind}', {suggest_names(JOINT_TYPES, kind)}"
-            raise joint.error(f"{joint.label} has {problem}")
+            problem = f"the type '{kind}'" if kind else "no type"
+            raise joint.error(
+                f"{joint.label} has {problem}, {suggest_names(JOINT_TYPES, kind or None)}"
+            )
         name = f"{scope.prefix}{joint.name}"
         ends = self._end_node(scope, joint, "parent"), self._end_node(scope, joint, "child")
         if ends[0] == ends[1]:

@@ -179,10 +179,9 @@ class _SdfTranslation:
         self._notes.warn_about_notes()
         return XmlFile(self._xml.file, self._robot, self._locations), tuple(self._springs)
 
-    def _set_source_location(self, element: etree._Element, item: SdfElement) -> etree._Element:
+    def _set_source_location(self, element: etree._Element, item: SdfElement) -> None:
         for inner in element.iter(etree.Element):
             set_source_location(inner, item.source_location, self._locations)
-        return element
 
     def _add_links(self, edges: list[SdfJointEdge]) -> None:
         self._ground_link = self._unique_link_name("world")
@@ -256,12 +255,11 @@ class _SdfTranslation:
     def _add_mimics(self, followers: list[CoupledCoordinate], joints: set[str]) -> None:
         elements = {joint.get("name"): joint for joint in self._robot.iterfind("joint")}
         for follower in followers:
-            for name in (follower.name, follower.leader):
-                if name not in joints:
-                    raise follower.item.error(
-                        f"{follower.item.label}: joint '{name}' is coupled and closes a loop of "
-                        "coupled joints, leave one of them out",
-                    )
+            if missing := [x for x in (follower.name, follower.leader) if x not in joints]:
+                raise follower.item.error(
+                    f"{follower.item.label}: joint '{missing[0]}' is coupled and closes a loop of "
+                    "coupled joints, leave one of them out",
+                )
             joint = elements[follower.name]
             if joint.find("mimic") is not None:
                 raise follower.item.error(f"joint '{follower.name}' follows two others, keep one")
@@ -274,26 +272,27 @@ class _SdfTranslation:
     def _add_loops(self, loop_edges: list[SdfJointEdge], tree: list[SdfJointEdge]) -> None:
         bodies = _rigid_bodies(tree)
         for edge in loop_edges:
-            if bodies.representative(edge.parent) == bodies.representative(edge.child):
-                if edge.kind != "fixed":
-                    raise edge.item.error(
-                        f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are "
-                        "one body: leave it out",
-                    )
+            is_one_body = bodies.representative(edge.parent) == bodies.representative(edge.child)
+            if is_one_body and edge.kind == "fixed":
                 continue
-            kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
+            if is_one_body:
+                raise edge.item.error(
+                    f"{edge.item.label} joins '{edge.parent}' and '{edge.child}', which are one "
+                    "body: leave it out",
+                )
+            kind, axis = {"ball": "spherical"}.get(edge.kind, edge.kind), edge.axis
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
                 end = etree.SubElement(loop, tag, link=self._link_name(link))
                 add_origin(end, *xyz_rpy_from_se3(self._link_poses[link].actInv(edge.placement)))
-            if edge.axis is not None:
-                etree.SubElement(loop, "axis", xyz=format_numbers(edge.axis.direction))
-                if finite_limits(edge.axis.limits) is not None:
-                    self._notes.note_unsupported("limits of joints that close loops", edge.name)
-                if edge.axis.damping or edge.axis.friction or edge.axis.stiffness:
-                    self._notes.note_unsupported(
-                        "friction and springs of joints that close loops", edge.name
-                    )
+            if axis is not None:
+                etree.SubElement(loop, "axis", xyz=format_numbers(axis.direction))
+            if axis is not None and finite_limits(axis.limits) is not None:
+                self._notes.note_unsupported("limits of joints that close loops", edge.name)
+            if axis is not None and (axis.damping or axis.friction or axis.stiffness):
+                self._notes.note_unsupported(
+                    "friction and springs of joints that close loops", edge.name
+                )
             self._set_source_location(loop, edge.item)
 
 

@@ -170,8 +170,10 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
             element, f"the limits of {label} are reversed ({lower:g} > {upper:g}), swap them"
         )
     if lower == upper:
-        problem = f"lower and upper limit of {label} are both {lower:g}"
-        xml.report(element, f"{problem}, widen them or make it fixed")
+        xml.report(
+            element,
+            f"lower and upper limit of {label} are both {lower:g}, widen them or make it fixed",
+        )
     return dataclasses.replace(limits, lower=parse_limit(lower), upper=parse_limit(upper))
 
 
@@ -267,8 +269,7 @@ def _read_end_links(
     kind = joint.get("type")
     if kind not in kinds:
         problem = f"the type '{kind}', which is not supported" if kind else "no type"
-        hint = suggest_names(kinds, kind or None)
-        xml.report(joint, f"{label} has {problem}, {hint}")
+        xml.report(joint, f"{label} has {problem}, {suggest_names(kinds, kind or None)}")
         similar = get_close_matches(kind or "", kinds, 1, 0.75)
         joint.set("type", similar[0] if similar else "revolute")
         limit = joint.find("limit")

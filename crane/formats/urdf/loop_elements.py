@@ -70,7 +70,7 @@ def _read_loop(
     label, source_location = f"loop '{name}'", xml.source_location(element)
     kind = element.get("type", "")
     if kind not in _LOOP_TYPES:
-        report_error(_loop_type_error(xml, element, label, kind, _LOOP_TYPES))
+        report_error(_type_error(xml, element, label, kind, _LOOP_TYPES))
     end_joints = []
     for end in ("predecessor", "successor"):
         tag, link = read_end_link(xml, element, end, label, links)
@@ -93,12 +93,12 @@ def _read_loop(
     ), end_joints
 
 
-def _loop_type_error(
+def _type_error(
     xml: XmlFile, element: etree._Element, label: str, kind: str, known_types: Iterable[str]
 ) -> CraneError:
-    problem = f"the unknown type '{kind}'" if kind else "no type"
     hint = suggest_names(known_types, kind.removesuffix("_joint") or None)
-    return xml.error_at(element, f"{label} has {problem}, {hint}")
+    problem = f"the unknown type '{kind}', {hint}" if kind else f"no type, {hint}"
+    return xml.error_at(element, f"{label} has {problem}")
 
 
 def read_end_link(
@@ -129,8 +129,7 @@ def read_end_link(
     elif link not in links and "link" in xml.unnamed_kinds:
         report_error(FollowUpError(f"link '{link}' may be the one without a name"))
     elif link not in links:
-        hint = suggest_names(links, link)
-        xml.report(child, f"{label} has the unknown {tag} '{link}', {hint}")
+        xml.report(child, f"{label} has the unknown {tag} '{link}', {suggest_names(links, link)}")
     return child, link if link in links else ""
 
 
@@ -223,7 +222,7 @@ def _convert_to_loop(xml: XmlFile, element: etree._Element) -> None:
             "a continuous joint about parent_axis, and close to that, with revolute",
         )
     if base_type not in _CONSTRAINT_TYPES:
-        raise _loop_type_error(xml, element, label, kind, _CONSTRAINT_TYPES)
+        raise _type_error(xml, element, label, kind, _CONSTRAINT_TYPES)
     element.set("type", _CONSTRAINT_TYPES[base_type])
     _check_axes(xml, element, label)
     for end, tag in _END_TAGS.items():
@@ -292,8 +291,7 @@ def read_coupling(
     label = f"coupling '{name}'"
     kind = element.get("type", _COUPLING_TYPES[0])
     if kind not in _COUPLING_TYPES:
-        hint = suggest_names(_COUPLING_TYPES, kind)
-        raise xml.error_at(element, f"{label} has the unknown type '{kind}', {hint}")
+        raise _type_error(xml, element, label, kind, _COUPLING_TYPES)
     parents = {
         child: (parent, joint) for joint, (parent, child) in end_links.items() if parent and child
     }

@@ -71,8 +71,12 @@ def warn_about_unknown_elements(
     ]
     groups.sort(key=lambda item: item[2].startswith("known"))  # likely mistakes first
     for elements, parent, hint in groups[:_MAX_WARNINGS]:
-        problem = f"unknown <{elements[0].tag}> in <{parent}>"
-        _warn_about_elements(xml, elements, problem, f", it is left out, {hint}")
+        _warn_about_elements(
+            xml,
+            elements,
+            f"unknown <{elements[0].tag}> in <{parent}>",
+            f", it is left out, {hint}",
+        )
     if remaining := [elements[0] for elements, _, _ in groups[_MAX_WARNINGS:]]:
         listed = ", ".join(f"<{element.tag}>" for element in remaining[:_MAX_WARNINGS])
         dots = ", ..." if len(remaining) > _MAX_WARNINGS else ""
@@ -85,8 +89,9 @@ def warn_about_unknown_elements(
             continue
         missing = [key for key in ("effort", "velocity") if limit.get(key) is None]
         if missing:
-            problem = f"the limit of joint '{name}' has no {' and no '.join(missing)}"
-            incomplete.append((limit, problem))
+            incomplete.append(
+                (limit, f"the limit of joint '{name}' has no {' and no '.join(missing)}")
+            )
     if incomplete:
         hint = ", nothing is limited then: add it, 1e9 for no limit"
         _warn_about_elements(xml, [limit for limit, _ in incomplete], incomplete[0][1], hint)

@@ -333,10 +333,9 @@ def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
     link = str(tips[0].get("parent_link", "")).strip()
     if link not in links:
         problem = (
-            f"is the unknown link '{link}'" if link else ('has no link, write parent_link="LINK"')
+            f"is the unknown link '{link}'" if link else 'has no link, write parent_link="LINK"'
         )
-        hint = suggest_names(links, link or None)
-        raise xml.error_at(tips[0], f"the tip {problem}, {hint}")
+        raise xml.error_at(tips[0], f"the tip {problem}, {suggest_names(links, link or None)}")
     return link
 
 
@@ -345,9 +344,11 @@ def _read_coordinate(
 ) -> tuple[str, float]:
     name = joint.get("name", "").strip()
     if name not in joints:
-        hint = suggest_names(joints, name)
-        problem = f"home names the joint '{name}', which is unknown or does not move, {hint}"
-        raise xml.error_at(joint, problem)
+        raise xml.error_at(
+            joint,
+            f"home names the joint '{name}', which is unknown or does not move, "
+            f"{suggest_names(joints, name)}",
+        )
     value = xml.number(joint, "value", f"home of '{name}'")
     if name in earlier_names:
         raise xml.error_at(joint, f"home of '{name}' is there twice, keep one")

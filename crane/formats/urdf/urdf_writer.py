@@ -226,16 +226,16 @@ def copy_shapes(
     materials: dict[str, etree._Element] = {}
     with open_robots(machine, chains) as sources:
         shapes = [
-            (xml.file.parent, link.get("name", "").strip(), shape)
+            (targets[link.get("name", "").strip()], xml.file.parent, shape)
             for xml in sources
             for link in xml.root.iterfind("link")
+            if link.get("name", "").strip() in targets
             for shape in (*link.iterfind("visual"), *link.iterfind("collision"))
         ]
         for material in (x for xml in sources for x in xml.root.iterfind("material")):
             materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-        for folder, name, shape in shapes:
-            if name in targets:
-                targets[name].append(_with_mesh_paths(shape, folder, uris))
+        for target, folder, shape in shapes:
+            target.append(_with_mesh_paths(shape, folder, uris))
     for material in reversed(materials.values()):
         robot.insert(0, material)
 
