@@ -185,8 +185,8 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
     for k in range(1, len(band)):  # rows and columns of given values
         band[k, :-k] *= is_unknown[k:] & is_unknown[:-k]
     band[0] = np.where(is_unknown, band[0], 1.0)
-    right_side = np.where(is_unknown, -product, 0.0)
-    knot_values = knots.unscale_values(y + solveh_banded(band, right_side, lower=True))
+    y += solveh_banded(band, np.where(is_unknown, -product, 0.0), lower=True)
+    knot_values = knots.unscale_values(y)
     knot_values[:, 0] = x
     return knot_values
 

@@ -86,10 +86,9 @@ class Sway(OneLineRepr):
             q_a[..., free] -= np.clip(newton_step, -0.5, 0.5)
             if np.abs(newton_step).max() < _EQUILIBRIUM_TOLERANCE**0.5 * 1e-3:
                 return q_a
-        names = ", ".join(self.machine.free)
         raise InputError(
-            f"what {names} carry has no stable equilibrium nearby: choose a configuration in "
-            "which it hangs"
+            f"what {', '.join(self.machine.free)} carry has no stable equilibrium nearby: choose "
+            "a configuration in which it hangs"
         )
 
     def stiffness(self, q_a: Array) -> Array:

@@ -280,9 +280,8 @@ def _path_columns(machine: Machine, table: Table) -> dict[str, str]:
         raise InputError(f"column '{missing[0]}' is missing, {hint}")
     unknown = [name for name in headings if name not in (TIME, *columns.values())]
     if unknown and not any(name.endswith((VELOCITY_SUFFIX, FORCE_SUFFIX)) for name in headings):
-        known_names = [*joints, *_UNITS]
         raise InputError(
-            f"column '{unknown[0]}' is unknown, {suggest_names(known_names, unknown[0])}"
+            f"column '{unknown[0]}' is unknown, {suggest_names([*joints, *_UNITS], unknown[0])}"
         )
     return columns
 

@@ -176,7 +176,6 @@ def _add_tendon_effects(
     slack_length, taut_length = (float(x) for x in model.tendon_lengthspring[tendon])
     is_spring, supported = slack_length == taut_length, set[str]()
     ends = straight_tendon_sites(mjcf, tendon)
-    is_along_joint = factors is not None and len(factors) == 1
     is_rope = ends is not None and slack_length == 0
     if (is_spring or is_rope) and tendon not in nonzero_rows(model, "tendon_stiffnesspoly"):
         supported.add("stiffness")
@@ -184,7 +183,7 @@ def _add_tendon_effects(
         supported.add("damping")
     stiffness *= "stiffness" in supported
     damping *= "damping" in supported
-    if factors is not None and is_along_joint:
+    if factors is not None and len(factors) == 1:
         supported |= {"friction", "armature"}
         ((joint, factor),) = factors.items()
         effects.add_along(
