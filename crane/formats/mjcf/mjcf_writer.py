@@ -251,11 +251,10 @@ class _MjcfWriter:
             )
         etree.SubElement(equality, "connect", {"name": f"{loop.name}_1", **sites})
         axis_offset = pin.SE3(np.eye(3), _HINGE_POINT_DISTANCE * np.array(loop.axis))
-        for i, (body, placement, _) in enumerate(ends, start=1):
-            end = ("predecessor", "successor")[i - 1]
-            sites[f"site{i}"] = self._add_site(
-                body, f"{loop.name}_{end}_axis", placement * axis_offset
-            )
+        for key, side, end in zip(
+            ("site1", "site2"), ("predecessor", "successor"), ends, strict=True
+        ):
+            sites[key] = self._add_site(end[0], f"{loop.name}_{side}_axis", end[1] * axis_offset)
         etree.SubElement(equality, "connect", {"name": f"{loop.name}_2", **sites})
 
     def _add_coupling(

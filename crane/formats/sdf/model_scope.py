@@ -287,7 +287,14 @@ class ModelReader:
                 f"there is no model '{uri}', say where it is: --packages FOLDER, packages=[...] "
                 "in Python",
             )
-        xml = self._open_file(file.resolve())
+        file = file.resolve()
+        if file not in self._files:
+            self._files[file] = XmlFile(file)
+        xml = self._files[file]
+        if xml.root.tag != "sdf":
+            raise xml.error_at(
+                xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>"
+            )
         models = xml.root.findall("model")
         if len(models) != 1:
             if scope.parent is None and (xml.root.find("light") is not None):
@@ -321,15 +328,6 @@ class ModelReader:
             if own_parts.setdefault(key, part) is not part:
                 raise include.error(f"merging brings a second '{key}', rename one")
         scope.models |= inner.models
-
-    def _open_file(self, file: Path) -> XmlFile:
-        if file not in self._files:
-            self._files[file] = xml = XmlFile(file)
-            if xml.root.tag != "sdf":
-                raise xml.error_at(
-                    xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>"
-                )
-        return self._files[file]
 
 
 def _file_from_config(folder: Path) -> Path:

@@ -99,11 +99,11 @@ def warn_about_unknown_elements(
 
 def _is_inside_read_elements(element: etree._Element, children: Mapping[str, Set[str]]) -> bool:
     """Whether all ancestors of an element are read."""
-    while (parent := element.getparent()) is not None:
-        if element.tag not in children.get(parent.tag, ()):
-            return False
-        element = parent
-    return True
+    path = [element, *element.iterancestors()]
+    return all(
+        child.tag in children.get(parent.tag, ())
+        for child, parent in zip(path, path[1:], strict=False)
+    )
 
 
 def _suggest_element(tag: str, tags: Set[str], attributes: Mapping[str, Set[str]]) -> str:

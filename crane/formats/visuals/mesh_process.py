@@ -14,7 +14,7 @@ import json
 import os
 import sys
 import warnings
-from typing import Any, BinaryIO
+from typing import Any
 
 MAX_MEMORY, MAX_SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
 MAX_TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
@@ -50,7 +50,10 @@ def main() -> None:
         except Exception as error:  # readers raise anything for malformed files
             message = " ".join(str(error).split()) or type(error).__name__
             header, arrays = {"wrong": message[:80]}, []
-        _send_answer(output, header, arrays)
+        output.write(json.dumps(header).encode() + b"\n")
+        for array in arrays:
+            output.write(array.tobytes())
+        output.flush()
 
 
 def limit_resources() -> None:
@@ -64,13 +67,6 @@ def limit_resources() -> None:
     for kind, limit in ((resource.RLIMIT_CPU, time_limit), (resource.RLIMIT_AS, MAX_MEMORY)):
         hard_limit = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (limit if hard_limit < 0 else min(limit, hard_limit), hard_limit))
-
-
-def _send_answer(output: BinaryIO, header: dict[str, Any], arrays: list[Any]) -> None:
-    output.write(json.dumps(header).encode() + b"\n")
-    for array in arrays:
-        output.write(array.tobytes())
-    output.flush()
 
 
 def _read_mesh(file: str, max_triangles: int) -> tuple[dict[str, Any], list[Any]]:

@@ -57,12 +57,15 @@ def patch_curves(
     """Singular curves of a patch: ends of the branch ("branch"), and of the tip ("tip")."""
     if not patch.is_closed.any():
         return []
-    lines = _join_polylines(patch, branch_edges)
-    curves = [curve for line in lines for curve in _split_curve("branch", kinematics, line)]
-    if patch.stroke_pair[0] == patch.stroke_pair[1]:
-        return curves
-    lines = _join_polylines(patch, _tip_singular_edges(kinematics, patch))
-    return curves + [curve for line in lines for curve in _split_curve("tip", kinematics, line)]
+    edges_by_kind = {"branch": branch_edges}
+    if patch.stroke_pair[0] != patch.stroke_pair[1]:
+        edges_by_kind["tip"] = _tip_singular_edges(kinematics, patch)
+    return [
+        curve
+        for kind, edges in edges_by_kind.items()
+        for line in _join_polylines(patch, edges)
+        for curve in _split_curve(kind, kinematics, line)
+    ]
 
 
 def branch_edges(machine: Machine, patch: WorkspacePatch) -> dict[GridEdge, Array]:
