@@ -218,7 +218,6 @@ class _MjcfReader:
         return [Joint(name, joint_type, "", "", source_location, *place, to_vector(axis), limits)]
 
     def _read_frames(self) -> MjcfFrames:
-        """Return the frames of the sites."""
         frames = MjcfFrames(used_names=set(self.links))
         model = self.model
         for site in range(model.nsite):

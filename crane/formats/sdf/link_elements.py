@@ -231,7 +231,6 @@ def add_shapes(
 
 
 def _geometry_shape(item: SdfElement) -> SdfElement | None:
-    """Return the shape in the `<geometry>` of a visual or collision."""
     geometry = item.single_child("geometry")
     tags = [] if geometry is None else [x.tag for x in geometry.element if isinstance(x.tag, str)]
     return geometry.single_child(tags[0]) if geometry is not None and tags else None

@@ -409,7 +409,6 @@ def _warn_about_unknown_elements(xml: XmlFile, joints: Mapping[str, etree._Eleme
 
 
 def _suggest_element(tag: str, tags: Set[str]) -> str:
-    """Suggest a known element or attribute in place of an unknown element."""
     if tag == "constraint":
         return CONSTRAINT_HINT
     element_of_attribute = {
