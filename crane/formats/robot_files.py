@@ -49,8 +49,10 @@ def _expand_xacro(xml: XmlFile) -> XmlFile:
         raise DescriptionError(f"{location}: xacro refuses it ({answer['wrong']}), correct it")
     for name in load_options().arguments:
         if name not in (*answer["arguments"], *OWN_ARGUMENTS):
-            hint = suggest_names(answer["arguments"], name)
-            raise InputError(f"{xml.file.name} has no argument '{name}', {hint}")
+            raise InputError(
+                f"{xml.file.name} has no argument '{name}', "
+                f"{suggest_names(answer['arguments'], name)}"
+            )
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     root = etree.fromstring(answer["text"].encode("utf-8"), parser)
     locations = {xml.file.name: 0}
@@ -120,9 +122,8 @@ def is_sdf_file(file: Path) -> bool:
 
 def is_simulator_file(file: Path) -> bool:
     """Whether a file is SDF or MJCF, which give all coordinates of home and are not changed."""
-    if file.suffix.lower() in (".yaml", ".yml"):
-        return False
-    return is_sdf_file(file) or not is_robot_file(file)
+    is_machine_file = file.suffix.lower() in (".yaml", ".yml")
+    return not is_machine_file and (is_sdf_file(file) or not is_robot_file(file))
 
 
 @contextmanager

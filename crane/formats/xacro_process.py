@@ -113,6 +113,8 @@ def _provide_package_search(
     """Make xacro find packages as this package does, whether ROS is installed or not."""
     from crane.common.package_search import find_file, find_package, use_load_options
 
+    original_function = xacro.abs_filename_spec
+
     def share(name: str) -> str:
         here = Path(next((x for x in reversed(xacro.filestack or []) if x), folder / "x")).parent
         with use_load_options(packages):
@@ -122,19 +124,16 @@ def _provide_package_search(
             raise LookupError(f"package '{name}' is not found")
         return str(found)
 
-    original_function = xacro.abs_filename_spec
-
     def absolute(name: str) -> str:
         if "://" not in name:
             return str(original_function(name))
         package = name.partition("://")[2].partition("/")[0]
         with use_load_options(packages):
-            found = find_file(name, folder)
-            if found is None and find_package(package, folder) is None:
+            if (found := find_file(name, folder)) is not None:
+                return str(found)
+            if find_package(package, folder) is None:
                 missing_packages.append(package)
-        if found is None:
-            raise LookupError(f"there is no '{name}'")
-        return str(found)
+        raise LookupError(f"there is no '{name}'")
 
     replacement_module = types.ModuleType("ament_index_python.packages")
     replacement_module.get_package_share_directory = share  # type: ignore[attr-defined]

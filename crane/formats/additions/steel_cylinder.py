@@ -16,7 +16,7 @@ from crane.description.kinematic_tree import Inertial, Joint, Limits, Link, Vect
 from crane.description.pinocchio_conversion import inertial_from_inertia, xyz_rpy_from_se3
 from crane.description.specification import LoopSpec
 from crane.formats.machine_file.machine_writer import MachineDraft, loop_data
-from crane.formats.urdf_elements import add_joint, add_link, add_origin, format_numbers
+from crane.formats.xml_file import add_joint, add_link, add_origin, format_numbers
 from crane.machine.machine import Machine
 
 STEEL_DENSITY = 7850.0  # [kg/m3]

@@ -45,7 +45,7 @@ from crane.formats.urdf.urdf_writer import (
     rotor_inertias,
     with_floating_joints,
 )
-from crane.formats.urdf_elements import add_joint, add_link
+from crane.formats.xml_file import add_joint, add_link
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.hydraulic_circuit import Hydraulics
 from crane.machine.machine import Machine

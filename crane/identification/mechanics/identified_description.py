@@ -15,7 +15,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.description.force_elements import Friction
 from crane.dynamics.dynamics import Dynamics
-from crane.formats.visuals.mesh_files import find_mesh_file
+from crane.formats.visuals.urdf_shapes import find_mesh_file
 from crane.identification.mechanics.feasible_parameters import (
     body_parameters,
     pseudo_inertia,
