@@ -297,7 +297,7 @@ class CompiledClosure:
             loops.largest_residual(redundant=True) - self._structure.redundancy.tolerance,
         )
         least_determinant: Scalar = 1.0
-        for sign, determinant in zip(signs, loops.determinants, strict=True):
+        for sign, determinant in zip(signs, loops.gamma_and_determinants[1], strict=True):
             least_determinant = minimum(least_determinant, float(sign) * determinant)
         worst = maximum(worst, -1.0 * least_determinant)
         for alignment in loops.alignments:

@@ -134,7 +134,10 @@ class Coordinates:
         out[..., self._configuration_indices] = q
         for column in self.floating_base_columns:
             at = self._configuration_indices[column]
-            out[..., at + 3 : at + 7] = _quaternion(q[..., column + 3 : column + 6])
+            r = q[..., column + 3 : column + 6]
+            half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
+            out[..., at + 3 : at + 6] = 0.5 * np.sinc(half / np.pi) * r
+            out[..., at + 6 : at + 7] = np.cos(half)
         return out
 
     def coordinate_derivatives(self, q: Array, v: Array) -> Array:
@@ -176,9 +179,3 @@ class Coordinates:
         for column in self.floating_base_columns:
             out[column : column + 6] = unlimited
         return out
-
-
-def _quaternion(r: Array) -> Array:
-    """Quaternions (x, y, z, w) of rotation vectors (..., 3)."""
-    half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
-    return np.concatenate([0.5 * np.sinc(half / np.pi) * r, np.cos(half)], axis=-1)

@@ -22,7 +22,7 @@ from crane.codegen.symbolic import (
     sum_scalars,
 )  # fmt: skip
 from crane.dynamics.joint_force_formulas import JointForceFormulas
-from crane.dynamics.spatial_inertia import composite_mass_matrix
+from crane.dynamics.spatial_inertia import composite_mass_matrix, symmetric_matrix
 
 
 class InertialForceFormulas(JointForceFormulas):
@@ -58,10 +58,7 @@ class InertialForceFormulas(JointForceFormulas):
             rotation = self.kinematics.rotation[i]
             xx, xy, xz, yy, yz, zz = rest[3:]
             half = matmul(rotation, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            tensor: list[Vector] = [[0.0] * 3 for _ in range(3)]
-            for r in range(3):
-                for c in range(r + 1):
-                    tensor[r][c] = tensor[c][r] = dot(half[r], rotation[c])
+            tensor = symmetric_matrix(lambda r, c, a=half, b=rotation: dot(a[r], b[c]))
             out.append((mass, matvec(rotation, rest[:3]), tensor))
         return out
 

@@ -238,9 +238,9 @@ class Reactions(OneLineRepr):
         friction: bool,
     ) -> tuple[Array, Array]:
         rows, stacked = self._as_stack(q, "q")
-        velocities = np.zeros_like(rows) if v is None else self._as_matching_stack(v, rows, "v")
+        velocities = np.zeros_like(rows) if v is None else self._as_stack(v, "v", rows)[0]
         if a is not None:
-            accelerations = self._as_matching_stack(a, rows, "a")
+            accelerations = self._as_stack(a, "a", rows)[0]
         else:
             accelerations = (
                 np.zeros_like(rows) if v is None else self.machine.closure.drift(rows, velocities)
@@ -396,14 +396,12 @@ class Reactions(OneLineRepr):
             kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
         )
 
-    def _as_stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
+    def _as_stack(self, value: ArrayLike, what: str, q: Array | None = None) -> tuple[Array, bool]:
+        """A value as stack (N, nq), as many as configurations q, and whether it is one."""
         given = as_samples(value, self._model.nv, what, self.machine.joints)
         if not given.size:
             raise InputError(f"{what} is an empty stack, give at least one sample")
-        return np.atleast_2d(given), given.ndim == 2
-
-    def _as_matching_stack(self, value: ArrayLike, q: Array, what: str) -> Array:
-        given = self._as_stack(value, what)[0]
-        if given.shape != q.shape:
-            raise InputError(f"{what} has {len(given)} samples and q {len(q)}, give as many")
-        return given
+        rows = np.atleast_2d(given)
+        if q is not None and rows.shape != q.shape:
+            raise InputError(f"{what} has {len(rows)} samples and q {len(q)}, give as many")
+        return rows, given.ndim == 2

@@ -78,7 +78,7 @@ class SpatialInertia:
             tensor: Inertia about the COM (3, 3).
         """
         moment = scale_vector(mass, lever)
-        out = _symmetric_matrix(
+        out = symmetric_matrix(
             lambda r, c: (
                 tensor[r][c] - moment[r] * lever[c] + (dot(moment, lever) if r == c else 0.0)
             )
@@ -91,9 +91,9 @@ class SpatialInertia:
 
     def __add__(self, other: "SpatialInertia") -> "SpatialInertia":
         return SpatialInertia(
-            _symmetric_matrix(lambda r, c: self.mass[r][c] + other.mass[r][c]),
+            symmetric_matrix(lambda r, c: self.mass[r][c] + other.mass[r][c]),
             [add_vectors(one, two) for one, two in zip(self.mixed, other.mixed, strict=True)],
-            _symmetric_matrix(lambda r, c: self.turning[r][c] + other.turning[r][c]),
+            symmetric_matrix(lambda r, c: self.turning[r][c] + other.turning[r][c]),
         )
 
     def apply_to(self, motion: SpatialVector) -> SpatialVector:
@@ -127,15 +127,16 @@ class SpatialInertia:
         return SpatialInertia(
             self.mass,
             coupling,
-            _symmetric_matrix(
+            symmetric_matrix(
                 lambda r, c: self.turning[r][c] - dot(old[r], across[c]) + dot(skew[r], new[c])
             ),
         )
 
 
-def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:
-    out: Matrix = [[0.0] * 3 for _ in range(3)]
-    for r in range(3):
+def symmetric_matrix(entry: Callable[[int, int], Scalar], size: int = 3) -> Matrix:
+    """The matrix of some entries, of which those up to the diagonal are computed."""
+    out: Matrix = [[0.0] * size for _ in range(size)]
+    for r in range(size):
         for c in range(r + 1):
             out[r][c] = out[c][r] = entry(r, c)
     return out
@@ -143,7 +144,7 @@ def _symmetric_matrix(entry: Callable[[int, int], Scalar]) -> Matrix:
 
 def _subtract_symmetric_product(matrix: Matrix, one: Vector, two: Vector) -> Matrix:
     """A symmetric matrix without a symmetric product."""
-    return _symmetric_matrix(lambda r, c: matrix[r][c] - one[r] * two[c])
+    return symmetric_matrix(lambda r, c: matrix[r][c] - one[r] * two[c])
 
 
 def _skew(v: Vector) -> Matrix:
@@ -190,13 +191,10 @@ class ClusterMassColumns:
             i: [dot([*row.values()], [gamma[j][k] for j in row]) for k in count]
             for i, row in tree.items()
         }
-        self.mass_block: list[Vector] = [[0.0] * len(count) for _ in count]
-        for k in count:
-            column = [row[k] for row in moved.values()]
-            for j in range(k + 1):
-                self.mass_block[j][k] = self.mass_block[k][j] = dot(
-                    [row[j] for row in gamma.values()], column
-                )
+        columns = [[row[k] for row in moved.values()] for k in count]
+        self.mass_block = symmetric_matrix(
+            lambda k, j: dot([row[j] for row in gamma.values()], columns[k]), len(count)
+        )
 
 
 def propagate_wrench(
@@ -346,7 +344,7 @@ class MassMoments:
 
 
 def _symmetric_from_upper(entry: Callable[[int, int], Scalar]) -> Matrix:
-    """`_symmetric_matrix` from the upper triangle: the order of operations stays the same."""
+    """`symmetric_matrix` from the upper triangle: the order of operations stays the same."""
     out: Matrix = [[0.0] * 3 for _ in range(3)]
     for r in range(3):
         for c in range(r, 3):
