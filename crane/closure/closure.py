@@ -252,9 +252,7 @@ class Closure(BranchSolver, OneLineRepr):
             raise InputError("q_a is an empty stack, give at least one sample")
         guess, names = None, self.equations.coordinates.names
         if initial_guess is not None:
-            guess = as_samples(
-                initial_guess, self.model.nv, "guess", self.equations.coordinates.names
-            )
+            guess = as_samples(initial_guess, self.model.nv, "guess", names)
             if guess.ndim != 1:
                 raise InputError(f"guess has the shape {guess.shape}, give one ({self.model.nv},)")
         out = np.empty((*targets.shape[:-1], self.model.nv))

@@ -339,7 +339,8 @@ class _ConstraintAnalysis:
                 f"the loops leave {names or 'all joints'} no freedom to move: check the types "
                 "and axes of the loops, and the axes of the joints"
             )
-        text = f"{format_count(count, 'active joint')} ({names}) for {format_count(mobility, *_DEGREES)}: "
+        degrees = format_count(mobility, *_DEGREES)
+        text = f"{format_count(count, 'active joint')} ({names}) for {degrees}: "
         if mobility < count:
             return text + f"name only {mobility} of them"
         missing = mobility - count

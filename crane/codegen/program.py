@@ -261,10 +261,8 @@ class PythonCallback:
 
 def run_with_fallback(
     count: int,
-    run_compiled: Callable[[int, int], int] | None,
+    run_compiled: Callable[[int], int] | None,
     run_fallback: Callable[[int], None],
-    max_chunk: int | None = None,
-    progress: Callable[[int], None] | None = None,
 ) -> None:
     """Process items one after another by machine code, with a fallback where that stops.
 
@@ -273,19 +271,14 @@ def run_with_fallback(
 
     Args:
         count: Number of items.
-        run_compiled: (first, end) -> number of completed items from the first on; None if there is
-            no machine code.
+        run_compiled: Processes the items from one on and returns how many it completed; None if
+            there is no machine code.
         run_fallback: Processes one item.
-        max_chunk: Largest number of items per call of `run_compiled`.
-        progress: Called with the number of completed items.
     """
     done = 0
     while done < count:
-        chunk_end = min(done + (max_chunk or count), count)
         if run_compiled is not None:
-            done += run_compiled(done, chunk_end)
-        if done < chunk_end:
+            done += run_compiled(done)
+        if done < count:
             run_fallback(done)
             done += 1
-        if progress is not None:
-            progress(done)

@@ -348,7 +348,7 @@ class QuantityEvaluator(OneLineRepr):
 
         run_with_fallback(
             len(targets),
-            lambda i, _: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
+            lambda i: formula.evaluate_targets(targets[i:], rows[i:], out[i:]),
             reach,
         )
         return out

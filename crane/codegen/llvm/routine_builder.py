@@ -120,11 +120,9 @@ class ArrayPointer:
         """Pointer to an element or a part."""
         return ArrayPointer(self.name, self.offset + self._element_index(index), layout)
 
-    def row_pointer(
-        self, index: "int | RoutineValue", width: int, layout: Layout | None = None
-    ) -> "ArrayPointer":
+    def row_pointer(self, index: "int | RoutineValue", width: int) -> "ArrayPointer":
         """Pointer to a row."""
-        return self.element_pointer(as_value(index, "integer") * width, layout)
+        return self.element_pointer(as_value(index, "integer") * width)
 
     def _element_index(self, index: "int | RoutineValue | str") -> RoutineValue:
         if isinstance(index, str):
