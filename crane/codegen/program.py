@@ -116,7 +116,7 @@ class Program:
         self.max_formula_length = max(self.max_formula_length, operations)
         layout = Layout(**{part: len(values) for part, values in parts.items()})
         formula = self.functions[name] = Formula(name, input_count, flat, layout)
-        self._signatures[name] = FunctionSignature(formula.argument_kinds, layout)
+        self._signatures[name] = len(formula.argument_kinds), layout
         return layout
 
     @contextmanager
@@ -133,11 +133,11 @@ class Program:
         routine = Routine(name, self.functions, counts, functions, named)
         yield routine
         self.functions[name] = routine
-        self._signatures[name] = FunctionSignature(routine.argument_kinds, None)
+        self._signatures[name] = len(routine.argument_kinds), None
 
     def formula_outputs(self, name: str) -> Layout:
         """Layout of the outputs of a formula."""
-        layout = self._signatures[name].outputs
+        _, layout = self._signatures[name]
         assert layout is not None
         return layout
 
@@ -167,7 +167,7 @@ class Program:
         return BoundFunction(self, self._entry_point(name, arguments), arguments)
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
-        expected = len(self._signatures[name].argument_kinds)
+        expected, _ = self._signatures[name]
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
         return self._machine_code.entry_point(name)
