@@ -9,7 +9,6 @@ import copy
 import dataclasses
 from collections.abc import Collection, Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -130,11 +129,6 @@ class Closure(BranchSolver, OneLineRepr):
     def units(self) -> Array:
         """(nv,) units that make coordinates comparable: 1 rad, and the characteristic length."""
         return self.equations.coordinate_units
-
-    @property
-    def cache_key(self) -> tuple[Any, ...]:
-        """Everything that the equations depend on, see `crane.codegen.cached_result`."""
-        return self.equations.cache_key
 
     def _one_line(self) -> str:
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"

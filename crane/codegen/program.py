@@ -162,38 +162,21 @@ class Program:
         result: int = self._entry_point(name, arguments)(_pack_addresses(arguments))
         return result
 
-    def bind(self, name: str, *arguments: "int | np.ndarray") -> "BoundFunction":
-        """A function with its arguments bound, for many fast calls."""
-        return BoundFunction(self, self._entry_point(name, arguments), arguments)
+    def bind(self, name: str, *arguments: "int | np.ndarray") -> partial[int]:
+        """A function with its arguments bound, for many fast calls; see `call`.
+
+        Passing one pointer from Python is much faster than passing a dozen.
+        """
+        addresses = np.frombuffer(_pack_addresses(arguments), dtype=np.int64)
+        bound = partial(self._entry_point(name, arguments), addresses.ctypes.data)
+        vars(bound)["references"] = self, addresses, arguments  # are kept alive
+        return bound
 
     def _entry_point(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
         expected, _ = self._signatures[name]
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
         return self._machine_code.entry_point(name)
-
-
-class BoundFunction(partial[int]):
-    """A compiled function with bound arguments, which it keeps alive; see `Program.call`.
-
-    Passing one pointer from Python is much faster than passing a dozen.
-
-    Args:
-        program: Program of the function, kept alive.
-        entry: Function that takes the address of the arguments' addresses.
-        arguments: See `Program.call`.
-    """
-
-    _references: tuple[Any, ...]
-
-    def __new__(
-        cls, program: Program, entry: Any, arguments: Sequence["int | np.ndarray"]
-    ) -> "BoundFunction":
-        """Bind the arguments."""
-        addresses = np.frombuffer(_pack_addresses(arguments), dtype=np.int64)
-        self = super().__new__(cls, entry, addresses.ctypes.data)
-        self._references = program, addresses, arguments
-        return self
 
 
 def _pack_addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:

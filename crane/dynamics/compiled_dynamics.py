@@ -1,6 +1,7 @@
 """Equations of motion and their derivatives as machine code of one machine."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,6 @@ from crane.closure.gamma_derivatives import GammaDerivatives
 from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
 from crane.codegen import Program, Scalar, SymbolicExpression, Tape, max_abs
 from crane.codegen.differentiation import directional_derivative
-from crane.codegen.program import BoundFunction
 from crane.common.samples import Array
 from crane.common.threads import ThreadLocal
 from crane.dynamics.dynamics_derivatives import DynamicsDerivatives
@@ -82,7 +82,7 @@ _ANALYTIC_DERIVATIVES: dict[str, _AnalyticDerivatives] = {
 DERIVATIVES_OF = "derivatives of "
 _FLOAT = np.dtype(np.float64)
 # of one sample: second argument, v_A, q_A (n,), result (size,), and what evaluates them
-_SampleBuffers = tuple[Array, Array, Array, Array, BoundFunction]
+_SampleBuffers = tuple[Array, Array, Array, Array, partial[int]]
 
 
 class CompiledQuantity:
