@@ -174,9 +174,10 @@ class Closure(BranchSolver, OneLineRepr):
         other = copy.copy(self)
         other.model, other.equations = model, equations
         other._start_solver(with_machine_code=False)
-        rows = self.structure.independent_rows, self.structure.redundant_rows
         constraints = other._constraints
-        lock, _ = constraints.assess_redundancy(other.home, *rows, self.active)
+        lock, _ = constraints.assess_redundancy(
+            other.home, self.structure.independent_rows, self.structure.redundant_rows, self.active
+        )
         if not constraints.is_closed(other.home) or lock:
             raise MechanismError("the loops do not close there, or lock up")
         return other

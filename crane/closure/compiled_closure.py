@@ -227,8 +227,15 @@ class CompiledClosure:
             Number of closed samples.
         """
         targets = np.ascontiguousarray(targets)
-        arrays = (self.geometry.constants, targets, cursor.state, out, self.tolerances)
-        return self._closure_program.call("follow", len(targets), *arrays)
+        return self._closure_program.call(
+            "follow",
+            len(targets),
+            self.geometry.constants,
+            targets,
+            cursor.state,
+            out,
+            self.tolerances,
+        )
 
     def close_in_place(self, q: Array) -> int:
         """Close the loops of configurations (N, nq) in place until one does not converge.
@@ -271,11 +278,16 @@ class CompiledClosure:
         kinematics = PositionKinematics(
             self.geometry, FormulaConstants(tape, geometry_argument, numbers), coordinates
         )
-        columns = self._active_columns, self._passive_columns
         return (
             coordinates,
             kinematics,
-            LoopFormulas(self._equations, self._structure, *columns, kinematics),
+            LoopFormulas(
+                self._equations,
+                self._structure,
+                self._active_columns,
+                self._passive_columns,
+                kinematics,
+            ),
         )
 
     def add_newton_formula(self, program: Program, signs: Array) -> None:

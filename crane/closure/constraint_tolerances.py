@@ -89,7 +89,6 @@ def redundant_gaps_along_motions(
     Returns:
         (k,), and whether each active joint moves at all.
     """
-    model = equations.model
     unit = equations.coordinate_units[active]
     turns = ~equations.coordinates.is_translation[active]
     distances_to_limits = [
@@ -102,7 +101,7 @@ def redundant_gaps_along_motions(
     ]
     largest_gaps = np.abs(equations.evaluate_scaled(home)[0][redundant_rows])
     moves = np.zeros(len(active), dtype=bool)
-    for active_columns, direction in _active_directions(model.nv, active):
+    for active_columns, direction in _active_directions(equations.model.nv, active):
         for side, distance in zip((-1.0, 1.0), ranges, strict=True):
             q = home
             for _ in range(_STEPS_TO_LIMIT):

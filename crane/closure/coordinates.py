@@ -98,8 +98,7 @@ class Coordinates:
         limit of a prismatic joint, else 1 m.
         """
         joints = (place.translation for place in list(self.model.jointPlacements)[1:])
-        links = (frame.placement.translation for frame in self.model.frames)
-        for places in (joints, links):
+        for places in (joints, (frame.placement.translation for frame in self.model.frames)):
             if distance := float(np.abs(list(places)).max(initial=0.0)):
                 return distance
         limits = np.abs(np.stack([self.lower, self.upper]))[:, self.is_translation]

@@ -325,11 +325,10 @@ class PositionKinematics:
 
     def joint_axis(self, i: int) -> Vector:
         """Axis of joint i."""
-        flyers = self.geometry.floating_bases
         axis_index = (
             2
             if i not in self.geometry.floating_bodies
-            else (i - max(j for j in flyers if j <= i)) % 3
+            else (i - max(j for j in self.geometry.floating_bases if j <= i)) % 3
         )
         return [row[axis_index] for row in self.rotation[i]]
 

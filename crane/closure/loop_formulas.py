@@ -150,9 +150,15 @@ class LoopFormulas:
             and locks_all_translations
             and self._structure.redundancy.tolerance <= CLOSED_TOLERANCE
         )
-        pair = bodies[one], bodies[one + 1]
         return LoopEquationFormula(
-            pair, is_translation, has_fixed_axis, axis, arm, wrench, phi, jacobian
+            (bodies[one], bodies[one + 1]),
+            is_translation,
+            has_fixed_axis,
+            axis,
+            arm,
+            wrench,
+            phi,
+            jacobian,
         )
 
     def solve_passive(

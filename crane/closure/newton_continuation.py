@@ -358,8 +358,7 @@ class NewtonContinuation:
             return evaluate(passive)[1]
 
         start = q[self._passive_columns] / units
-        nearest = least_squares(residual, start, jacobian, xtol=1e-12)
-        phi = evaluate(nearest.x)[0]
+        phi = evaluate(least_squares(residual, start, jacobian, xtol=1e-12).x)[0]
         worst = int(np.abs(phi).argmax())
         place, last = self._format_values(target), self._format_values(last_reached.q_a)
         if np.abs(phi[worst]) < 10 * _CLOSED_TOLERANCE * self.rounding_scale(q):

@@ -214,9 +214,11 @@ class ArticulatedCluster:
         forces = self._factorization.solve(right)
         for i in self._cluster.joints:
             step = self._joint_steps[i]
-            parent = body_accelerations[self._recursion.kinematics.geometry.parents[i]]
             total_force = step.net_force + dot(step.constraint_forces, forces)
-            carrier = shift_motion(parent, self._recursion.kinematics.offsets[i])
+            carrier = shift_motion(
+                body_accelerations[self._recursion.kinematics.geometry.parents[i]],
+                self._recursion.kinematics.offsets[i],
+            )
             yield i, (total_force - spatial_dot(step.column, carrier)) * step.inverse
 
 
@@ -377,10 +379,9 @@ def joint_accelerations(recursion: RecursionInput, plan: RecursionPlan) -> Vecto
     kinematics = recursion.kinematics
     for articulated_cluster in reversed(articulated_clusters):
         for i, rate in articulated_cluster.joint_accelerations(bodies):
-            parent = bodies[kinematics.geometry.parents[i]]
             out[i] = out[i] + rate
             bodies[i] = add_spatial(
-                shift_motion(parent, kinematics.offsets[i]),
+                shift_motion(bodies[kinematics.geometry.parents[i]], kinematics.offsets[i]),
                 scale_spatial(rate, kinematics.body_motion_axes(i)),
             )
     return out

@@ -309,8 +309,7 @@ class CompiledParameterDerivatives:
 
     def evaluate_closed(self, q: Array, inputs: Array) -> Array:
         """(size, k) at one closed configuration (nq,), inputs [v_A, x] (2 n,)."""
-        size = self._program.formula_outputs("formula").size
-        out = np.empty((len(self._directions[0]), size))
+        out = np.empty((len(self._directions[0]), self._program.formula_outputs("formula").size))
         for row, *directions in zip(out, *self._directions, strict=True):
             self._program.call("formula", *self._constants, q, inputs, *directions, row)
         return out.T

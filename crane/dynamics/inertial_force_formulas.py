@@ -65,10 +65,11 @@ class InertialForceFormulas(JointForceFormulas):
     @cached_property
     def body_inertias(self) -> list[tuple[Scalar, Vector, list[Vector]]]:
         """Per body mass, COM, inertia about it, in the frame of the reference body."""
-        origins = self.kinematics.origin[1:]
         return [
             (mass, add_vectors(origin, lever), tensor)
-            for origin, (mass, lever, tensor) in zip(origins, self._body_inertias, strict=True)
+            for origin, (mass, lever, tensor) in zip(
+                self.kinematics.origin[1:], self._body_inertias, strict=True
+            )
         ]
 
     @cached_property
@@ -112,9 +113,10 @@ class InertialForceFormulas(JointForceFormulas):
             )
             carrier = self.formula_structure.carrier_bodies[i]
             if carrier:
-                arm = self.kinematics.offsets[i]
                 forces[carrier - 1] = add_vectors(forces[carrier - 1], force)
-                moments[carrier - 1] = add_vectors(moments[carrier - 1], moment, cross(arm, force))
+                moments[carrier - 1] = add_vectors(
+                    moments[carrier - 1], moment, cross(self.kinematics.offsets[i], force)
+                )
         return out
 
     def body_motions(
@@ -207,18 +209,17 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def rate_jacobian(self) -> list[Vector]:
         """d(rates)/dv_A (nb, n), zero for floating bases."""
-        floating = self.kinematics.geometry.floating_bodies
         none: Vector = [0.0] * self._mobility
+        floating = self.kinematics.geometry.floating_bodies
         return [none if i in floating else self.gamma[i] for i in range(1, self._body_count)]
 
     @cached_property
     def kinetic(self) -> Scalar:
         """v_A^T M_A v_A / 2, summed over bodies [J]."""
-        velocity = self._carrier_velocities.velocities
         total: Scalar = 0.0
         for i in range(1, self._body_count):
             mass, centre, tensor = self.body_inertias[i - 1]
-            v, w = velocity[i]
+            v, w = self._carrier_velocities.velocities[i]
             at = add_vectors(v, cross(w, centre))
             total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, matvec(tensor, w))
         for inertia, rate in zip(self.rotor_inertias, self.joint_velocities, strict=True):

@@ -278,10 +278,9 @@ class QuantityEvaluator(OneLineRepr):
         self._required_formula(quantity)
         key = quantity, tuple(names)
         if key not in self._parameter_derivatives:
-            closure = self.machine.closure
             constants = ConstantDerivatives(self.machine).jacobian(names, self.constants_of)
             geometry, numbers = np.split(
-                constants, [len(closure.compiled_closure.geometry.constants)], axis=1
+                constants, [len(self.machine.closure.compiled_closure.geometry.constants)], axis=1
             )
             geometry[:, -1] = 0.0  # the characteristic length only scales residuals
             self._parameter_derivatives[key] = CompiledParameterDerivatives(

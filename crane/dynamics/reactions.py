@@ -352,14 +352,13 @@ class Reactions(OneLineRepr):
     ) -> _StackKinematics:
         """Kinematics of configurations (N, nq); writes wrenches (N, nj, 6) into `carried`."""
         model, data, equations = self._model, self._data, self._equations
-        configurations = self.machine.coordinates.configuration(q)
         columns = np.empty((len(q), 6, model.nv))
         bodies = np.empty((len(q), model.njoints, 4, 4))
         joint_placements, joint_forces = (
             list(data.oMi),
             list(data.f)[1:],
         )  # references, updated by Pinocchio
-        for i, at in enumerate(configurations):
+        for i, at in enumerate(self.machine.coordinates.configuration(q)):
             columns[i] = pin.computeJointJacobians(model, data, at).reshape(6, -1)
             bodies[i] = [placement.homogeneous for placement in joint_placements]
             if carried is not None and v is not None and a is not None:
