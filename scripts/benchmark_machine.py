@@ -1,4 +1,4 @@
-"""What the benchmark simulates: the mini forwarder in springs and dampers, and its own motions."""
+"""The machine of the benchmark, the mini forwarder in springs and dampers, and its motions."""
 
 import dataclasses
 
@@ -8,13 +8,9 @@ import pinocchio as pin
 import crane
 from crane.codegen import Program
 from crane.control import ControlLaw, ValveDrive
-from crane.simulation.integration import (
-    Chart,
-    ErrorControlledIntegrator,
-    FixedStepIntegrator,
-    RosenbrockStepper,
-    row_layout,
-)
+from crane.simulation.integration.charts import Chart, row_layout
+from crane.simulation.integration.integrators import ErrorControlledIntegrator, FixedStepIntegrator
+from crane.simulation.integration.rosenbrock import RosenbrockStepper
 
 Array = np.ndarray
 

@@ -201,8 +201,7 @@ class RadauLinearSystem:
             if k:
                 reduced += add_vectors(list(view.controller), matvec(blocks["o_q"], part))
             reduced += add_vectors(matvec(blocks["mass"], view.v_a), matvec(blocks["v_q"], part))
-        solution = lu_solve(factors, reduced)
-        parts = [solution[i * m : (i + 1) * m] for i in range(len(views))]
+        parts = [lu_solve(factors, reduced)[i * m : (i + 1) * m] for i in range(len(views))]
         v_a = [
             [factor * x for factor, x in zip(blocks["free"][0], part[k:], strict=True)]
             for part in parts

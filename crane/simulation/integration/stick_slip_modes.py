@@ -77,8 +77,9 @@ class StickSlipModes:
     def __init__(self, machine: Machine, columns: tuple[int, ...]):
         self.columns = list(columns)
         self._joints = [machine.joints[column] for column in columns]
-        units = machine.closure.units[self.columns]
-        self._inverse_velocities = machine.closure.characteristic_time / units
+        self._inverse_velocities = (
+            machine.closure.characteristic_time / machine.closure.units[self.columns]
+        )
         self.slip_signs = np.zeros(len(columns))
         self.is_held = np.zeros(len(columns), dtype=bool)
         self.is_moving, self.has_modes, self.is_undetermined = True, False, False
