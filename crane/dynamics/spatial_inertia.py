@@ -133,11 +133,13 @@ class SpatialInertia:
         )
 
 
-def symmetric_matrix(entry: Callable[[int, int], Scalar], size: int = 3) -> Matrix:
-    """The matrix of some entries, of which those up to the diagonal are computed."""
+def symmetric_matrix(
+    entry: Callable[[int, int], Scalar], size: int = 3, upper: bool = False
+) -> Matrix:
+    """The symmetric matrix of some entries, from its lower or upper triangle row by row."""
     out: Matrix = [[0.0] * size for _ in range(size)]
     for r in range(size):
-        for c in range(r + 1):
+        for c in range(r, size) if upper else range(r + 1):
             out[r][c] = out[c][r] = entry(r, c)
     return out
 
@@ -291,14 +293,17 @@ class MassMoments:
         """
         first = scale_vector(mass, centre)
         square = dot(first, centre)
-        inertia = _symmetric_from_upper(
-            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0)
+        inertia = symmetric_matrix(
+            lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0),
+            upper=True,
         )
         v, w = motion
         momentum = scale_vector(mass, add_vectors(v, cross(w, centre)))
         # second moments about the centre, tr(I) / 2 - I
         half = 0.5 * (tensor[0][0] + tensor[1][1] + tensor[2][2])
-        spread = _symmetric_from_upper(lambda r, c: (half if r == c else 0.0) - tensor[r][c])
+        spread = symmetric_matrix(
+            lambda r, c: (half if r == c else 0.0) - tensor[r][c], upper=True
+        )
         spun = transpose([cross(w, column) for column in spread])
         k = [
             [p * x + more for x, more in zip(centre, row, strict=True)]
@@ -317,8 +322,8 @@ class MassMoments:
         return MassMoments(
             self.mass + other.mass,
             add_vectors(self.first_moment, other.first_moment),
-            _symmetric_from_upper(
-                lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c]
+            symmetric_matrix(
+                lambda r, c: self.inertia_tensor[r][c] + other.inertia_tensor[r][c], upper=True
             ),
             add_vectors(self.momentum, other.momentum),
             [
@@ -341,12 +346,3 @@ class MassMoments:
         """Angular part of B^T of a motion."""
         v, w = motion
         return add_vectors(cross(self.momentum, v), matvec(transpose(self.moment_rate), w))
-
-
-def _symmetric_from_upper(entry: Callable[[int, int], Scalar]) -> Matrix:
-    """`symmetric_matrix` from the upper triangle: the order of operations stays the same."""
-    out: Matrix = [[0.0] * 3 for _ in range(3)]
-    for r in range(3):
-        for c in range(r, 3):
-            out[r][c] = out[c][r] = entry(r, c)
-    return out
