@@ -159,7 +159,9 @@ class Program:
         Returns:
             The integer that a routine returns, 0 for a formula.
         """
-        result: int = self._entry_point(name, arguments)(_pack_addresses(arguments))
+        result: int = self._entry_point(name, arguments)(
+            pack(f"{len(arguments)}q", *map(_argument_address, arguments))
+        )
         return result
 
     def bind(self, name: str, *arguments: "int | np.ndarray") -> partial[int]:
@@ -167,7 +169,9 @@ class Program:
 
         Passing one pointer from Python is much faster than passing a dozen.
         """
-        addresses = np.frombuffer(_pack_addresses(arguments), dtype=np.int64)
+        addresses = np.frombuffer(
+            pack(f"{len(arguments)}q", *map(_argument_address, arguments)), dtype=np.int64
+        )
         bound = partial(self._entry_point(name, arguments), addresses.ctypes.data)
         vars(bound)["references"] = self, addresses, arguments  # are kept alive
         return bound
@@ -177,10 +181,6 @@ class Program:
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
         return self._machine_code.entry_point(name)
-
-
-def _pack_addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:
-    return pack(f"{len(arguments)}q", *map(_argument_address, arguments))
 
 
 def _argument_address(argument: "int | np.ndarray") -> int:

@@ -75,10 +75,6 @@ class RecursionInput:
     rotor_inertias: Vector
     joint_forces: Vector
 
-    def remaining_force(self, i: int) -> Scalar:
-        """Force along a joint that is left for accelerations relative to the reference."""
-        return self.joint_forces[i] - self.rotor_inertias[i] * self.reference_accelerations[i]
-
     def articulated_inertia(self, i: int, articulated: ArticulatedInertias) -> ArticulatedInertia:
         """Inertia and wrench of a body with those that it carries, at its origin."""
         mass, lever, tensor = self.body_inertias[i - 1]
@@ -172,7 +168,8 @@ class ArticulatedCluster:
         inertia, wrench = recursion.articulated_inertia(i, articulated)
         column = inertia.apply_to(axis)
         inverse = 1.0 / (spatial_dot(axis, column) + recursion.rotor_inertias[i])
-        net_force = recursion.remaining_force(i) - spatial_dot(axis, wrench)
+        rotor_force = recursion.rotor_inertias[i] * recursion.reference_accelerations[i]
+        net_force = recursion.joint_forces[i] - rotor_force - spatial_dot(axis, wrench)
         constraint_forces = [
             row.jacobian.get(i, 0.0) - spatial_dot(axis, force)
             for row, force in zip(self._loop_rows, self._constraint_wrenches[i], strict=True)
@@ -272,9 +269,9 @@ class ProjectedCluster:
         for i in reversed(cluster.joints):
             inertia, wrench = recursion.articulated_inertia(i, articulated_inside)
             inertias[i], arm = inertia, kinematics.offsets[i]
-            force = recursion.remaining_force(i) - spatial_dot(
-                kinematics.body_motion_axes(i), wrench
-            )
+            rotor_force = recursion.rotor_inertias[i] * recursion.reference_accelerations[i]
+            force = recursion.joint_forces[i] - rotor_force
+            force = force - spatial_dot(kinematics.body_motion_axes(i), wrench)
             self._net_forces = [
                 old + factor * force
                 for old, factor in zip(self._net_forces, self._gamma[i], strict=True)

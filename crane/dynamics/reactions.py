@@ -40,6 +40,10 @@ class _StackKinematics(NamedTuple):
     loop_wrenches: Array
     scaled_jacobian: Array
 
+    def position(self, body: int, point: Array) -> Array:
+        """(N, 3) positions of a point of a body in the world."""
+        return np.asarray(self.origins[:, body] + self.rotations[:, body] @ point)
+
 
 class Reactions(OneLineRepr):
     """Wrenches in the joints of a machine with closed loops.
@@ -173,7 +177,7 @@ class Reactions(OneLineRepr):
         body, placement = frame_placement(self.machine, link)
         rows, stacked = self._as_stack(q, "q")
         kinematics = self._evaluate_kinematics(rows)
-        point = self._point_in_world(kinematics, body, placement.translation)
+        point = kinematics.position(body, placement.translation)
         push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         carried = (
             -self._is_carried_by[body][None, :, None, None]
@@ -250,7 +254,7 @@ class Reactions(OneLineRepr):
         kinematics = self._evaluate_kinematics(rows, carried, velocities, accelerations)
         element_forces, _ = forces.passive_forces_by_element(rows, velocities)
         for ends, force in zip(forces.lengths.end_points, element_forces[:, nv:].T, strict=True):
-            one, two = (self._point_in_world(kinematics, *end) for end in ends)
+            one, two = (kinematics.position(*end) for end in ends)
             way = two - one
             push = (
                 force[:, None] * way / np.maximum(np.linalg.norm(way, axis=1), MIN_LENGTH)[:, None]
@@ -282,7 +286,7 @@ class Reactions(OneLineRepr):
     ) -> None:
         """Subtract a wrench (6,) or (N, 6) about a point of a body from `carried`."""
         about = np.array(np.broadcast_to(wrench, (len(carried), 6)))
-        about[:, 3:] += np.cross(self._point_in_world(kinematics, *point), about[:, :3])
+        about[:, 3:] += np.cross(kinematics.position(*point), about[:, :3])
         carried -= self._is_carried_by[point[0]][:, None] * about[:, None]
 
     def _solve_loop_forces(
@@ -385,14 +389,6 @@ class Reactions(OneLineRepr):
         return np.concatenate(
             [kinematics.rotations[:, 1:] @ self._local_axes, kinematics.loop_frames[0][:, 1::2]],
             axis=1,
-        )
-
-    def _point_in_world(
-        self, kinematics: _StackKinematics, body: int, local_point: Array
-    ) -> Array:
-        """(N, 3) positions of a point of a body in the world."""
-        return np.asarray(
-            kinematics.origins[:, body] + kinematics.rotations[:, body] @ local_point
         )
 
     def _as_stack(self, value: ArrayLike, what: str, q: Array | None = None) -> tuple[Array, bool]:
