@@ -242,18 +242,12 @@ class QuantityEvaluator(OneLineRepr):
     def _compiled_quantity(self, quantity: str) -> CompiledQuantity | None:
         """Machine code of a quantity, or None on the Pinocchio backend."""
         if quantity not in self._compiled_quantities:
-            made = None
+            parts = self.formula_constants, self.constant_pattern, self.formula_structure
+            is_compiled = self.backend == "compiled"
             try:
-                if self.backend == "compiled":
-                    made = CompiledQuantity(
-                        quantity,
-                        self.machine,
-                        self.formula_constants,
-                        self.constant_pattern,
-                        self.formula_structure,
-                    )
+                made = CompiledQuantity(quantity, self.machine, *parts) if is_compiled else None
             except FormulaTooLongError:
-                pass
+                made = None
             # if two threads compile it at the same time, both use the first
             self._compiled_quantities.setdefault(quantity, made)
         return self._compiled_quantities[quantity]

@@ -186,10 +186,11 @@ class TippingStability:
         # the rate of momentum acts at the centre of mass of the moving bodies
         moved = rates[:, :3] - (self.mass - own.mass) * self._gravity
         out[:, 3:] += np.cross(centres, moved) - np.cross(own.mass * own.lever, self._gravity)
-        if external_wrenches is not None:
-            for k in range(len(self.machine.external_forces)):
-                if k not in self._support_contacts:
-                    out -= self._external_wrench_about_origin(q, k, external_wrenches)
+        if external_wrenches is None:
+            return out
+        for k in range(len(self.machine.external_forces)):
+            if k not in self._support_contacts:
+                out -= self._external_wrench_about_origin(q, k, external_wrenches)
         return out
 
     def contact_wrench(self, q: Array, external_wrenches: Array) -> Array:
