@@ -192,14 +192,10 @@ class ExactConstraints:
         closed_tolerances: (m,) largest residuals of closed loops [m], [rad].
     """
 
-    closed_tolerances: Array
-
     def __init__(self, equations: LoopEquations):
         self._equations = equations
-        self._residual_units, self._coordinate_units = (
-            equations.residual_units,
-            equations.coordinate_units,
-        )
+        self._residual_units = equations.residual_units
+        self._coordinate_units = equations.coordinate_units
         self.closed_tolerances = CLOSED_TOLERANCE * self._residual_units
 
     def is_closed(self, q: Array) -> bool:

@@ -320,9 +320,10 @@ def _state_derivatives(
 ) -> list[Scalar]:
     """Derivatives (3, k, n) of values (k,) by q_A, v_A and x."""
     n = len(x)
+    columns_of_gamma = zip(*(row for _, row in sorted(formulas.gamma.items())), strict=True)
     seeds = [
-        dict(zip(map(_tape_index, formulas.q), formulas.coordinate_direction(k), strict=True))
-        for k in range(n)
+        dict(zip(map(_tape_index, formulas.q), formulas.coordinate_rates(motion), strict=True))
+        for motion in ([0.0, *column] for column in columns_of_gamma)
     ]
     for entry in (*formulas.v_a, *x):
         seeds.append({_tape_index(entry): 1.0})

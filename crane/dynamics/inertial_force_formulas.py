@@ -22,7 +22,7 @@ from crane.codegen.symbolic import (
     sum_scalars,
 )  # fmt: skip
 from crane.dynamics.joint_force_formulas import JointForceFormulas
-from crane.dynamics.spatial_inertia import composite_mass_matrix, symmetric_matrix
+from crane.dynamics.spatial_inertia import composite_mass_matrix
 
 
 class InertialForceFormulas(JointForceFormulas):
@@ -58,7 +58,10 @@ class InertialForceFormulas(JointForceFormulas):
             rotation = self.kinematics.rotation[i]
             xx, xy, xz, yy, yz, zz = rest[3:]
             half = matmul(rotation, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            tensor = symmetric_matrix(lambda r, c, a=half, b=rotation: dot(a[r], b[c]))
+            tensor: list[Vector] = [[0.0] * 3 for _ in range(3)]
+            for r in range(3):
+                for c in range(r + 1):
+                    tensor[r][c] = tensor[c][r] = dot(half[r], rotation[c])
             out.append((mass, matvec(rotation, rest[:3]), tensor))
         return out
 
@@ -189,15 +192,10 @@ class InertialForceFormulas(JointForceFormulas):
     @property
     def coordinate_derivatives(self) -> Vector:
         """Time derivatives of the coordinates (nb,): the rates, except for rotation vectors."""
-        return self._coordinate_derivatives(self.joint_velocities)
+        return self.coordinate_rates(self.joint_velocities)
 
-    def coordinate_direction(self, k: int) -> Vector:
-        """Derivatives of the coordinates (nb,) along the motion v_k = 1."""
-        return self._coordinate_derivatives(
-            [0.0, *(self.gamma[i][k] for i in range(1, self._body_count))]
-        )
-
-    def _coordinate_derivatives(self, joint_velocities: Vector) -> Vector:
+    def coordinate_rates(self, joint_velocities: Sequence[Scalar]) -> Vector:
+        """Derivatives of the coordinates (nb,) along joint velocities (nb + 1,)."""
         out = list(joint_velocities[1:])
         for i in self.kinematics.geometry.floating_bases:
             linear, angular = out[i - 1 : i + 2], out[i + 2 : i + 5]
