@@ -356,10 +356,8 @@ class CompiledClosure:
         rows: list[list[Scalar]] = [[0.0] * n for _ in range(self._nq)]
         for k, column in enumerate(self._active_columns):
             rows[column][k] = 1.0
-        for row, column in enumerate(self._passive_columns):
-            for k in range(n):
-                if (row, k) in at:
-                    rows[column][k] = tape.load(0, at[row, k])
+        for (row, k), index in sorted(at.items()):
+            rows[self._passive_columns[row]][k] = tape.load(0, index)
         program.add_formula("gamma", 1, [entry for row in rows for entry in row])
 
     def _determinant_signs(self, home: ClosedConfiguration) -> Array:
