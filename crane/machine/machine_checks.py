@@ -216,9 +216,8 @@ def check_force_elements(
     for item in elements:
         if item.between is None:
             closure.equations.coordinates.column(item.joint)
-        else:
-            for link in item.between:
-                find_frame(link)
+        for link in item.between or ():
+            find_frame(link)
     for problem in frame_element_problems(closure, elements):
         raise InputError(problem)
     for joint in gas_springs:

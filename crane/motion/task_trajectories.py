@@ -145,7 +145,7 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
         raise InputError(f"task '{task}' moves levers, it has no trajectory")
     closure = machine.closure
     dependencies = (
-        closure.cache_key, closure.structure, machine.home, machine.lower, machine.upper,
+        closure.equations.cache_key, closure.structure, machine.home, machine.lower, machine.upper,
         machine.active, machine.is_driven, machine.tip, task_spec.space, task_spec.duration,
         tuple((name, tuple(row)) for name, row in task_spec.coefficients.items()),
         tuple((x.time, tuple(x.point.items()), tuple(x.rates.items())) for x in task_spec.via),
