@@ -137,14 +137,6 @@ UserMeasures = Annotated[
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
-_Changes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Another value of a parameter, as payload.mass=200; may be repeated.",
-    ),
-]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +144,14 @@ class ChangeOptions(OptionBlock):
     """Changed parameters of a machine."""
 
     panel = "Machine options"
-    changes: _Changes = None
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Another value of a parameter, as payload.mass=200; may be repeated.",
+        ),
+    ] = None
 
     def changed_values(self) -> dict[str, float]:
         """Values of the changed parameters."""

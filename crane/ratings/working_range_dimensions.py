@@ -306,8 +306,11 @@ class DimensionFinder:
         )
         if optimum is None or optimum[0] <= _MIN_DEPTH:
             return None
-        if not self._reaches_ground_vertically(optimum[1]):
-            return None
+        radius, lip_height = self._lip.coordinates(optimum[1][None])[0].tolist()
+        objective, zeros = self._lip.coordinate_objective(1), np.zeros(len(positions))
+        for height in np.linspace(lip_height, self._ground, _CHECKED_POINTS)[1:].tolist():
+            if self._maximize_fixed(objective, zeros, {0: radius, 1: height}) is None:
+                return None
         return self._dimension(
             "vertical wall digging depth", optimum,
             "deepest lip with neither the bucket's floor nor its pivot beyond an upright line, "
@@ -325,15 +328,6 @@ class DimensionFinder:
             return float(direction @ floor), np.asarray(gradient)
 
         return evaluate
-
-    def _reaches_ground_vertically(self, q: Array) -> bool:
-        """Return whether the lip can move from a configuration vertically to the ground."""
-        radius, lip_height = self._lip.coordinates(q[None])[0].tolist()
-        objective, zeros = self._lip.coordinate_objective(1), np.zeros(len(self._positions))
-        return all(
-            self._maximize_fixed(objective, zeros, {0: radius, 1: height}) is not None
-            for height in np.linspace(lip_height, self._ground, _CHECKED_POINTS)[1:].tolist()
-        )
 
     def _dump_height(self, pivot: FrameSectionCoordinates) -> Dimension | None:
         lip, size = self._lip, self._size

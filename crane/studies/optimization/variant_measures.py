@@ -219,8 +219,7 @@ class VariantEvaluation:
                 position,
                 *(x for x in self._load_positions if (with_derivatives, x) not in self._loads),
             ]
-            slews = sorted({x[2] for x in all_positions if len(x) == 3})
-            for slew in [None, *slews]:
+            for slew in [None, *sorted({x[2] for x in all_positions if len(x) == 3})]:
                 positions = [x for x in all_positions if (x[2] if len(x) == 3 else None) == slew]
                 if positions:
                     self._compute_loads(positions, slew, with_derivatives)
