@@ -317,7 +317,7 @@ def _shortened(cell: str) -> str:
 
 def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
     """Read numbers (N, columns) below the header row, line `header` of `lines`."""
-    values, count, is_valid = scratch_arrays.empty_array(lines - header, len(units)), 0, True
+    values, count = scratch_arrays.empty_array(lines - header, len(units)), 0
     try:
         with path.open(encoding="utf-8") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of blank lines
@@ -328,10 +328,8 @@ def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) 
                 rows = np.loadtxt(block, delimiter=",", comments=None, ndmin=2)
                 if not rows.size:
                     continue
-                if rows.shape[1] != len(units):
-                    is_valid = False
-                    break
-                is_valid = is_valid and bool(np.isfinite(rows).all())
+                if rows.shape[1] != len(units) or not np.isfinite(rows).all():
+                    _raise_first_fault(path, header, units)
                 values[count : count + len(rows)] = rows
                 count += len(rows)
                 scratch_arrays.release_pages()
@@ -339,10 +337,10 @@ def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) 
         _raise_first_fault(path, header, units)
         reason = " ".join(str(error).split())[:120]
         raise RecordingError(f"{reason}, correct the file") from None
-    if is_valid and not count:
+    if not count:
         raise RecordingError("has a header and no samples, write one row per sample")
     values = values[:count]
-    if not is_valid or (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
+    if (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
         _raise_first_fault(path, header, units)
     return values
 
