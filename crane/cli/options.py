@@ -13,7 +13,7 @@ from crane.cli.command import OptionBlock
 from crane.cli.parsing import parse_arguments, parse_names, parse_values
 from crane.cli.terminal import status
 from crane.common.atomic_output import check_file_is_writable, check_folder_is_writable
-from crane.common.errors import InputError, OutputError
+from crane.common.errors import OutputError
 from crane.common.result import Result
 
 # Arguments and options of several commands that are not part of a block.
@@ -252,20 +252,9 @@ class TimeOptions(OptionBlock):
 
     @property
     def span(self) -> tuple[float, float]:
-        """Start and end [s] of the part to read.
-
-        Raises:
-            InputError: It is empty.
-        """
+        """Start and end [s] of the part to read."""
         start = -inf if self.since is None else self.since
-        end = inf if self.until is None else self.until
-        if not start < end:
-            raise InputError(f"nothing lies from {start:g} to {end:g} s, give a later --until")
-        return start, end
-
-    def check(self) -> None:
-        """Raise an error if the part to read is empty."""
-        _ = self.span
+        return start, inf if self.until is None else self.until
 
 
 @dataclass(frozen=True, kw_only=True)
