@@ -10,8 +10,8 @@ from scipy.interpolate import make_interp_spline
 import crane
 from crane.common.errors import CraneError
 from crane.control.valve_feedforward import largest_flow_share
-from crane.motion.sway import Sway
-from crane.motion.sway_suppression import SWAY_METHODS, input_shaper, retime, suppress_sway
+from crane.motion.sway import SWAY_METHODS, Sway, input_shaper, suppress_sway
+from crane.motion.trajectory import retime
 
 pytestmark = pytest.mark.slow
 

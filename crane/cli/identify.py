@@ -256,7 +256,7 @@ def identify(
                 loaded, inside, trials, progress, **settings
             )
         print(f"{format_trials(tried_settings)}\n")
-        settings = identify_options(tried_settings[0], settings)
+        settings = identify_options(tried_settings[0].settings, settings)
     with progress_bar("identifying") as progress:
         result = crane.identify(loaded, inside, judges or None, progress=progress, **settings)
     if result.validation is None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.dynamics.constant_derivatives import ConstantDerivatives
+from crane.dynamics.quantity_evaluator import ConstantDerivatives
 from crane.dynamics.statics import StaticQuantities
 from crane.machine.machine import Machine
 from crane.ratings.limiting_factors import (

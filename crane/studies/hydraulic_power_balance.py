@@ -13,8 +13,12 @@ from crane.description.force_elements import Friction
 from crane.description.sensors import VELOCITY_SUFFIX
 from crane.dynamics.dynamics import Dynamics
 from crane.hydraulics.circuit_elements import MAIN_PUMP
-from crane.hydraulics.circuit_equations import CircuitEquations
-from crane.hydraulics.power_balance import ROD_POWER, SHAFT_POWER, component_powers
+from crane.hydraulics.circuit_equations import (
+    ROD_POWER,
+    SHAFT_POWER,
+    CircuitEquations,
+    component_powers,
+)
 from crane.machine.machine import Machine
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import check_columns_present, check_unit

@@ -10,7 +10,7 @@ from crane.common.errors import InputError
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
 from crane.common.units import format_quantity
-from crane.hydraulics.power_balance import SHAFT_POWER, STORED_POWERS
+from crane.hydraulics.circuit_equations import SHAFT_POWER, STORED_POWERS
 from crane.recordings.timeseries import TIME, write_columns
 
 DIESEL_DENSITY = 840.0  # [kg/m3]

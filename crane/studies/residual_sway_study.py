@@ -14,8 +14,7 @@ from crane.common.units import format_table
 from crane.control.valve_feedforward import ValveFeedforward, fastest_trajectory
 from crane.formats.machine_loading import load
 from crane.machine.machine import Machine
-from crane.motion.sway import Sway
-from crane.motion.sway_suppression import SWAY_METHODS
+from crane.motion.sway import SWAY_METHODS, Sway
 from crane.motion.task_trajectories import task_trajectory
 from crane.simulation.simulation_run import simulate
 
