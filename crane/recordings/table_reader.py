@@ -319,8 +319,8 @@ def _read_values(path: Path, header: int, lines: int, units: Mapping[str, str]) 
     """Read numbers (N, columns) below the header row, line `header` of `lines`."""
     values, count = scratch_arrays.empty_array(lines - header, len(units)), 0
     try:
-        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of blank lines
+        # numpy warns of blank lines
+        with path.open(encoding="utf-8") as file, warnings.catch_warnings(action="ignore"):
             for _ in itertools.islice(file, header):
                 pass
             for line in file:
@@ -355,8 +355,7 @@ def _read_log_values(
         ValueError: Rows have different numbers of cells.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of a file without samples
+        with warnings.catch_warnings(action="ignore"):  # numpy warns of a file without samples
             values = np.loadtxt(rows(), delimiter=separator, comments=None, ndmin=2)
     except ValueError:
         _raise_invalid_cell(rows(), header, separator, names)

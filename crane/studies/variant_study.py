@@ -196,8 +196,8 @@ def study(
 
 def measure_variant(study_job: StudyJob) -> tuple[dict[str, float], str]:
     """Return the columns of one variant, and the reasons for missing ones."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # the machine itself has given them
+    # the machine itself has given its warnings
+    with warnings.catch_warnings(action="ignore", category=CraneWarning):
         try:
             machine = load(study_job.machine, study_job.changes, study_job.locked_joints)
         except CraneError as error:
