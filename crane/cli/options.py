@@ -271,8 +271,8 @@ class RecordingOptions(TimeOptions):
     def read(
         self, path: Path, machine: "crane.Machine | None" = None, needs: Any = ()
     ) -> "crane.Recording":
-        """Read a recording, see `crane.recordings.run_folder.read_run`."""
-        from crane.recordings.run_folder import read_run
+        """Read a recording, see `crane.recordings.measured_recordings.read_run`."""
+        from crane.recordings.measured_recordings import read_run
 
         return read_run(path, machine, self.columns, self.span, needs)
 
