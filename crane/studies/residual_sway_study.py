@@ -22,8 +22,6 @@ _OBSERVATION_TIME = 10.0  # after the motion [s]
 _STEP = 1e-2  # [s]
 DEFAULT_DAMPING_RATIO = 0.2
 
-Progress = Callable[[float], None]
-
 
 @dataclass(frozen=True)
 class SwayRow:
@@ -95,7 +93,7 @@ def sway_study(
     payloads: Sequence[float] = (0.0, 100.0, 200.0, 300.0, 400.0, 500.0),
     damping: float = DEFAULT_DAMPING_RATIO,
     changes: Mapping[str, float] | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> SwayStudy:
     """Compute the residual sway of a task, with and without each sway suppression method.
 

@@ -54,7 +54,6 @@ _MAX_VARIANTS = 100_000
 _REQUIREMENT_TOLERANCE = 1e-9  # relative violation of a requirement that is accepted
 # first words of parameters that do not change inverse dynamics
 _NON_MECHANICAL_PREFIXES = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
-Progress = Callable[[float], None]
 
 # one machine per set of formulas; variants share its machine code as long as it exists
 _CODE_OWNERS: dict[int, Machine] = {}
@@ -98,7 +97,7 @@ def study(
     seed: int = 0,
     processes: int = 1,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Study:
     """Measure variants of a machine: a grid of parameter values, or random draws.
 
