@@ -146,10 +146,9 @@ def find_file(name: str, folder: Path) -> Path | None:
     parts = [part for part in Path(rest if separated else name).parts if part != "/"]
     in_package = bool(separated) and scheme in ("package", "model") and bool(parts)
     try:
-        if in_package and (package := find_package(parts[0], folder)) is not None:
-            inside = package.joinpath(*parts[1:])
-            if inside.exists():
-                return inside
+        package = find_package(parts[0], folder) if in_package else None
+        if package is not None and package.joinpath(*parts[1:]).exists():
+            return package.joinpath(*parts[1:])
         ends = [Path(rest if separated else name)]
         if in_package:  # also without the name of the package
             ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]

@@ -391,12 +391,12 @@ def _front_pin_links(machine: Machine, frame: str) -> list[str]:
     """Return the frame and the links whose origins are the pins of the slewing part."""
     slewing_joint = find_slewing_joint(machine, frame)
     assert slewing_joint is not None, "it slews"
-    model = machine.model
-    slew_joint_id = model.getJointId(machine.active[slewing_joint[0]])
-    out = [frame]
-    for joint in machine.tree.moving_joints:
-        if joint.kind == "revolute" and model.existJointName(joint.name):
-            joint_id = model.getJointId(joint.name)
-            if joint_id != slew_joint_id and slew_joint_id in list(model.supports[joint_id]):
-                out.append(joint.child)
-    return out + [loop.successor for loop in machine.closure.equations.loops]
+    model, slew = machine.model, machine.active[slewing_joint[0]]
+    pins = [x for x in machine.tree.moving_joints if x.kind == "revolute" and x.name != slew]
+    carried = [
+        x.child
+        for x in pins
+        if model.existJointName(x.name)
+        and model.getJointId(slew) in list(model.supports[model.getJointId(x.name)])
+    ]
+    return [frame, *carried, *(loop.successor for loop in machine.closure.equations.loops)]

@@ -11,6 +11,7 @@ Missing ones are computed:
 Recorded columns are not changed. All other columns are channels.
 """
 
+import itertools
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -395,12 +396,12 @@ def dead_length(machine: Machine, joint: str) -> float | None:
     axis = data.oMf[machine.frame(slide.child)].rotation @ np.array(slide.axis)
     bodies = machine.tree.bodies_by_link()
     smallest_deviation, length = _MAX_AXIS_DEVIATION, None
-    for one in _pin_positions(machine, data, bodies[slide.parent], joint):
-        for two in _pin_positions(machine, data, bodies[slide.child], joint):
-            along = float(axis @ (two - one))
-            axis_distance = float(np.linalg.norm(two - one - along * axis))
-            if axis_distance < smallest_deviation * along:
-                smallest_deviation, length = axis_distance / along, along
+    pins = (_pin_positions(machine, data, bodies[x], joint) for x in (slide.parent, slide.child))
+    for one, two in itertools.product(*pins):
+        along = float(axis @ (two - one))
+        axis_distance = float(np.linalg.norm(two - one - along * axis))
+        if axis_distance < smallest_deviation * along:
+            smallest_deviation, length = axis_distance / along, along
     return None if length is None else length - float(machine.home[machine.column(joint)])
 
 

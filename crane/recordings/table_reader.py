@@ -199,14 +199,14 @@ def _check_sample_count(values: Array, notes: Mapping[str, str]) -> None:
         )
 
 
+@np.errstate(over="ignore")  # infinite values are reported with their name later
 def _convert_to_si(table: Table) -> Table:
     units, values = dict(table.units), table.values
     for i, (name, unit) in enumerate(table.units.items()):
         scratch_arrays.release_pages()
         if unit in SI_CONVERSIONS:
             units[name], a, b = SI_CONVERSIONS[unit]
-            with np.errstate(over="ignore"):  # infinite values are reported with their name later
-                values[:, i] = values[:, i] * a / b
+            values[:, i] = values[:, i] * a / b
         column = values[:, i]
         is_too_large = np.isfinite(column) & (np.abs(column) > _MAX_VALUE)
         if is_too_large.any():

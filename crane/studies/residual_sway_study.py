@@ -116,7 +116,7 @@ def sway_study(
     if not payloads:
         raise InputError("no payloads, give some masses [kg]")
     rows: list[SwayRow] = []
-    finished_count, total_count = 0, len(payloads) * len(SWAY_METHODS) * (1 + (damping > 0))
+    total_count = len(payloads) * len(SWAY_METHODS) * (1 + (damping > 0))
     for mass in payloads:
         payload_mass = as_number(mass, "the payload", "kg")
         payload_changes = {
@@ -146,9 +146,8 @@ def sway_study(
                         1.0 - residual / reference_result[1],
                     )
                 )
-                finished_count += 1
                 if progress is not None:
-                    progress(finished_count / total_count)
+                    progress(len(rows) / total_count)
     return SwayStudy(task, tuple(rows))
 
 
