@@ -420,7 +420,7 @@ def calibrate(
     sensors: ComparedColumns = None,
 ) -> None:
     """Fit parameters through simulations of valve signals."""
-    from crane.recordings.run_folder import recording_file
+    from crane.recordings.measured_recordings import recording_file
 
     fits, window = parse_fits(fit), parse_window(train)
     loaded = options.load(machine)

@@ -146,22 +146,16 @@ def find_file(name: str, folder: Path) -> Path | None:
     parts = [part for part in Path(rest if separated else name).parts if part != "/"]
     in_package = bool(separated) and scheme in ("package", "model") and bool(parts)
     try:
-        if in_package and (package := find_package(parts[0], folder)) is not None:
-            inside = package.joinpath(*parts[1:])
-            if inside.exists():
-                return inside
-        return _search_upwards(Path(rest if separated else name), parts, folder, in_package)
+        package = find_package(parts[0], folder) if in_package else None
+        if package is not None and package.joinpath(*parts[1:]).exists():
+            return package.joinpath(*parts[1:])
+        ends = [Path(rest if separated else name)]
+        if in_package:  # also without the name of the package
+            ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
+        places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
+        return next(filter(Path.is_file, places), None)
     except (OSError, ValueError):  # not a valid file name
         return None
-
-
-def _search_upwards(path: Path, parts: list[str], folder: Path, in_package: bool) -> Path | None:
-    """A path relative to a folder or one above it, in packages also without their name."""
-    ends = [path]
-    if in_package:
-        ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
-    places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
-    return next(filter(Path.is_file, places), None)
 
 
 def find_package(name: str, folder: Path) -> Path | None:
