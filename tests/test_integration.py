@@ -69,6 +69,26 @@ class Push(crane.control.ControlLaw):
         return inputs.settings, ()
 
 
+@pytest.fixture
+def steps(monkeypatch):
+    """How many steps were done in machine code and how many in Python."""
+    done = {"compiled": 0, "python": 0}
+    run, advance = RungeKuttaStepper.run, PythonStepper.advance
+
+    def counted_run(self, *rest):
+        count = run(self, *rest)
+        done["compiled"] += count
+        return count
+
+    def counted_advance(self, *rest):
+        done["python"] += 1
+        return advance(self, *rest)
+
+    monkeypatch.setattr(RungeKuttaStepper, "run", counted_run)
+    monkeypatch.setattr(PythonStepper, "advance", counted_advance)
+    return done
+
+
 def traces(recording):
     """Everything that was recorded, (N, .)."""
     return np.column_stack([recording.q, recording.v, recording.tau, *recording.channels.values()])
