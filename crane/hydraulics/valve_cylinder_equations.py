@@ -406,7 +406,7 @@ def cylinder_constants(cylinder: Cylinder, valve: Valve, stroke: float) -> dict[
     return named | {"counterbalance": counterbalance}
 
 
-def spool_constants(spool: Valve | Spool) -> dict[str, float]:
+def spool_constants(spool: Valve | Spool) -> dict[str, Scalar]:
     """Constants of a spool."""
     return {
         "neutral": spool.neutral,

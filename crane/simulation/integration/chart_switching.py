@@ -373,9 +373,12 @@ class ChartSwitchingIntegrator:
             return False
         columns = control.references(np.zeros(1)).shape[1]
         sizes = n, n, self._row_layout.parts["controller"], len(control.settings), columns
-        values = (tape.load_vector(i, 0, size) for i, size in enumerate(sizes))
+        q_a, v_a, state, settings, reference = (
+            tape.load_vector(i, 0, size) for i, size in enumerate(sizes)
+        )
+        functions = raise_undetermined, raise_undetermined
         try:
-            control.law(ControllerInputs(*values, raise_undetermined, raise_undetermined))
+            control.law(ControllerInputs(q_a, v_a, state, settings, reference, *functions))
         except InputError:
             return True
         return False

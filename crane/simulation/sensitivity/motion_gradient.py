@@ -140,11 +140,7 @@ def gradient(
     for name in parameters or ():
         directions.parameter_value(name)
     track = SimulatedMotion(problem.simulation, progress)
-    directions_by_name = (
-        directions.all_derivatives(track.time)
-        if parameters is None
-        else directions.derivatives(parameters, track.time)
-    )
+    directions_by_name = directions.derivatives(parameters, track.time)
     for name in [x for x, direction in directions_by_name.items() if direction.references.any()]:
         if parameters is not None:
             raise InputError(

@@ -147,20 +147,10 @@ class SimulatedMotion:
     """
 
     def __init__(self, motion: SimulationProblem, progress: Callable[[float], None] | None):
-        dynamics, control, count, step = (
-            motion.dynamics,
-            motion.control,
-            motion.step_count,
-            motion.step,
-        )
-        machine, self.chart, self.control = (
-            dynamics.machine,
-            Chart.from_dynamics(dynamics),
-            control,
-        )
-        if not (dynamics.backend == "compiled" and machine.has_traceable_forces) or not isinstance(
-            control, ControlLaw
-        ):
+        dynamics, control, self._step = motion.dynamics, motion.control, motion.step
+        machine, self.chart = dynamics.machine, Chart.from_dynamics(dynamics)
+        self.control, self.has_joints_at_rest = control, False
+        if dynamics.backend != "compiled" or not machine.has_traceable_forces:
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
                 "joints, or write the controller as a Law, and loads as ExternalForce"
@@ -173,17 +163,13 @@ class SimulatedMotion:
                 "are of those without lateral stiffness"
             )
         self.chart.stick_slip.transitions = []
-        made = (dynamics, control, motion.initial, 2 * count, 0.5 * step, motion.method)
+        steps = 2 * motion.step_count, 0.5 * motion.step
+        made = (dynamics, control, motion.initial, *steps, motion.method)
         run = integrate(*made, progress, motion.tolerance, self.chart)
         if run.stop is not None:
             raise run.stop
         time, parts, self.notes = run.time, run.rows, run.notes
-        self.time, self.controller_state_count, self._step, self.has_joints_at_rest = (
-            time,
-            parts.controller.shape[1],
-            step,
-            False,
-        )
+        self.time, self.controller_state_count = time, parts.controller.shape[1]
         stride = max(1, len(time) // _MAX_CHECKED_SAMPLES)
         for at, configuration in zip(time[::stride], parts.q[::stride], strict=True):
             if self.chart.largest_gamma_entry(configuration) > self.chart.chart_limits[0]:
