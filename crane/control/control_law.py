@@ -351,5 +351,4 @@ class ComputedTorque(ControlLaw):
 
 
 def _gains_example(joint: str) -> str:
-    """Example of the argument `gains`."""
     return f"gains={{'{joint}': crane.description.PIGains(kp, ki)}}"

@@ -143,7 +143,6 @@ class LeverPhases(ValveCommand, OneLineRepr, threading.local):
         self._sample_rows.append(np.append(signals, clock))
 
     def _begin_phase(self, index: int, time: float, positions: Mapping[str, float]) -> None:
-        """Start a phase."""
         self._phase_index, self._phase_start_time, self._phase_start = index, time, dict(positions)
         self._pending_joints = (
             set() if (index == len(self._phases)) else set(self._phases[index].until)

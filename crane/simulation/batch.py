@@ -50,7 +50,6 @@ class Batch(OneLineRepr):
     warnings: dict[int, str]
 
     def _one_line(self) -> str:
-        """Number of simulations, duration, and number of failures."""
         return (
             f"Batch of {format_count(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
             f"{format_count(len(self.time), 'sample')}: {len(self.failures)} failed"

@@ -93,7 +93,6 @@ class Comparison(Result):
     recording: Recording | None = None
 
     def _one_line(self) -> str:
-        """Duration and compared channels."""
         return (
             f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
             + ", ".join(channel.name for channel in self.channels)
@@ -313,7 +312,6 @@ def _initial_pressures(
 def _initial_motion(
     machine: Machine, table: Table, time: Array, signals: list[Array]
 ) -> tuple[Array, Array]:
-    """Initial active coordinates and velocities."""
     for text in locked_joint_conflicts(
         machine, dict(zip(table.units, table.values.T, strict=True)), table.units
     ):

@@ -291,7 +291,6 @@ def friction_chatter_text(machine: Machine, time: Array, rows: LayoutView, step:
 
 
 def _energies_differ(one: Array, other: Array, tolerance: float) -> np.ndarray:
-    """Whether energies (N,) [J] differ."""
     gap = np.abs(one - other)
     return (gap > _MAX_DISSIPATION_ERROR * np.maximum(np.abs(one), np.abs(other))) & (
         gap > tolerance

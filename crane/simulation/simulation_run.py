@@ -301,7 +301,6 @@ def has_fixed_steps(dynamics: Dynamics, control: Controller, method: str | None)
 
 
 def _default_method(dynamics: Dynamics, control: Controller) -> str:
-    """Name of the default method."""
     if isinstance(control, ValveDrive):
         return "rosenbrock"
     return (

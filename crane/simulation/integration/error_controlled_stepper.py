@@ -410,7 +410,6 @@ class DormandPrinceStepper(ErrorControlledStepper):
         program.add_formula("dense", 4, parts)
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
-        """See `ErrorControlledStepper`."""
         from scipy.integrate import DOP853  # slow to import
 
         r, size = step.routine, self.state_layout.size

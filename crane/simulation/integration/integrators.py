@@ -154,7 +154,6 @@ class StickSlipIntegrator(ABC):
         raise NotImplementedError
 
     def _outputs_and_margin(self, time: float, state: Array) -> tuple[Array, float]:
-        """Outputs and margin at a state."""
         if self._compiled_method is not None:
             return self._compiled_method.observe(time, state)
         return self.python_stepper.observe(time, state)[1], self.python_stepper.transition_margin
@@ -269,7 +268,6 @@ class FixedStepIntegrator(StickSlipIntegrator):
         rows: Array,
         progress: StepProgress,
     ) -> bool:
-        """See `StickSlipIntegrator._advance`."""
         if self.offset < 0:
             time = first + step * self.next_instant + self.offset
             after, margin = self._make_step(time, state, -self.offset)
@@ -307,7 +305,6 @@ class FixedStepIntegrator(StickSlipIntegrator):
         return True
 
     def _make_step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """See `StickSlipIntegrator._make_step`."""
         if self._compiled_stepper is not None:
             after, row = state.copy(), np.empty((1, self._row_size))
             if self._compiled_stepper.run(np.array([time]), after, length, row):
@@ -406,7 +403,6 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         rows: Array,
         progress: StepProgress,
     ) -> bool:
-        """See `StickSlipIntegrator._advance`."""
         now = first + step * self.done
         chunk = rows[self.done : min(self.done + _INSTANTS_PER_REPORT, len(times))]
         if self._sampled_drive is not None:
@@ -428,7 +424,6 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         return True
 
     def _update_command(self, drive: ValveDrive, time: float, state: Array) -> None:
-        """Sample the valve command."""
         at = self.python_stepper.state_layout.view(state)
         try:
             drive.update(time, at.q, self._chart.user_velocities(at.q, at.v_a), at.controller)

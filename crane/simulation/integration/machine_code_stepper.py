@@ -109,7 +109,6 @@ class MachineCodeStepper:
         self._program = machine_program(machine, control, key, self._build)
 
     def _build(self, program: Program) -> None:
-        """Add formulas and routines."""
         raise NotImplementedError
 
     def _trace_controlled_machine(self, tape: Tape) -> MachineFormulas:

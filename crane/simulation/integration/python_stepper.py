@@ -264,7 +264,6 @@ class PythonStepper:
         ), tau
 
     def _set_circuit_friction(self, time: float, state: LayoutView, v_a: Array) -> None:
-        """Set the circuit friction of the dynamics."""
         control = self._control
         if self._dynamics.forces.circuit_friction_columns and isinstance(control, ValveDrive):
             inputs = control.inputs_at(

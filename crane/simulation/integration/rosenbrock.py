@@ -278,7 +278,6 @@ class RosenbrockStepper(ErrorControlledStepper):
         program.add_formula(f"solve{stage}{suffix}", 4, outputs)
 
     def _write_step(self, program: Program, step: StepLoop) -> tuple[StepWriter, StepWriter]:
-        """See `ErrorControlledStepper`."""
         r, size = step.routine, self.state_layout.size
         u, stage = r.local_array("u", STAGES * size), r.local_array("stage", size)
         stage_rate = r.local_array("slope", program.formula_outputs("rate"))

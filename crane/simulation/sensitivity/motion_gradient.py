@@ -53,7 +53,6 @@ class Gradient(OneLineRepr):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Outputs and number of parameters."""
         return f"Gradient of {', '.join(self.outputs)} by {len(self.parameters)} numbers"
 
     def derivative(self, parameter: str) -> Array:

@@ -125,7 +125,6 @@ class Sensitivities(Result):
     derivatives: Array
 
     def _one_line(self) -> str:
-        """Outputs and parameters."""
         return f"Sensitivities of {', '.join(self.outputs)} by {', '.join(self.parameters)}"
 
     def derivative(self, output: str, parameter: str) -> Array:
