@@ -16,7 +16,7 @@ from crane.common.samples import Array, as_number, as_sample
 from crane.description.specification import PIGains
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.external_forces import static_active_forces
-from crane.dynamics.hybrid_dynamics import hybrid_dynamics
+from crane.dynamics.inertial_force_formulas import hybrid_dynamics
 from crane.machine.machine import Machine
 from crane.motion.task_trajectories import add_free_joints
 from crane.motion.trajectory import Trajectory

@@ -19,8 +19,7 @@ from crane.control.valve_commands import (
     lever_signals,
     require_circuit,
 )
-from crane.description.specification import DEFAULT_RAMP_TIME
-from crane.description.task_phases import Phase
+from crane.description.specification import DEFAULT_RAMP_TIME, Phase
 from crane.machine.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectory import Trajectory

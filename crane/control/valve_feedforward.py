@@ -15,10 +15,9 @@ from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.flow_equations import LAMINAR_PRESSURE_DROP
 from crane.hydraulics.hydraulic_circuit import Hydraulics, PDGains
 from crane.machine.machine import Machine
-from crane.motion.sway import Sway
-from crane.motion.sway_suppression import retime, suppress_sway
+from crane.motion.sway import Sway, suppress_sway
 from crane.motion.task_trajectories import add_free_joints
-from crane.motion.trajectory import Trajectory
+from crane.motion.trajectory import Trajectory, retime
 
 _MIN_PRESSURE_DROP = 1e5  # least pressure drop that an edge is assumed to have [Pa]
 _PRESSURE_DIFFERENCE = 1e3  # pressure step of difference quotients [Pa]

@@ -23,6 +23,7 @@ from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine.machine import Machine
 from crane.recordings.measured_configurations import (
+    MissingMeasurements,
     add_inclination_angles,
     determining_joints,
     joint_motion,
@@ -32,12 +33,10 @@ from crane.recordings.measured_recordings import (
     check_strokes,
     locked_joint_conflicts,
 )
-from crane.recordings.missing_measurements import MissingMeasurements
 from crane.recordings.recording import VELOCITY_SUFFIX, Recording
-from crane.recordings.recording_columns import time_derivative
 from crane.recordings.recording_reader import FULL_TIME_SPAN, TimeSpan, read_quantities
 from crane.recordings.sensor_discrepancy import warn_discrepancies
-from crane.recordings.timeseries import TIME, Table, table_column
+from crane.recordings.timeseries import TIME, Table, table_column, time_derivative
 from crane.simulation.recorded_run import read_simulation, recorded_columns
 from crane.simulation.simulation_run import Progress, simulate
 

@@ -1,4 +1,4 @@
-"""A discrete PI controller that moves a plant, and knows only what the sensors tell."""
+"""A discrete PI controller that moves a plant, using only the sensor readings."""
 
 import math
 import warnings

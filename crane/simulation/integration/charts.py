@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from crane.closure.active_joint_selection import null_space_basis, select_columns
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.closure.kinematics_formulas import folding_pattern
 from crane.codegen import Layout
 from crane.codegen.symbolic import Scalar, SymbolicExpression, dot

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import FormulaConstants
-from crane.closure.spatial_vectors import wrap_rotation_vector
+from crane.closure.kinematics_formulas import FormulaConstants, wrap_rotation_vector
 from crane.codegen import (
     Layout,
     LayoutView,

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 
 from crane.codegen import ArrayPointer, Layout, Program, RoutineValue, Scalar, Tape, select
-from crane.codegen.matrix_factorization import lu_factorize
 from crane.codegen.symbolic import (
     add_vectors,
     apply_function,
     dot,
+    lu_factorize,
     maximum,
     scale_vector,
     subtract_vectors,

@@ -1,10 +1,11 @@
 """Linear systems of the Newton iteration of Radau IIA, as formulas in block form."""
 
 from crane.codegen import Layout, Scalar, Tape
-from crane.codegen.matrix_factorization import Matrix, lu_solve
 from crane.codegen.symbolic import (
+    Matrix,
     add_vectors,
     dot,
+    lu_solve,
     matvec,
     scale_vector,
     subtract_vectors,

@@ -4,19 +4,17 @@ import numpy as np
 
 from crane.codegen import Program, RoutineValue, Scalar, SymbolicExpression, Tape, max_abs, maximum
 from crane.codegen.differentiation import differentiate
-from crane.codegen.matrix_factorization import (
+from crane.codegen.symbolic import (
     Matrix,
+    add_vectors,
+    apply_function,
     load_matrix,
     lu_factorize,
     lu_solve,
-    symbolic_entries,
-)
-from crane.codegen.symbolic import (
-    add_vectors,
-    apply_function,
     matvec,
     scale_vector,
     subtract_vectors,
+    symbolic_entries,
 )
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive

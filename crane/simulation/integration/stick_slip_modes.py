@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crane.closure.closure import Closure
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.samples import Array
 from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.joint_forces import REST_VELOCITY

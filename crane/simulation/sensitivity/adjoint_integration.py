@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.samples import Array
 from crane.simulation.sensitivity.rate_derivatives import ForwardDerivatives, ReverseDerivatives
 from crane.simulation.sensitivity.simulated_motion import (

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.kinematics_formulas import FormulaConstants, folding_pattern
-from crane.closure.spatial_vectors import Vector
+from crane.closure.kinematics_formulas import FormulaConstants, Vector, folding_pattern
 from crane.codegen import FormulaTooLongError, Program, Scalar, SymbolicExpression, Tape
 from crane.codegen.differentiation import directional_derivative
 from crane.codegen.symbolic import (

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.errors import InputError, SimulationError
 from crane.common.samples import Array
 from crane.control.control_law import ControlLaw

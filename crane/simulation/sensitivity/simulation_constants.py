@@ -12,8 +12,8 @@ from crane.common.samples import Array
 from crane.control.control_law import ControlLaw
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import VELOCITY_SUFFIX
-from crane.dynamics.constant_derivatives import UNIT_OF_ZERO_PARAMETER, ConstantDerivatives
 from crane.dynamics.dynamics import Dynamics
+from crane.dynamics.quantity_evaluator import UNIT_OF_ZERO_PARAMETER, ConstantDerivatives
 from crane.machine.machine import Machine
 from crane.simulation.integration.machine_formulas import reference_samples
 
