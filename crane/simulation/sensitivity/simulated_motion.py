@@ -25,28 +25,6 @@ _MAX_CHECKED_SAMPLES = 500  # configurations that are checked for dead centres
 _EVENT_DIFFERENCE_STEP = 1e-6  # share of a step: interval of the rate of references at an event
 
 
-class SimulationProblem(NamedTuple):
-    """Definition of a simulation.
-
-    Attributes:
-        dynamics: Dynamics of the machine.
-        control: Its controller.
-        initial: Initial q_A and v_A.
-        step_count: Number of output intervals.
-        step: Output interval [s].
-        method: See `simulate`.
-        tolerance: See `simulate`.
-    """
-
-    dynamics: Dynamics
-    control: ControlLaw
-    initial: tuple[Array, Array]
-    step_count: int
-    step: float
-    method: str | None = None
-    tolerance: float | None = None
-
-
 class MotionNodes(NamedTuple):
     """Nodes of a segment of n steps: their ends and their middles.
 
@@ -124,7 +102,13 @@ class SimulatedMotion:
     """A simulated motion with states at the ends and middles of its steps.
 
     Args:
-        motion: The simulation.
+        dynamics: Dynamics of the machine.
+        control: Its controller.
+        initial: Initial q_A and v_A.
+        step_count: Number of output intervals.
+        step: Output interval [s].
+        method: See `simulate`.
+        tolerance: See `simulate`.
         progress: See `simulate`.
 
     Attributes:
@@ -146,10 +130,19 @@ class SimulatedMotion:
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
 
-    def __init__(self, motion: SimulationProblem, progress: Callable[[float], None] | None):
-        dynamics, control, self._step = motion.dynamics, motion.control, motion.step
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        control: ControlLaw,
+        initial: tuple[Array, Array],
+        step_count: int,
+        step: float,
+        method: str | None = None,
+        tolerance: float | None = None,
+        progress: Callable[[float], None] | None = None,
+    ):
         machine, self.chart = dynamics.machine, Chart.from_dynamics(dynamics)
-        self.control, self.has_joints_at_rest = control, False
+        self.control, self._step, self.has_joints_at_rest = control, step, False
         if dynamics.backend != "compiled" or not machine.has_traceable_forces:
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
@@ -163,9 +156,8 @@ class SimulatedMotion:
                 "are of those without lateral stiffness"
             )
         self.chart.stick_slip.transitions = []
-        steps = 2 * motion.step_count, 0.5 * motion.step
-        made = (dynamics, control, motion.initial, *steps, motion.method)
-        run = integrate(*made, progress, motion.tolerance, self.chart)
+        made = (dynamics, control, initial, 2 * step_count, 0.5 * step, method)
+        run = integrate(*made, progress, tolerance, self.chart)
         if run.stop is not None:
             raise run.stop
         time, parts, self.notes = run.time, run.rows, run.notes
@@ -187,7 +179,7 @@ class SimulatedMotion:
         self.parts = layout.view(self.rows[::2])
         self._states = self.rows[:, : layout.start_index("tau")]
         make = integrator_factory(
-            dynamics, control, self.controller_state_count, motion.method, motion.tolerance
+            dynamics, control, self.controller_state_count, method, tolerance
         )
         self._integrator = make(self.chart)
         self.transitions: list[StickSlipTransition] = self.chart.stick_slip.transitions

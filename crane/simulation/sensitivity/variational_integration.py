@@ -18,7 +18,7 @@ The transposed map takes weights lambda of S(t + h) to those of S(t) and of the 
     Psi^T lambda = sum_j B_j^T mu_j,    mu_j = h sum_i a_ij nu_i.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,6 @@ from crane.simulation.sensitivity.simulated_motion import (
     MotionNodes,
     ResimulatedSegment,
     SimulatedMotion,
-    SimulationProblem,
     TransitionJump,
 )
 from crane.simulation.sensitivity.simulation_constants import SimulationConstants
@@ -171,44 +170,22 @@ STEP_ACCURACY = 1e-8  # relative error of a step
 MIN_RELATIVE_CHANGE = 1e-6  # least relative change of states by a whole parameter that counts
 
 
-def integrate_sensitivities(
-    motion: SimulationProblem,
-    outputs: Sequence[str],
-    make_constants: Callable[[Array], tuple[SimulationConstants, SimulationConstants]],
-    typical_changes: Array,
-    accuracy: float = STEP_ACCURACY,
-    progress: Callable[[float], None] | None = None,
-) -> tuple[SimulatedMotion, Array]:
-    """Simulate a machine, with derivatives of its outputs along directions.
-
-    Args:
-        motion: The simulation.
-        outputs: Names of the outputs, see `sensitivities`.
-        make_constants: Function of the times (2 N + 1,) of the references; returns constants of
-            the simulation, and p directions of them, each part with a leading axis.
-        typical_changes: (p,) sizes of large changes along the directions.
-        accuracy: Relative error of a step.
-        progress: See `simulate`.
-
-    Returns:
-        The motion, and derivatives (N + 1, k, p) of k outputs in p directions at its instants.
-
-    Raises:
-        InputError: The machine has no formulas or a floating base, or an output is unknown.
-        SimulationError: The motion comes to a dead centre; else as `simulate`.
-    """
-    track = SimulatedMotion(motion, progress)
-    integrator = _VariationalIntegrator(
-        track, outputs, *make_constants(track.time), typical_changes, accuracy
-    )
-    return track, integrator.integrate()
-
-
-class _VariationalIntegrator:
-    """Integrator of the variational equations along a recorded motion, segment by segment.
+class VariationalIntegrator:
+    """Integrator of the variational equations along a simulated motion, segment by segment.
 
     Pairs of steps over which A or B are not smooth, as where a valve opens or a compensator
-    closes, are divided and simulated again. For the arguments see `integrate_sensitivities`.
+    closes, are divided and simulated again.
+
+    Args:
+        motion: The motion.
+        outputs: Names (k,) of the outputs, see `sensitivities`.
+        nominal_constants: Constants of the simulation, for the times of the motion.
+        directions: p directions of them, each part with a leading axis.
+        typical_changes: (p,) sizes of large changes along the directions.
+        accuracy: Relative error of a step.
+
+    Raises:
+        InputError: An output is unknown, or the formulas are too long.
     """
 
     def __init__(
@@ -218,7 +195,7 @@ class _VariationalIntegrator:
         nominal_constants: SimulationConstants,
         directions: SimulationConstants,
         typical_changes: Array,
-        accuracy: float,
+        accuracy: float = STEP_ACCURACY,
     ):
         self._motion, self._accuracy = motion, accuracy
         self._nominal_constants, self._directions = nominal_constants, directions
