@@ -9,7 +9,6 @@ import numpy as np
 
 from crane.common.errors import (
     CraneWarning,
-    InputError,
     RecordingError,
     prefix_location,
     suggest_names,
@@ -18,7 +17,7 @@ from crane.common.one_line_repr import OneLineRepr
 from crane.common.progress import progress_reporter
 from crane.common.result import Result
 from crane.common.samples import Array, as_number
-from crane.control.valve_commands import ValveSignals
+from crane.control.valve_commands import ValveSignals, require_circuit
 from crane.control.valve_drive import ValveDrive
 from crane.description.sensors import SUPPLY_PRESSURE, TANK_PRESSURE, VALVE_SIGNAL_PREFIX
 from crane.machine.machine import Machine
@@ -148,37 +147,23 @@ def replay(
     table = read_quantities(path, machine, columns, span)
     try:
         inputs = replay_inputs(machine, table)
-        drive = inputs.valve_drive(machine)
+        drive, time = inputs.valve_drive(machine), inputs.time
+        steps = int(time[-1] / step + 1e-9)
+        if steps < 1:
+            raise RecordingError(f"is shorter than a step of {step:g} s, shorten the step")
+        recording = simulate(
+            machine,
+            drive,
+            inputs.initial,
+            steps * step,
+            step,
+            label=Path(path).stem,
+            progress=progress,
+        )
+        names = recorded_columns(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(prefix_location(str(path), error)) from None
-    time, initial = inputs.time, inputs.initial
-    steps = int(time[-1] / step + 1e-9)
-    if steps < 1:
-        raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
-    recording = simulate(
-        machine, drive, initial, steps * step, step, label=Path(path).stem, progress=progress
-    )
-    try:
-        return recording, compare_channels(machine, table, recording)
-    except RecordingError as error:
-        raise RecordingError(prefix_location(str(path), error)) from None
-
-
-def compare_channels(machine: Machine, table: Table, recording: Recording) -> Comparison:
-    """Compare the channels of a measurement with those of a simulation, without the inputs.
-
-    Args:
-        machine: The simulated machine.
-        table: The measurement.
-        recording: The simulation from the same instant on.
-
-    Raises:
-        RecordingError: A channel of the file has the unit of another quantity.
-    """
-    time = table_column(table, TIME)
-    time = time - time[0]
     inside = time <= recording.time[-1] * (1 + 1e-12)
-    names = recorded_columns(machine, table, recording)
     channels = [
         ChannelComparison(
             name,
@@ -190,7 +175,7 @@ def compare_channels(machine: Machine, table: Table, recording: Recording) -> Co
             names, read_simulation(machine, recording, names).T, strict=True
         )
     ]
-    return Comparison(time[inside], tuple(channels), recording)
+    return recording, Comparison(time[inside], tuple(channels), recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,27 +220,21 @@ def replay_inputs(machine: Machine, table: Table) -> ReplayInputs:
         RecordingError: The table has no signals, or is malformed.
         InputError: The machine has no valves.
     """
-    joints = machine.hydraulics.joints if machine.hydraulics else ()
-    spools = tuple(machine.hydraulics.spools) if machine.hydraulics else ()
-    if not joints:
-        raise InputError(
-            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
-            "the machine file"
-        )
+    circuit = require_circuit(machine)
     time = table_column(table, TIME)
     time = time - time[0]
     if len(time) < 2:
         raise RecordingError("has one sample, give at least two")
     signals, pressures, missing = {}, {}, MissingMeasurements(machine, table)
     with missing.collect_errors():
-        signals = _spool_signals(machine, spools, table)
+        signals = _spool_signals(machine, tuple(circuit.spools), table)
     check_pressures(machine, table)
     supply, tank = (
         table_column(table, name, "Pa") if name in table.units else None
         for name in (SUPPLY_PRESSURE, TANK_PRESSURE)
     )
     with missing.collect_errors():
-        pressures = _initial_pressures(joints, table, time)
+        pressures = _initial_pressures(circuit.joints, table, time)
     table_with_angles = add_inclination_angles(machine, table)
     has_joint_motion = any(joint in table_with_angles.units for joint in machine.joints)
     if has_joint_motion:
