@@ -184,7 +184,19 @@ class ValveCylinderEquations:
             priority_share: Share of the inflow that priority valves leave.
         """
         float_share: Scalar = 0.0
-        flows = self._flows_between_chambers()
+        constants, (node_a, node_b) = self._constants, self.pressures_by_node
+        difference = self.pressures[0] - self.pressures[1]
+        flows = [Flow(node_a, node_b, constants["leakage"] * difference, "piston")]
+        if self._cylinder.cross_relief > 0:
+            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
+                excess = maximum(sign * difference - constants["cross_relief"], 0.0)
+                flows.append(Flow(source, target, constants["relief_gain"] * excess, "cross"))
+        if self.valve.regeneration > 0:
+            orifice = series_coefficient(
+                constants["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
+            )
+            rate = orifice * signed_square_root(maximum(-difference, 0.0))
+            flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
         if self.valve.float_from > 0:
             excess = -self._spool_positions[0] - self._constants["float_from"]
             float_share = clip(excess * self._constants["per_float"], 0.0, 1.0)
@@ -212,23 +224,6 @@ class ValveCylinderEquations:
             )
             return_node = (self.valve.return_a, self.valve.return_b)[side]
             flows.append(Flow(node, return_node, self._limit_outflow(outflow, side), "outlet"))
-        return flows
-
-    def _flows_between_chambers(self) -> list[Flow]:
-        """Leakage past the piston, cross relief, regeneration."""
-        constants, (node_a, node_b) = self._constants, self.pressures_by_node
-        difference = self.pressures[0] - self.pressures[1]
-        flows = [Flow(node_a, node_b, constants["leakage"] * difference, "piston")]
-        if self._cylinder.cross_relief > 0:
-            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
-                excess = maximum(sign * difference - constants["cross_relief"], 0.0)
-                flows.append(Flow(source, target, constants["relief_gain"] * excess, "cross"))
-        if self.valve.regeneration > 0:
-            orifice = series_coefficient(
-                constants["regeneration"] * self.inlet_openings[0], *self._outflow_restrictions(1)
-            )
-            rate = orifice * signed_square_root(maximum(-difference, 0.0))
-            flows.append(Flow(node_b, node_a, self._limit_outflow(rate, 1), "regeneration"))
         return flows
 
     def leak_and_relief_flows(self, tank: Scalar) -> list[Flow]:

@@ -295,23 +295,6 @@ def _initial_motion(
     ):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q_a, v_a = joint_motion(machine, table)
-    _warn_of_limits(machine, time, q_a)
-    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
-    # at rest until a valve moves, within bounds
-    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
-    fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
-    steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
-    states = []
-    for i, joint in enumerate(machine.active):
-        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
-        states.append(
-            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
-        )
-    return np.array([x for x, _ in states]), np.array([v for _, v in states])
-
-
-def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
-    """Warn of measured coordinates (N, n) outside of the limits."""
     span = machine.upper - machine.lower
     excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
     excess /= np.where(np.isfinite(span), span, 1.0)
@@ -324,8 +307,20 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 f"measured '{joint}' goes to {q_a[k, i]:.6g} {unit} at t = {time[k]:.4g} s, "
                 f"beyond its limit {limit:.6g} {unit}: look at the limits and the sensor's zero",
                 CraneWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
+    has_moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    # at rest until a valve moves, within bounds
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in has_moved)
+    fit_duration = max(_START_FIT_DURATION, float(time[min(_MIN_FIT_SAMPLES, len(time)) - 1]))
+    steady = time <= max(min(first, _MAX_REST_DURATION), fit_duration)
+    states = []
+    for i, joint in enumerate(machine.active):
+        has_velocity = joint + VELOCITY_SUFFIX in table.units or joint not in table.units
+        states.append(
+            _start_of_joint(time, q_a[:, i], v_a[:, i] if has_velocity else None, steady)
+        )
+    return np.array([x for x, _ in states]), np.array([v for _, v in states])
 
 
 def _start_of_joint(

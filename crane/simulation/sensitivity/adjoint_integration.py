@@ -112,21 +112,14 @@ class AdjointIntegrator:
                 if len(output_weights) > 1:
                     output_weights[-1] = 0.0  # it belongs to the next segment
                 adjoint = self._integrate_segment(nodes, adjoint, output_weights, MAX_REFINEMENTS)
-        return self._gradient_constants(adjoint)
-
-    def _gradient_constants(self, start: Array) -> SimulationConstants:
-        """The gradient by parts of the constants."""
         out = SimulationConstants(
-            *(np.zeros((len(start), part.shape[-1])) for part in self._nominal_constants)
+            *(np.zeros((sum_count, part.shape[-1])) for part in self._nominal_constants)
         )
-        every = np.split(
-            self._gradient,
-            np.cumsum([len(which) for which in self._variable_indices])[:-1],
-            axis=1,
-        )
+        ends = np.cumsum([len(which) for which in self._variable_indices])[:-1]
+        every = np.split(self._gradient, ends, axis=1)
         for part, which, found in zip(out[:4], self._variable_indices, every, strict=True):
             part[:, which] = found
-        return out._replace(initial_state=start)
+        return out._replace(initial_state=adjoint)
 
     def _integrate_segment(
         self, nodes: MotionNodes, adjoint: Array, output_weights: Array | None, depth: int

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import LayoutView
 from crane.common.errors import CraneWarning, InputError, suggest_names
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array
@@ -148,7 +147,15 @@ def gradient(
     )
     nominal_constants = directions.nominal_constants(motion.time)
     integrator = AdjointIntegrator(motion, names, nominal_constants, changes)
-    observed = _output_values(motion.chart.machine, recording, motion.parts, names)
+    simulated, columns, values = motion.chart.machine, recording.columns(), []
+    for name in names:
+        joint = name.removesuffix(VELOCITY_SUFFIX)
+        if name not in columns and joint in simulated.joints:  # the velocity of a passive joint
+            rows = simulated.closure.gamma(motion.parts.q)[:, simulated.joints.index(joint)]
+            values.append(np.einsum("ni,ni->n", rows, motion.parts.v_a))
+        else:
+            values.append(read_simulation(simulated, recording, [name])[:, 0])
+    observed = np.column_stack(values)
     total, weights = _functional_and_weights(functional, recording.time, observed)
     gradients = integrator.integrate_backward(weights.reshape(-1, *observed.shape))
     # no parameter changes the references of the controller
@@ -211,23 +218,3 @@ def _functional_and_weights(
     if not (np.isfinite(weights).all() and np.isfinite(total).all()):
         raise InputError("weights of outputs are not finite, look at the function")
     return total, weights
-
-
-def _output_values(
-    machine: Machine, recording: Recording, parts: LayoutView, outputs: Sequence[str]
-) -> Array:
-    """Values (N + 1, k) of the outputs, which may be velocities of passive joints."""
-    columns, found = recording.columns(), []
-    for name in outputs:
-        joint = name.removesuffix(VELOCITY_SUFFIX)
-        if name not in columns and joint in machine.joints:
-            found.append(
-                np.einsum(
-                    "ni,ni->n",
-                    machine.closure.gamma(parts.q)[:, machine.joints.index(joint)],
-                    parts.v_a,
-                )
-            )
-        else:
-            found.append(read_simulation(machine, recording, [name])[:, 0])
-    return np.column_stack(found)

@@ -69,18 +69,24 @@ def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, 
     Args:
         values: A and B (4 n + 1, m, m + p) at the nodes.
         lengths: (2 n,) of the steps, those of a pair equal [s].
-        sizes: See `step_maps`.
+        sizes: (m,) scales of the states for the solution of the equations.
 
     Returns:
         Maps of the first step, and of both steps, extrapolated.
     """
-    m, count = values.shape[1], len(lengths)
-    all_step_maps = np.concatenate(step_maps(*_stage_values(values, lengths), sizes), axis=2)
-    first, second, coarse = (
-        all_step_maps[:count:2],
-        all_step_maps[1:count:2],
-        all_step_maps[count:],
+    count, (stage_values, all_lengths) = len(lengths), _stage_values(values, lengths)
+    by_state, by_number = np.split(stage_values, [values.shape[1]], axis=-1)
+    step_count, stages, m, _ = by_state.shape
+    right = np.empty(stage_values.shape)
+    right[..., :m] = np.eye(m)
+    right[..., m:] = (
+        np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, all_lengths, by_number) / sizes[:, None]
     )
+    right = right.reshape(step_count, stages * m, stage_values.shape[-1])
+    matrix = _stage_matrix(by_state, all_lengths, sizes)
+    maps = np.linalg.solve(matrix, right)[:, -m:] * sizes[:, None]
+    maps[..., :m] /= sizes
+    first, second, coarse = maps[:count:2], maps[1:count:2], maps[count:]
     refined = second[..., :m] @ first
     refined[..., m:] += second[..., m:]
     return first, refined + (refined - coarse) / 15.0
@@ -93,8 +99,13 @@ def transposed_pair_maps(
 
     See `step_pair_maps`, with A (4 n + 1, m, m).
     """
-    count = len(lengths)
-    back, stages = transposed_step_maps(*_stage_values(by_state, lengths), sizes)
+    count, (stage_values, all_lengths) = len(lengths), _stage_values(by_state, lengths)
+    step_count, stage_count, m, _ = stage_values.shape
+    right = np.broadcast_to(np.eye(stage_count * m)[:, -m:], (step_count, stage_count * m, m))
+    matrix = _stage_matrix(stage_values, all_lengths, sizes)
+    solution = np.linalg.solve(np.swapaxes(matrix, 1, 2), right)
+    nu = solution.reshape(step_count, stage_count, m, m) / sizes[:, None] * sizes
+    back, stages = nu.sum(axis=1), np.einsum("ij,n,nimp->njmp", STAGE_WEIGHTS, all_lengths, nu)
     first, second = (TransposedMap(back[i:count:2], stages[i:count:2]) for i in range(2))
     refined_stages = np.concatenate(
         [
@@ -121,38 +132,6 @@ def _stage_values(values: Array, lengths: Array) -> tuple[Array, Array]:
 def _values_by_step(values: Array) -> Array:
     """Values (N, 3, .) at the stages of N steps, of those (2 N + 1, .) at their nodes."""
     return np.stack([values[i : len(values) - 2 + i : 2] for i in range(3)], axis=1)
-
-
-def step_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
-    """Phi (N, m, m) and Psi (N, m, p) of steps.
-
-    Args:
-        values: A and B (N, 3, m, m + p) at their stages.
-        lengths: (N,) [s].
-        sizes: (m,) scales of the states for the solution of the equations.
-    """
-    count, stages, m, width = values.shape
-    by_state, by_number, p = values[..., :m], values[..., m:], width - m
-    right = np.empty((count, stages, m, m + p))
-    right[..., :m] = np.eye(m)
-    right[..., m:] = (
-        np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, lengths, by_number) / sizes[:, None]
-    )
-    right = right.reshape(count, stages * m, m + p)
-    solution = (
-        np.linalg.solve(_stage_matrix(by_state, lengths, sizes), right)[:, -m:] * sizes[:, None]
-    )
-    solution[..., :m] /= sizes
-    return solution[..., :m].astype(np.float64), solution[..., m:].astype(np.float64)
-
-
-def transposed_step_maps(by_state: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
-    """Phi^T (N, m, m) of steps, and matrices (N, 3, m, m) that give mu_j of their stages."""
-    count, stages, m, _ = by_state.shape
-    right = np.broadcast_to(np.eye(stages * m)[:, -m:], (count, stages * m, m))
-    solution = np.linalg.solve(np.swapaxes(_stage_matrix(by_state, lengths, sizes), 1, 2), right)
-    nu = solution.astype(np.float64).reshape(count, stages, m, m) / sizes[:, None] * sizes
-    return nu.sum(axis=1), np.einsum("ij,n,nimp->njmp", STAGE_WEIGHTS, lengths, nu)
 
 
 def _stage_matrix(by_state: Array, lengths: Array, sizes: Array) -> Array:
