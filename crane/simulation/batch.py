@@ -175,4 +175,5 @@ def _stack_results(results: dict[int, _Result], failures: dict[int, str], count:
         for stack, part in zip(stacks, result[1:5], strict=True):
             stack[i] = part
     texts = {i: results[i][5] for i in sorted(results) if results[i][5]}
-    return Batch(first[0], *stacks, dict(sorted(failures.items())), texts)
+    q, v, tau, energy = stacks
+    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), texts)

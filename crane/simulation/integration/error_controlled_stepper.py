@@ -200,10 +200,8 @@ class ErrorControlledStepper(MachineCodeStepper):
             outputs = machine.outputs(with_joints_at_rest)
             if isinstance(self._control, ValveDrive):
                 outputs += self._control.channel_values(machine.inputs)
-            margin = machine.accelerations(with_joints_at_rest).transition_margin
-            program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
-            machine = self._trace_controlled_machine(Tape())
             rate, margin = machine.state_rate(with_joints_at_rest)
+            program.add_formula("observe" + suffix, 5, {"outputs": outputs, "margin": [margin]})
             closure = self._chart.machine.closure
             event_distances = machine.dynamics_formulas.end_stop_distances(
                 closure.units.tolist(), closure.characteristic_length
@@ -226,7 +224,8 @@ class ErrorControlledStepper(MachineCodeStepper):
             start = program.formula_outputs("rate").start_index("event_distances")
             signs = [copysign(1.0, x) for x in Tape().load_vector(0, start, count)]
             program.add_formula("event_signs", 1, signs)
-            tape, smallest = Tape(), 1.0
+            tape = Tape()
+            smallest: Scalar = 1.0
             pairs = tape.load_vector(0, start, count), tape.load_vector(1, 0, count)
             for distance, sign in zip(*pairs, strict=True):
                 smallest = minimum(smallest, distance * sign)

@@ -60,7 +60,7 @@ class StickSlipIntegrator(ABC):
     ):
         self.python_stepper = PythonStepper(chart, control, controller_state_count)
         self.done = self.next_instant = 0
-        self.offset = self._next_time = 0.0
+        self.offset = self._first = self._step = 0.0
         self._stick_slip, self._compiled_method = chart.stick_slip, compiled_method
         self._dynamics, self._transition_count, self._count_start_time = chart.dynamics, 0, -np.inf
 
@@ -88,19 +88,17 @@ class StickSlipIntegrator(ABC):
         Raises:
             IntegrationHaltError: A step fails, or the loops do not close.
         """
-        first = times[0] if len(times) else self._next_time
+        first = times[0] if len(times) else self._first + self._step * self.next_instant
+        self._first, self._step = first, step
         self.done = self.next_instant = 0
         self._prepare_modes(first + self.offset, state)
-        try:
-            while self.done < len(times) or self.offset < 0:
-                if not self._advance(first, times, state, step, rows, progress):
-                    break
-                if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
-                    self.offset = 0.0
-                if progress is not None:
-                    progress(self.done)
-        finally:
-            self._next_time = first + step * self.next_instant
+        while self.done < len(times) or self.offset < 0:
+            if not self._advance(first, times, state, step, rows, progress):
+                break
+            if not self.offset < -_TIME_TOLERANCE * step:  # within rounding errors
+                self.offset = 0.0
+            if progress is not None:
+                progress(self.done)
         return self.next_instant
 
     @abstractmethod

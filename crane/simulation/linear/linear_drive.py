@@ -213,7 +213,8 @@ class LinearizedDrive:
         output_units = [*control.channel_values(inputs), *(tau[i] for i in self._active_indices)]
         if friction := control.circuit_friction(inputs):
             # F_K sign(v); 0 for joints at rest
-            forces, friction_forces = JointForces(machine), [0.0] * n
+            forces = JointForces(machine)
+            friction_forces: list[Scalar] = [0.0] * n
             for column, force in zip(forces.circuit_friction_columns, friction, strict=True):
                 i, law = machine.active.index(machine.joints[column]), forces.table[column]
                 sign = friction_sign(law.tolist(), v_a[i], column in forces.sticking, False)

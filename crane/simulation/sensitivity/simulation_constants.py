@@ -162,7 +162,7 @@ class ParameterDirections:
             )
 
         out: dict[str, SimulationConstants] = {}
-        nominal = None
+        nominal, ignored_errors = None, InputError if names is None else ()
         for name in self._constant_derivatives.parameter_names if names is None else names:
             if name.startswith(START_PREFIX):
                 out[name] = self._start_derivative(name, times)
@@ -171,9 +171,7 @@ class ParameterDirections:
                 nominal = self._constant_derivatives.nominal_constants(flat)
             try:
                 derivative = self._constant_derivatives.derivative(name, flat, nominal)
-            except InputError:
-                if names is not None:
-                    raise
+            except ignored_errors:
                 continue
             if names is None and not derivative.any():
                 continue

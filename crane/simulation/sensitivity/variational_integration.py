@@ -77,14 +77,14 @@ def step_pair_maps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, 
     count, (stage_values, all_lengths) = len(lengths), _stage_values(values, lengths)
     by_state, by_number = np.split(stage_values, [values.shape[1]], axis=-1)
     step_count, stages, m, _ = by_state.shape
-    right = np.empty(stage_values.shape)
+    right = np.empty_like(stage_values)
     right[..., :m] = np.eye(m)
     right[..., m:] = (
         np.einsum("ij,n,njmp->nimp", STAGE_WEIGHTS, all_lengths, by_number) / sizes[:, None]
     )
-    right = right.reshape(step_count, stages * m, stage_values.shape[-1])
+    sides = right.reshape(step_count, stages * m, stage_values.shape[-1])
     matrix = _stage_matrix(by_state, all_lengths, sizes)
-    maps = np.linalg.solve(matrix, right)[:, -m:] * sizes[:, None]
+    maps = np.linalg.solve(matrix, sides)[:, -m:] * sizes[:, None]
     maps[..., :m] /= sizes
     first, second, coarse = maps[:count:2], maps[1:count:2], maps[count:]
     refined = second[..., :m] @ first
