@@ -406,8 +406,15 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
         if self._sampled_drive is not None:
             since = round(now / step) % self._period_in_steps
             chunk = chunk[: 0 if self.offset < 0 else self._period_in_steps - since]
-            if not since and not self.offset < 0:
-                self._update_command(self._sampled_drive, now, state)
+            at = self.python_stepper.state_layout.view(state)
+            try:
+                if not since and not self.offset < 0:
+                    v_a = self._chart.user_velocities(at.q, at.v_a)
+                    self._sampled_drive.update(now, at.q, v_a, at.controller)
+            except ClosureError as error:
+                raise IntegrationHaltError(
+                    now, self.python_stepper.user_coordinates(state), f": {error}"
+                ) from None
         count, self.offset = self._stepper.run(now, state, self.offset, step, chunk)
         self.done = self.next_instant = self.done + count
         time = first + step * self.done + self.offset
@@ -420,12 +427,3 @@ class ErrorControlledIntegrator(StickSlipIntegrator):
                 raise self.python_stepper.halt_error(time, state)
             return False
         return True
-
-    def _update_command(self, drive: ValveDrive, time: float, state: Array) -> None:
-        at = self.python_stepper.state_layout.view(state)
-        try:
-            drive.update(time, at.q, self._chart.user_velocities(at.q, at.v_a), at.controller)
-        except ClosureError as error:
-            raise IntegrationHaltError(
-                time, self.python_stepper.user_coordinates(state), f": {error}"
-            ) from None

@@ -101,8 +101,7 @@ class LinearizedDrive:
             for name in self.state_units
         ]
         spools = self._valve_drive.circuit.hydraulics.spools.values()
-        mask: Any = np.array([*initial_states, *(spool.joint in moving for spool in spools)])
-        return mask
+        return np.asarray([*initial_states, *(spool.joint in moving for spool in spools)])
 
     def load_bearing_mask(self, forces: Array) -> Any:
         """(k,) whether states are pressures of the chambers that carry forces (n,)."""

@@ -138,19 +138,15 @@ class Sensitivities(Result):
         for name, names in ((output, self.outputs), (parameter, self.parameters)):
             if name not in names:
                 raise InputError(f"'{name}' is not among them, {suggest_names(names, name)}")
-        found: Array = self.derivatives[
-            :, self.outputs.index(output), self.parameters.index(parameter)
-        ]
-        return found
+        index = self.outputs.index(output), self.parameters.index(parameter)
+        return np.asarray(self.derivatives[:, index[0], index[1]])
 
     @property
     def typical_changes(self) -> Array:
         """(p,) small changes: 1 % of parameters; 0.001 [SI] of zeros and initial values."""
         is_parameter = [not name.startswith(START_PREFIX) for name in self.parameters]
-        steps: Array = np.where(
-            is_parameter & (self.values != 0), 0.01 * np.abs(self.values), 1e-3
-        )
-        return steps
+        is_zero = ~np.array(is_parameter) | (self.values == 0)
+        return np.where(is_zero, 1e-3, 0.01 * np.abs(self.values))
 
     def unit(self, output: str) -> str:
         """SI unit of an output."""
