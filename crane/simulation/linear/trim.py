@@ -52,15 +52,15 @@ def find_trim(
                 f"{FORCE_UNITS[machine.unit(joint)]} would have to hold it: linearize where it "
                 "hangs still"
             )
-    if drive.state_units:
-        for shared in (True, False) if not v_a.any() else (True,):
-            trim = _trim_valves(_TrimEquations(dynamics, drive, q_a, v_a, external_forces, shared))
-            if trim is not None:
-                return trim
-        raise SimulationError(
-            "the machine cannot be trimmed there: no pressures and signals keep these velocities"
-        )
-    return drive.initial_states, forces[machine.is_driven]
+    if not drive.state_units:
+        return drive.initial_states, forces[machine.is_driven]
+    for shared in (True, False) if not v_a.any() else (True,):
+        trim = _trim_valves(_TrimEquations(dynamics, drive, q_a, v_a, external_forces, shared))
+        if trim is not None:
+            return trim
+    raise SimulationError(
+        "the machine cannot be trimmed there: no pressures and signals keep these velocities"
+    )
 
 
 class _TrimEquations:
