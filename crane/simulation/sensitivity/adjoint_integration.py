@@ -231,7 +231,7 @@ class AdjointIntegrator:
     def _gradients_at_nodes(
         self, nodes: MotionNodes, node_indices: Indices, weights: Array
     ) -> Array:
-        """See `ReverseDerivatives.against`, at some of the nodes."""
+        """See `ReverseDerivatives.gradients`, at some of the nodes."""
         numbers = self._motion.constants_at(self._nominal_constants, nodes)
         numbers = numbers._replace(references=numbers.references[node_indices])
         return self._reverse_derivatives.gradients(
@@ -282,7 +282,7 @@ class AdjointIntegrator:
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:
-        """Lambda before joints start or stop, from that behind; see `SimulatedMotion.leap`."""
+        """Lambda before joints start or stop, from that behind; see `SimulatedMotion.sensitivity_jump`."""
         track, nodes = self._motion, self._motion.nodes_at_transition(jump.transition)
         by_state, leap = track.sensitivity_jump(
             self._forward_derivatives, self._nominal_constants, jump
