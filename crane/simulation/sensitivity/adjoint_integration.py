@@ -282,7 +282,7 @@ class AdjointIntegrator:
         return rough
 
     def _apply_jump(self, jump: TransitionJump, adjoint: Array) -> Array:
-        """Lambda before joints start or stop, from that behind; see `SimulatedMotion.sensitivity_jump`."""
+        """Lambda before joints start or stop, from that behind; see `sensitivity_jump`."""
         track, nodes = self._motion, self._motion.nodes_at_transition(jump.transition)
         by_state, leap = track.sensitivity_jump(
             self._forward_derivatives, self._nominal_constants, jump

@@ -219,7 +219,7 @@ class VariationalIntegrator:
         return output_derivatives
 
     def _directional_derivatives(self, nodes: MotionNodes) -> tuple[Array, Array]:
-        """A and B, derivatives of outputs and margin; see `ForwardDerivatives.directional_derivatives`."""
+        """A and B, derivatives of outputs and margin; see `ForwardDerivatives`."""
         reference_changes = nodes.interpolate(self._directions.references)
         return self._forward_derivatives.directional_derivatives(
             self._motion.constants_at(self._nominal_constants, nodes),
@@ -274,7 +274,7 @@ class VariationalIntegrator:
         )
 
     def _apply_jump(self, jump: TransitionJump, sensitivity: Array) -> Array:
-        """S behind an instant at which joints start or stop; see `SimulatedMotion.sensitivity_jump`."""
+        """S behind an instant at which joints start or stop; see `sensitivity_jump`."""
         track, m, nodes = (
             self._motion,
             self._forward_derivatives.state_size,
