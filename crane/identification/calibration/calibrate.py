@@ -156,19 +156,17 @@ def calibrate(
             CalibrationProblem(machine, [*unknowns, *extras], cases), progress
         )
     estimate = estimate_with_profiles(search, len(problem.unknowns))
-    calibration = replace(
-        _calibration_result(problem, search, estimate, initial_residuals, units),
-        unobserved_parameters=tuple(excluded),
-    )
+    tests = []
     if not automatic:
         applicable_extras = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
-        calibration = replace(
-            calibration, score_tests=tuple(score_tests(search, applicable_extras, estimate.z))
-        )
+        tests = score_tests(search, applicable_extras, estimate.z)
+    found = _calibration_result(problem, search, estimate, initial_residuals, units)
     known = dict(machine.sensors) | dict(cases[0].known_sensors)
     return replace(
-        calibration,
-        machine=_machine_with_sensors(calibration.machine, known, columns, calibration.changes),
+        found,
+        machine=_machine_with_sensors(found.machine, known, columns, found.changes),
+        score_tests=tuple(tests),
+        unobserved_parameters=tuple(excluded),
     )
 
 

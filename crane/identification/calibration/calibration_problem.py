@@ -169,7 +169,6 @@ class CalibrationProblem:
     def _fitted_sensor(
         self, case: RecordingCase, name: str, values: Mapping[str, float]
     ) -> Sensor:
-        """Sensor with its fitted parameters."""
         known = case.known_sensors.get(name, Sensor())
         names = [f"{SENSOR_PREFIX}{name}.{what}" for what in SENSOR_PARAMETER_DEFAULTS]
         fitted = {x: values[x] for x in names if x in values}

@@ -73,6 +73,8 @@ class PulseSignals(ValveCommand):
         self._low, self._high = low, high
         self._joint_columns = [machine.column(joint) for joint in circuit.joints]
         valves = list(circuit.valves.values())
+        cylinders = [circuit.cylinders[joint] for joint in circuit.joints]
+        self._areas = np.array([(x.area_a, x.area_b) for x in cylinders])
         self._neutral = np.array([valve.neutral for valve in valves])
         self._signal_ranges = np.array([valve.full - valve.neutral for valve in valves])
         self._dead_bands = np.array([valve.dead_band for valve in valves])
@@ -104,14 +106,16 @@ class PulseSignals(ValveCommand):
         opening, share = self._plan[slot].T
         x = q[self._joint_columns]
         circuit = self._circuit
-        speeds = np.empty((len(x), 2))  # at full opening, forwards and backwards
-        for i, joint in enumerate(circuit.joints):
-            cylinder, valve = circuit.cylinders[joint], circuit.valves[joint]
-            force = cylinder.area_a * pressures[i][0] - cylinder.area_b * pressures[i][1]
-            speeds[i] = [
-                full_opening_speed(cylinder, valve, circuit.supply, force, side)
+        forces = (self._areas * pressures * [1.0, -1.0]).sum(axis=1)
+        speeds = np.array([  # at full opening, forwards and backwards
+            [
+                full_opening_speed(
+                    circuit.cylinders[joint], circuit.valves[joint], circuit.supply, force, side
+                )
                 for side in (False, True)
             ]
+            for joint, force in zip(circuit.joints, forces.tolist(), strict=True)
+        ])  # fmt: skip
         self._pulse_durations = share * self.period
         openings = np.array(
             [
@@ -119,7 +123,9 @@ class PulseSignals(ValveCommand):
                 for i, y in enumerate(opening)
             ]
         )
-        openings *= min(1.0, self._max_flow / max(self._pump_flow(openings, speeds), 1e-30))
+        sides = np.arange(len(openings)), (openings < 0).astype(int)
+        flow = (np.abs(openings) * speeds[sides] * self._areas[sides]).sum()
+        openings *= min(1.0, self._max_flow / max(flow, 1e-30))
         u = self._dead_bands + (1.0 - self._dead_bands) * np.abs(openings)
         return np.where(openings, np.copysign(u, openings), 0.0)
 
@@ -158,16 +164,6 @@ class PulseSignals(ValveCommand):
         dead = self._dead_bands[i]
         u = dead + (1.0 - dead) * opening
         return float(opening * (self._pulse_durations[i] - (u + dead) / self._rate))
-
-    def _pump_flow(self, openings: Array, speeds: Array) -> float:
-        """Demand of pump flow [m3/s]."""
-        total = 0.0
-        for y, speed, cylinder in zip(
-            openings, speeds, self._circuit.cylinders.values(), strict=True
-        ):
-            area = cylinder.area_b if y < 0 else cylinder.area_a
-            total += abs(y) * speed[int(y < 0)] * area
-        return total
 
 
 def full_opening_speed(

@@ -258,7 +258,6 @@ def _check_forces(
     equations: RegressionEquations,
     trust: bool,
 ) -> None:
-    """Check the forces of recordings against the model."""
     modelled, first = equations.compare(equations.base.values(model.nominal)).modelled, 0
     for motion, thinned in zip(motions, equations.thinned_motions(), strict=True):
         here = modelled[first : first + len(thinned.time)]
