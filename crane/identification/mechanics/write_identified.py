@@ -1,6 +1,5 @@
 """Writing of identified machines: machine file and URDF files with identified parameters."""
 
-import dataclasses
 import shutil
 import warnings
 from collections.abc import Mapping
@@ -28,6 +27,7 @@ from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base_parameters import random_samples
 from crane.identification.mechanics.identification_result import Identification
 from crane.identification.mechanics.identified_description import (
+    FRICTION_PARAMETERS,
     divide_locked_bodies,
     friction_laws,
     joint_combinations,
@@ -38,7 +38,6 @@ from crane.identification.mechanics.model_terms import BODY_PARAMETERS, Friction
 from crane.machine.machine import Machine
 
 _FORCE_TOLERANCE = 1e-9  # of the largest force, for the check of the written machine
-_FRICTION_PARAMETERS = tuple(item.name for item in dataclasses.fields(Friction))
 
 
 def write_identified(identification: Identification, folder: str | Path) -> Path:
@@ -304,7 +303,7 @@ def _check_written_machine(
     force_differences = np.abs(written_forces - expected_forces).max(axis=0)
     if force_differences.max() <= _FORCE_TOLERANCE * np.abs(expected_forces).max():
         return
-    kinds = {*_FRICTION_PARAMETERS, "gas_scale", "rotor_inertia", *BODY_PARAMETERS}
+    kinds = {*FRICTION_PARAMETERS, "gas_scale", "rotor_inertia", *BODY_PARAMETERS}
     others = [name for name in model.names if name.rpartition(".")[2] not in kinds]
     what = f"'{others[0]}'" if others else "friction over other velocities than the machine's"
     raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")
