@@ -268,21 +268,22 @@ class CalibrationProblem:
 
         motion = SimulationProblem(dynamics, drive, initial, steps, step)
         with warnings.catch_warnings(action="ignore"):
-            solution = integrate_sensitivities(
+            run_motion, derivatives = integrate_sensitivities(
                 motion,
                 case.sensors,
                 setup,
                 np.ones(len(simulated_unknowns)),
                 self.derivative_tolerance,
             )
-            run = recording_of(machine, drive, solution.time, solution.parts, "")
-        curve = CubicSpline(solution.time, read_simulation(machine, run, case.sensors))
+            run_time = run_motion.time[::2]
+            run = recording_of(machine, drive, run_time, run_motion.parts, "")
+        curve = CubicSpline(run_time, read_simulation(machine, run, case.sensors))
         readings, sensor_derivatives = self._sensor_readings(case, curve, z)
         jacobian = np.zeros((*readings.shape, self.unknown_count))
-        sensitivity_curve = CubicSpline(solution.time, solution.derivatives)
+        sensitivity_curve = CubicSpline(run_time, derivatives)
         for k, name in enumerate(case.sensors):
             sensor = self._fitted_sensor(case, name, self.values(z))
-            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, solution.time[-1])
+            delayed_time = np.clip(case.inputs.time - sensor.delay, 0.0, run_time[-1])
             jacobian[:, k, simulated_unknowns] = (
                 sensor.scale * sensitivity_curve(delayed_time)[:, k]
             )

@@ -14,8 +14,8 @@ from crane.identification.signals.signal_processing import (
 )
 from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
-from crane.recordings.missing_measurements import check_columns_present
 from crane.recordings.recording import Recording
+from crane.recordings.timeseries import check_columns_present
 
 _STROKE_TOLERANCE = 1e-3  # of the stroke, for noise beyond its ends
 _NOISE_SHARE = 0.03  # of the fastest speed; noise above it is smoothed

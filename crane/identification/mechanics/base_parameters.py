@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.closure.constraint_structure import Indices
+from crane.closure.coordinates import Indices
 from crane.common.errors import ClosureError, InputError
 from crane.common.one_line_repr import OneLineRepr
 from crane.common.samples import Array

@@ -28,7 +28,7 @@ from crane.identification.signals.signal_quality import (
 from crane.machine.machine import Machine
 from crane.recordings.measured_recordings import locked_joint_conflicts
 from crane.recordings.recording import FORCE_SUFFIX, VELOCITY_SUFFIX, VELOCITY_UNITS, Recording
-from crane.recordings.recording_columns import time_derivative
+from crane.recordings.timeseries import time_derivative
 
 _MOTION_FACTOR = 3.0  # standard deviations of a velocity, above which a joint moves
 # times the velocity limit of a joint, above which a recording is rejected
