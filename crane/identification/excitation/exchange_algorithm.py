@@ -257,10 +257,8 @@ class ExchangeAlgorithm:
             trial_plan = self._random_plan(rng)
             if plan is not None and trial >= random_trial_count:
                 trial_plan = self._exchange_slot(plan, trial_plan, rng)
-            if (run := self._simulate_within_limits(trial_plan)) is not None:
-                cost = self._cost(run)
-                if cost < lowest_cost and (unsmoothed_run := self._verified_run(run)) is not None:
-                    plan, best, lowest_cost = trial_plan, unsmoothed_run, cost
+            if (found := self._improved_run(trial_plan, lowest_cost)) is not None:
+                plan, (best, lowest_cost) = trial_plan, found
             if progress is not None:
                 progress((trial + 1) / trials)
         if best is None:
@@ -311,37 +309,30 @@ class ExchangeAlgorithm:
         )
         return replay_signals(machine, simulated_run)
 
-    def _simulate_within_limits(self, plan: Array) -> Recording | None:
-        """Run of a plan, None if it exceeds the limits."""
+    def _improved_run(self, plan: Array, lowest_cost: float) -> tuple[Recording, float] | None:
+        """Run without smoothed friction, and its cost.
+
+        None if the cost is not lower, or if the run, that with smoothed friction or perturbed
+        machines exceed the limits.
+        """
+        limits = self._limits
         try:
             run = self._simulate_plan(plan)
-        except CraneError as error:
-            self._rejection_reason = str(error)
-            return None
-        if reason := self._limits.exceeded_limit(run):
-            self._rejection_reason = f"for {reason}"
-            return None
-        return run
-
-    def _cost(self, run: Recording) -> float:
-        try:
+            if reason := limits.exceeded_limit(run):
+                self._rejection_reason = f"for {reason}"
+                return None
             rows = self._information.information_root(run, estimate_start=False)
-        except CraneError as error:
-            self._rejection_reason = str(error)
-            return np.inf
-        singular_values = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
-        return float(self._criterion(singular_values))
-
-    def _verified_run(self, run: Recording) -> Recording | None:
-        """Run without smoothed friction, None if it or perturbed machines exceed the limits."""
-        try:
+            singular_values = np.asarray(np.linalg.svd(rows, compute_uv=False), dtype=np.float64)
+            cost = float(self._criterion(singular_values))
+            if not cost < lowest_cost:
+                return None
             unsmoothed_run = replay_signals(self._information.machine, run)
-            stroke_margins = self._limits.worst_case_stroke_margins(run)
+            stroke_margins = limits.worst_case_stroke_margins(run)
         except CraneError as error:
             self._rejection_reason = str(error)
             return None
-        reason = self._limits.exceeded_limit(unsmoothed_run)
+        reason = limits.exceeded_limit(unsmoothed_run)
         if not reason and stroke_margins.min() <= 0:
             reason = "a stroke with deviating parameters"
         self._rejection_reason = f"for {reason}"
-        return None if reason else unsmoothed_run
+        return None if reason else (unsmoothed_run, cost)
