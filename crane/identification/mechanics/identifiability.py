@@ -181,8 +181,9 @@ def prior_from_names(
             where, _, kind = model.names[i].rpartition(".")
             law = model.machine.friction.get(where) if kind.endswith("_offset") else None
             reference = abs(mean[i]) or float(getattr(law, kind.removesuffix("_offset"), 0.0))
-            size = what.std * (reference if what.relative else 1.0)
-            std[i] = size or (parameter_sizes[i] or 1.0)
+            std[i] = (what.std * (reference if what.relative else 1.0)) or (
+                parameter_sizes[i] or 1.0
+            )
         place = name.rpartition(".")[0]
         if not bodies and not others and not fnmatch.filter(model.machine.locked_joints, place):
             check_name(name, (*model.bodies, *model.names[count:]), f"prior '{name}' is unknown")

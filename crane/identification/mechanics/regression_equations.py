@@ -204,8 +204,7 @@ class RegressionEquations:
 
     def _sides(self, at: MotionSamples) -> tuple[Array, Array]:
         """W (N, n, r) and known forces (N, n)."""
-        W = self._model.regressor(at)[:, :, self.base.independent]
-        return W, self._model.known_forces(at)
+        return self._model.regressor(at)[:, :, self.base.independent], self._model.known_forces(at)
 
     def _free_joint_rows(self, samples: MotionSamples, values: Array) -> tuple[Array, Array]:
         """W (N, n, r) and known forces (N, n) with rows of free joints at parameters b.

@@ -102,8 +102,7 @@ def smoothed_motion(
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
     is_moving = np.ones(n, dtype=bool)  # by more than the uncertainty of the velocity
     if found.std_v is not None:
-        uncertainty = np.sqrt(np.mean(found.std_v**2, axis=0))
-        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * uncertainty
+        is_moving = found.v.std(axis=0) > _MOTION_FACTOR * np.sqrt(np.mean(found.std_v**2, axis=0))
     v, a = np.where(is_moving, (found.v, found.a), 0.0)
     _check_speeds(machine, v, trust)
     # static friction makes any force
