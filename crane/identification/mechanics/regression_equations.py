@@ -129,9 +129,13 @@ class RegressionEquations:
         self.samples = instant.astype(np.int32)
         used_joints = np.cumsum(self.is_moving.any(axis=0)) - 1
         self.groups = used_joints.astype(np.int8)[joint]
-        self.time = _concatenate_times(
-            [part.motion.time[:: part.thinning] for part in self._filtered_motions]
-        )
+        times: list[Array] = []  # shifted to follow each other
+        end = 0.0
+        for part in self._filtered_motions:
+            time = part.motion.time[:: part.thinning]
+            times.append(time if not times else end + (time - time[0]) + (time[1] - time[0]))
+            end = times[-1][-1]
+        self.time = np.concatenate(times)
         self.forces, self.offset = np.empty((2, *self.is_moving.shape))
         wanted = _BLOCK_BYTES // (8 * len(model.names) * len(model.machine.active))
         self._blocks, first = list[_EquationBlock](), 0
@@ -354,14 +358,6 @@ class RegressionEquations:
 def is_long_enough(motion: Motion, bandwidth: float) -> bool:
     """Whether a motion is long enough for a low-pass [Hz]."""
     return bandwidth * float(motion.time[-1] - motion.time[0]) >= _MIN_PERIODS
-
-
-def _concatenate_times(times: Sequence[Array]) -> Array:
-    """Instants of motions, shifted to follow each other."""
-    out = [times[0]]
-    for time in times[1:]:
-        out.append(out[-1][-1] + (time - time[0]) + (time[1] - time[0]))
-    return np.concatenate(out)
 
 
 class ProjectedRegressor:
