@@ -263,12 +263,7 @@ def check_identifiable(names: Sequence[str], W: Array, prior: Prior) -> None:
     if rank == len(unknown_columns):
         return
     # the null space shows the dependent parameters
-    square = triangle[:rank, :rank]
-    rest = (
-        np.linalg.solve(square, triangle[:rank, rank:])
-        if rank
-        else np.zeros((0, len(unknown_columns)))
-    )
+    rest = np.linalg.solve(triangle[:rank, :rank], triangle[:rank, rank:])
     shares = np.concatenate([np.abs(rest).max(axis=1), np.ones(len(unknown_columns) - rank)])
     undetermined = sorted(unknown_columns[pivots[shares > 1e-6]])
     listed = ", ".join(names[i] for i in undetermined[:_MAX_LISTED]) + ", ..." * (

@@ -2,7 +2,7 @@
 
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +79,10 @@ def write_identified(identification: Identification, folder: str | Path) -> Path
         spec = read_machine_spec(machine.path)
         unlocked_machine = load(machine.path) if machine.locked_joints else machine
     bodies = divide_locked_bodies(machine, parameters, unlocked_machine)
-    names = _file_names(spec)
+    chains = spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
+    names = _file_names(chains)
     file = f"{machine.path.stem}.yaml"
-    originals = {machine.path, *(chain.urdf for chain in _written_chains(spec))}
+    originals = {machine.path, *(chain.urdf for chain in chains)}
     for name in (file, *names.values()):
         if (target := (Path(folder) / name).resolve()) in originals:
             raise OutputError(
@@ -151,18 +152,13 @@ def _infeasible_body(bodies: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _file_names(spec: MachineSpec) -> dict[str, str]:
+def _file_names(chains: Sequence[Chain]) -> dict[str, str]:
     """File name of each chain; a number distinguishes equal names."""
     taken: dict[str, str] = {}
-    for number, chain in enumerate(_written_chains(spec)):
+    for number, chain in enumerate(chains):
         name = chain.urdf.name
         taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
     return taken
-
-
-def _written_chains(spec: MachineSpec) -> tuple[Chain, ...]:
-    """The chains, with that of the payload of the machine file."""
-    return spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
 
 
 def _fixed_links(spec: MachineSpec) -> set[str]:
