@@ -93,11 +93,10 @@ def weak_directions(
             break
         largest = np.argsort(-np.abs(vector))[:_MAX_NAMED]
         sign = np.sign(vector[largest[0]])
+        named = [i for i in largest[1:] if abs(vector[i]) >= _MIN_NAMED_SHARE]
         words = ""
-        for i in largest:
+        for i in (largest[0], *named):
             share = float(sign * vector[i])
-            if words and abs(share) < _MIN_NAMED_SHARE:
-                break
             words += f" {'-' if share < 0 else '+'} {abs(share):.2f} {names[i]}"
         found.append((float(np.sqrt(value)), words.removeprefix(" + ")))
     return found

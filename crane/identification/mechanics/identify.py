@@ -320,15 +320,15 @@ def prepare_motions(
         raise InputError("no recording is given, give at least one")
     motions = []
     for number, one in enumerate(sources, start=1):
+        which = f"{role or 'recording'} {number} of {len(sources)}: "
+        if isinstance(one, Motion):
+            motions.append(one)
+            continue
         try:
-            if not isinstance(one, Motion):
-                one = smoothed_motion(machine, one, trust=trust, progress=progress)
+            motions.append(smoothed_motion(machine, one, trust=trust, progress=progress))
         except RecordingError as error:
-            if not role and len(sources) == 1:
-                raise
-            which = f"{role or 'recording'} {number} of {len(sources)}"
-            raise RecordingError(f"{which}: {error}") from None
-        motions.append(one)
+            is_only = not role and len(sources) == 1
+            raise RecordingError(str(error) if is_only else f"{which}{error}") from None
     return motions
 
 

@@ -156,11 +156,9 @@ class RegressionEquations:
             W = self._block_cache.get(number)
             if W is None:
                 W = self._compute_block(number)
-                if (
-                    sum(one.nbytes for one in self._block_cache.values()) + W.nbytes
-                    <= _CACHE_BYTES
-                ):
-                    self._block_cache[number] = W
+            cached_bytes = sum(one.nbytes for one in self._block_cache.values())
+            if cached_bytes + W.nbytes <= _CACHE_BYTES:
+                self._block_cache[number] = W
             if self._progress is not None:
                 self._progress((done + 1) / len(self._blocks))
             yield self._blocks[number].instants, W
