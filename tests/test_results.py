@@ -7,8 +7,8 @@ from writing_commands import read
 import crane
 from crane.common.errors import OutputError
 from crane.common.result import Result
+from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.orifice_coefficients import OrificeCoefficients
-from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.recordings.measured_recordings import read_run
 from crane.simulation.linear.linearization import linear_models

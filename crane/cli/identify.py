@@ -375,7 +375,7 @@ def circuit(
 
     The recordings have valve signals and pressures. Bulk modulus is estimated with the orifices.
     """
-    from crane.identification.hydraulics.cylinder_signals import required_channels
+    from crane.identification.hydraulics.cylinder_equations import required_channels
 
     check_name(model, _CIRCUIT_MODELS, f"model '{model}' is unknown")
     if model != "orifices":

@@ -88,11 +88,6 @@ class CalibrationProblem:
             found |= unknown.changes(value)
         return found
 
-    def fitted_machine(self, z: Array) -> Machine:
-        """The machine and its sensors with the changed parameters."""
-        with warnings.catch_warnings(action="ignore"):
-            return self._variants.machine(self.changes(z))
-
     def simulated_machine(self, z: Array, friction_smoothing: float) -> Machine:
         """The machine for simulation, with changed parameters and smoothed friction."""
         changes = {
@@ -169,7 +164,6 @@ class CalibrationProblem:
     def _fitted_sensor(
         self, case: RecordingCase, name: str, values: Mapping[str, float]
     ) -> Sensor:
-        """Sensor with its fitted parameters."""
         known = case.known_sensors.get(name, Sensor())
         names = [f"{SENSOR_PREFIX}{name}.{what}" for what in SENSOR_PARAMETER_DEFAULTS]
         fitted = {x: values[x] for x in names if x in values}

@@ -11,8 +11,8 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.identification.excitation.periodic_excitation import Excitation
 from crane.identification.excitation.signal_excitation import SignalExcitation
+from crane.identification.hydraulics.cylinder_equations import EquationSides
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
-from crane.identification.hydraulics.orifice_equations import EquationSides
 from crane.identification.hydraulics.valve_curve import ValveCurve
 from crane.identification.mechanics.force_comparison import ForceComparison
 from crane.identification.mechanics.identification_result import Identification
