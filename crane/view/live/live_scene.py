@@ -43,7 +43,6 @@ class LiveScene:
         ]
         for index, visual in enumerate(visuals):
             _add_shape(server.scene, f"/machine/{visual.link}/{index}", visual)
-        self._tip: Any = None
         if session.machine.tip is not None:
             self._links.append(session.machine.tip)
             self._frames.append(server.scene.add_frame("/tip", show_axes=False))

@@ -257,8 +257,8 @@ def _correlation_section(result: Identification) -> str:
 
 def _unobservable_section(result: Identification) -> str:
     base = result.base
-    effects = zip(base.names, base.grouping.any(axis=0), strict=True)
-    unexcited = [x for x, is_seen in effects if not is_seen and x not in base.unobservable]
+    effects = zip(base.names, base.grouping.T, strict=True)
+    unexcited = [x for x, column in effects if not column.any() and x not in base.unobservable]
     parts = [
         f"<p>{explanation}: {', '.join(f'<code>{escape(name)}</code>' for name in names)}.</p>"
         for names, explanation in (

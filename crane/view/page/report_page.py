@@ -273,12 +273,12 @@ def summarize_run(machine: Machine, recording: Recording | None) -> dict[str, An
             text += f", {_format_quantity(returned_work, 'J')} returned"
         facts.append(("work of the actuators", text))
     channels = recording.channels
-    for name, label in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
+    for name, text in (("dissipated", "friction losses"), ("pump_work", "work of the pump")):
         if count < 2 or recording.channel_units.get(name) != "J":
             continue
         change = float(channels[name][-1] - channels[name][0])
         if _format_number(change) != "0":
-            facts.append((label, _format_quantity(change, "J")))
+            facts.append((text, _format_quantity(change, "J")))
     if count > 1 and summary.balance_text:
         facts.append(("energy balance", summary.balance_text.replace("-", "\u2212")))
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:

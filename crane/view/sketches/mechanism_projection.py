@@ -92,7 +92,7 @@ class _MechanismProjection:
         ground = [
             (at, np.array([0.0, -1.0])) for at in _distinct_points(self.points[0], self.size)
         ]
-        if self._has_base():
+        if collars and self._has_base():
             base_point, collar = self.outer[0][0], collars[0]
             ground = [item for item in ground if np.abs(item[0] - collar.position).max() > 0]
             position = self.origins[1]
@@ -126,12 +126,11 @@ class _MechanismProjection:
         return outer_points
 
     def _has_base(self) -> bool:
-        """Return whether the first joint is revolute about an axis through the world's origin."""
+        """Return whether the first joint axis goes through the world's origin."""
         first, axis = self.origins[1], self.axes[1]
         tolerance = COINCIDENCE_TOLERANCE * self.machine.closure.characteristic_length
         return bool(
-            self.turns[1]
-            and self.axis_cosines[1] < _MIN_PIN_COSINE
+            self.axis_cosines[1] < _MIN_PIN_COSINE
             and np.linalg.norm(first - (first @ axis) * axis) < tolerance
         )
 

@@ -89,18 +89,18 @@ class SketchCanvas:
         self, position: Array, down_direction: Array, ground_gap: float | None
     ) -> None:
         """Draw the ground: a support under a pin, or a hatched line below a point [points]."""
-        lateral = self.point_size * np.array([-down_direction[1], down_direction[0]])
+        lateral = np.array([-down_direction[1], down_direction[0]])
         gap = 11.0 if ground_gap is None else ground_gap
         ground_point = position + gap * self.point_size * down_direction
         if ground_gap is None:
-            support = np.array([position, ground_point - 7 * lateral, ground_point + 7 * lateral])
+            width = 7 * self.point_size * lateral
+            support = np.array([position, ground_point - width, ground_point + width])
             self.axes.add_patch(
                 Polygon(support, facecolor="white", edgecolor=INK_COLOUR, linewidth=1.2, zorder=2)
             )
             self.occupied_segments += [support[[0, 1]], support[[0, 2]]]
-        self.draw_hatching(
-            ground_point - 15 * lateral, ground_point + 15 * lateral, down_direction
-        )
+        half_length = 15 * self.point_size * lateral
+        self.draw_hatching(ground_point - half_length, ground_point + half_length, down_direction)
 
     def draw_hatching(self, start: Array, end: Array, down_direction: Array) -> None:
         """Draw a line from start to end [m], hatched on the side of a unit vector."""
@@ -271,7 +271,7 @@ def create_sketch_layout(
 
 def _mechanism_bounds(mechanism: SketchMechanism) -> tuple[Array, Array]:
     """Return the lower and upper corner (2,) of all points [m]."""
-    points = [item.position for item in (*mechanism.pins, *mechanism.collars)]
+    points = [x.position for x in mechanism.pins] + [x.position for x in mechanism.collars]
     points += [end for x in mechanism.slides for end in (x.start, x.mouth, x.rod_outer_end)]
     points += [corner for body in mechanism.bodies for corner in body.points]
     points += [position for position, _ in mechanism.ground]
