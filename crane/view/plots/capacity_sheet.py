@@ -144,11 +144,20 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
     right_edges = (
         first_column + width * (1 + np.arange(len(rows[0]))) - 0.08
     )  # right ends of columns
-    top = bottom + _LINE_HEIGHT * (len(rows) + (2 if any(names) else 1))
     for i, (height, row) in enumerate(zip(table.heights, rows, strict=True)):
         y = bottom + _LINE_HEIGHT * (len(rows) - 1 - i)
         if i % 2 == 0:
-            _draw_row_band(figure, y - 0.045, first_column + width * len(row))
+            band = Rectangle(
+                (_PAGE_MARGIN / _PAGE_WIDTH, (y - 0.045) / _PAGE_HEIGHT),
+                (first_column + width * len(row) - _PAGE_MARGIN) / _PAGE_WIDTH,
+                _LINE_HEIGHT / _PAGE_HEIGHT,
+                facecolor=FAINT_COLOUR,
+                alpha=0.45,
+                transform=figure.transFigure,
+                linewidth=0,
+                zorder=-1,
+            )
+            figure.add_artist(band)
         _write_text(
             figure,
             _PAGE_MARGIN + 0.5,
@@ -187,20 +196,4 @@ def _draw_table(figure: Figure, chart: Capacity, table: LoadTable, bottom: float
             fontweight="bold",
         )
     _write_text(figure, right_edges[-1], y, "at [m]", size=size, ha="right", fontweight="bold")
-    return top
-
-
-def _draw_row_band(figure: Figure, y: float, right: float) -> None:
-    """Draw a tinted band behind a row."""
-    figure.add_artist(
-        Rectangle(
-            (_PAGE_MARGIN / _PAGE_WIDTH, y / _PAGE_HEIGHT),
-            (right - _PAGE_MARGIN) / _PAGE_WIDTH,
-            _LINE_HEIGHT / _PAGE_HEIGHT,
-            facecolor=FAINT_COLOUR,
-            alpha=0.45,
-            transform=figure.transFigure,
-            linewidth=0,
-            zorder=-1,
-        )
-    )
+    return y + _LINE_HEIGHT

@@ -249,7 +249,7 @@ def design_figure(result: Design) -> Figure:
         axes[0].plot(
             *np.array([x.objectives[:2] for x in result.solutions]).T,
             "o",
-            linestyle=DASHED_STYLE,
+            linestyle=DASHED_STYLE["linestyle"],
             color=RECORDED_COLOUR,
             markersize=5,
             linewidth=1.0,

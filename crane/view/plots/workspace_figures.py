@@ -86,14 +86,9 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
 
 def _draw_section(axes: Axes, reachable_space: Workspace, skeleton: Array, points: Array) -> None:
     if reachable_space.area:
-        raster = reachable_space.raster
-        covered = raster.fill_cracks(2 if reachable_space.is_complete else 6)
-        axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
+        _draw_region(axes, reachable_space, 1.1)
         lines = _grid_images(reachable_space)
         axes.add_collection(LineCollection(lines, colors=_GRID_COLOUR, linewidths=0.6, zorder=2))
-        axes.contour(
-            raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=1.1, zorder=3
-        )
     else:
         stroke = reachable_space.machine.active.index(reachable_space.strokes[0])
         path = reachable_space.section_positions[np.argsort(reachable_space.q_a[:, stroke])]
@@ -256,6 +251,7 @@ def _add_caption(figure: Figure, reachable_space: Workspace) -> None:
 
 
 _SOIL_COLOUR, _LINE_COLOUR = "#8a6d4b", "#666666"
+_VERTICAL_WORDS = ("depth", "height")
 _LINE_GAP_SHARE = 0.055  # between dimension lines, of the drawing's larger extent
 
 
@@ -275,7 +271,10 @@ def working_range_figure(result: WorkingRange) -> Figure:
     gap = _LINE_GAP_SHARE * float((upper - lower).max())
     figure = Figure(figsize=(9.6, 6.8), layout="constrained")
     axes = figure.subplots()
-    _draw_reach(axes, reach, skeleton)
+    _draw_region(axes, reach, 1.2)
+    for line in skeleton:
+        axes.plot(*line.T, color=INK_COLOUR, linewidth=1.6, solid_capstyle="round", zorder=5)
+    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5)
     letters = dict(zip(string.ascii_uppercase, result.dimensions, strict=False))
     right = _draw_vertical_lines(axes, letters, result.ground_height, max(upper[0], 0.0), gap)
     axes.plot(
@@ -283,7 +282,11 @@ def working_range_figure(result: WorkingRange) -> Figure:
         zorder=4,
     )  # fmt: skip
     bottom, top = _draw_horizontal_lines(axes, letters, lower[1], upper[1], gap)
-    _draw_level_bottom(axes, result)
+    for dimension in result.dimensions:
+        if "level bottom" in dimension.name:
+            u, w = dimension.section_position
+            style: Any = {"color": DASHED_STYLE["color"], "linewidth": 1.8, "zorder": 6}
+            axes.plot([u, u + result.level_length], [w, w], **style)
     names = reach.section.coordinate_names
     axes.set(xlim=(lower[0] - gap, right), ylim=(bottom, top), aspect="equal",
              xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]")  # fmt: skip
@@ -296,73 +299,51 @@ def working_range_figure(result: WorkingRange) -> Figure:
     return figure
 
 
-def _draw_reach(axes: Axes, reach: Workspace, skeleton: Array) -> None:
+def _draw_region(axes: Axes, reach: Workspace, line_width: float) -> None:
+    """Draw the region of the section that is reached, with its border."""
     raster = reach.raster
     covered = raster.fill_cracks(2 if reach.is_complete else 6)
     axes.contourf(raster.u, raster.w, covered, [0.5, 1.5], colors=[_REGION_COLOUR], zorder=1)
-    axes.contour(
-        raster.u, raster.w, covered, [0.5], colors=[RECORDED_COLOUR], linewidths=1.2, zorder=3
-    )
-    for line in skeleton:
-        axes.plot(*line.T, color=INK_COLOUR, linewidth=1.6, solid_capstyle="round", zorder=5)
-    axes.plot(*skeleton.reshape(-1, 2).T, "o", ms=2.6, color=INK_COLOUR, zorder=5)
-
-
-def _is_vertical(dimension: Dimension) -> bool:
-    return any(word in dimension.name for word in ("depth", "height"))
+    style: Any = {"colors": [RECORDED_COLOUR], "linewidths": line_width, "zorder": 3}
+    axes.contour(raster.u, raster.w, covered, [0.5], **style)
 
 
 def _draw_vertical_lines(
     axes: Axes, letters: Mapping[str, Dimension], ground: float, right: float, gap: float
 ) -> float:
-    """Draw lines on the right of the reach, and return the right end of the drawing."""
-    columns = _dimension_columns({a: x for a, x in letters.items() if _is_vertical(x)}, ground)
-    for k, column in enumerate(columns):
-        u = right + gap * (k + 1)
-        for letter, dimension in column:
+    """Draw lines on the right of the reach, and return the right end of the drawing.
+
+    Dimensions above and below ground share a line, the shortest first.
+    """
+    counts = {False: 0, True: 0}
+    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
+        if any(word in dimension.name for word in _VERTICAL_WORDS):
             position = dimension.section_position
+            is_above = bool(position[1] > ground)
+            counts[is_above] += 1
+            u = right + gap * counts[is_above]
             _draw_dimension_line(axes, letter, (u, ground), (u, position[1]), position)
-    return right + gap * (len(columns) + 0.7)
+    return right + gap * (max(counts.values()) + 0.7)
 
 
 def _draw_horizontal_lines(
     axes: Axes, letters: Mapping[str, Dimension], bottom: float, top: float, gap: float
 ) -> tuple[float, float]:
     """Draw lines below and above the reach, and return the vertical limits of the drawing."""
-    horizontal = {a: x for a, x in letters.items() if not _is_vertical(x)}
-    heights = [bottom, top]
-    for is_above, edge, direction in ((False, bottom, -1.0), (True, top, 1.0)):
-        items = [(a, x) for a, x in horizontal.items() if ("slewing" in x.name) == is_above]
-        for k, (letter, dimension) in enumerate(sorted(items, key=lambda item: item[1].value)):
-            w, position = edge + direction * gap * (k + 1), dimension.section_position
+    heights = {False: bottom, True: top}
+    has_lines = False
+    for letter, dimension in sorted(letters.items(), key=lambda item: item[1].value):
+        if not any(word in dimension.name for word in _VERTICAL_WORDS):
+            is_above, position = "slewing" in dimension.name, dimension.section_position
+            has_lines = True
+            heights[is_above] += gap if is_above else -gap
+            w = heights[is_above]
             _draw_dimension_line(axes, letter, (0.0, w), (position[0], w), position)
-            heights.append(w)
-    limits = min(heights) - gap, max(heights) + gap
-    if horizontal:
+    limits = heights[False] - gap, heights[True] + gap
+    if has_lines:
         style: Any = {"color": _LINE_COLOUR, "linewidth": 0.8, "linestyle": (0, (8, 2, 1, 2))}
         axes.plot([0, 0], limits, zorder=2, **style)
     return limits
-
-
-def _dimension_columns(
-    vertical: dict[str, Dimension], ground_height: float
-) -> list[list[tuple[str, Dimension]]]:
-    """Return pairs of dimensions above and below ground that share a line, shortest first."""
-    sides = [
-        sorted(
-            (
-                item
-                for item in vertical.items()
-                if (item[1].section_position[1] > ground_height) == is_above
-            ),
-            key=lambda item: item[1].value,
-        )
-        for is_above in (False, True)
-    ]
-    return [
-        [side[k] for side in sides if k < len(side)]
-        for k in range(max(len(side) for side in sides))
-    ]
 
 
 def _draw_dimension_line(
@@ -390,19 +371,3 @@ def _draw_dimension_line(
         letter, middle, ha="center", va="center", fontsize=9, fontweight="bold", zorder=7,
         bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": "none"},
     )  # fmt: skip
-
-
-def _draw_level_bottom(axes: Axes, result: WorkingRange) -> None:
-    for dimension in result.dimensions:
-        if "level bottom" in dimension.name:
-            line_ends = [
-                dimension.section_position[0],
-                dimension.section_position[0] + result.level_length,
-            ]
-            axes.plot(
-                line_ends,
-                [dimension.section_position[1]] * 2,
-                color=DASHED_STYLE["color"],
-                linewidth=1.8,
-                zorder=6,
-            )
