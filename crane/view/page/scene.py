@@ -372,7 +372,9 @@ def skeleton_visuals(machine: Machine, bodies: Collection[int] | None = None) ->
         if bodies is not None and body not in bodies:
             continue
         link_placement = model.frames[machine.frame(links[body])].placement.inverse()
-        shapes = [(SphereShape(1.5 * radius), pin.SE3(np.eye(3), point))]
+        shapes: list[tuple[Any, pin.SE3]] = [
+            (SphereShape(1.5 * radius), pin.SE3(np.eye(3), point))
+        ]
         length = float(np.linalg.norm(point))
         if length and (body or name not in element_links):
             rotation = pin.Quaternion.FromTwoVectors(pin.ZAxis, point)
