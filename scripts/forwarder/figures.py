@@ -1,4 +1,4 @@
-"""Figures like 8 to 10 of the paper, and what the formulations and reconstructions do."""
+"""Figures like 8 to 10 of the paper, and effects of formulations and reconstructions."""
 
 from pathlib import Path
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.identification.estimation.estimators import essential_parameters
+from crane.identification.mechanics.identifiability import essential_parameters
 from crane.identification.mechanics.identification_result import Identification
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.recording_summary import result_title

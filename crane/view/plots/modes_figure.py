@@ -12,7 +12,7 @@ from crane.common.samples import Array
 from crane.common.units import display_unit
 from crane.description.machine_lookup import CHANGES_SEPARATOR
 from crane.recordings.recording_summary import DISPLAY_UNITS, result_title
-from crane.simulation.linear import LinearModel, Mode
+from crane.simulation.linear.linear_model import LinearModel, Mode
 from crane.simulation.sensitivity.motion_sensitivities import ZERO_TOLERANCE, Sensitivities
 from crane.view.plots.figure_style import (
     INK_COLOUR,

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from crane.common.samples import Array
 from crane.common.units import display_unit, format_number
-from crane.hydraulics.power_balance import SHAFT_POWER
+from crane.hydraulics.circuit_equations import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
 from crane.studies.power_balance_result import (
     POWER_CLASSES,

@@ -9,7 +9,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
 
 from crane.common.units import format_number
-from crane.hydraulics.power_balance import SHAFT_POWER
+from crane.hydraulics.circuit_equations import SHAFT_POWER
 from crane.recordings.recording_summary import result_title
 from crane.studies.power_balance_result import (
     LOAD,

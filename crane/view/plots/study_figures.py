@@ -11,7 +11,7 @@ from scipy.stats import rankdata
 
 from crane.common.samples import Array
 from crane.recordings.recording_summary import result_title
-from crane.studies.optimization import Design
+from crane.studies.optimization.design_optimization import Design
 from crane.studies.study_table import Study
 from crane.view.plots.figure_style import (
     DASHED_STYLE,
