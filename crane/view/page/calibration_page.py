@@ -104,9 +104,9 @@ def _parameter_table(calibration: Calibration) -> str:
     return (
         f"{cautions}<p>Confidence intervals of 95 %, computed without bounds; correlated "
         "residuals reduce the number of independent samples. Grey rows are parameters on a bound "
-        "and parameters that the recordings do not determine: they are no result. Intervals hold for "
-        "a correct model. A parameter that compensates an effect which is missing in the machine "
-        "file may be far off with a narrow interval.</p>"
+        "and parameters that the recordings do not determine: they are no result. Intervals hold "
+        "for a correct model. A parameter that compensates an effect which is missing in the "
+        "machine file may be far off with a narrow interval.</p>"
     ) + html_table(
         list(columns),
         zip(*columns.values(), strict=True),
