@@ -180,16 +180,26 @@ def _base_parameter_section(result: Identification) -> str:
             ]
         )
         classes.append("" if is_essential else "weak")
-    headings = [
-        "parameter*", "value", "from", "to", "rel. std", "description", "marks*", "together with*",
-    ]  # fmt: skip
     return (
         f"{warning_text}<p>{len(essential_indices)} of {len(result.names)} are essential: without "
         "the others (grey), the forces are not explained significantly worse. Intervals have a "
         "confidence of 95 %. Parameters are not determined if their standard deviation exceeds "
         "the values of such machines. A base parameter combines the parameter in its name with "
         "others that have the same effect.</p>"
-    ) + html_table(headings, rows, classes)
+    ) + html_table(
+        [
+            "parameter*",
+            "value",
+            "from",
+            "to",
+            "rel. std",
+            "description",
+            "marks*",
+            "together with*",
+        ],
+        rows,
+        classes,
+    )
 
 
 def _format_share(numerator: float, denominator: float) -> str:
@@ -257,8 +267,11 @@ def _correlation_section(result: Identification) -> str:
 
 def _unobservable_section(result: Identification) -> str:
     base = result.base
-    effects = zip(base.names, base.grouping.T, strict=True)
-    unexcited = [x for x, column in effects if not column.any() and x not in base.unobservable]
+    unexcited = [
+        x
+        for x, column in zip(base.names, base.grouping.T, strict=True)
+        if not column.any() and x not in base.unobservable
+    ]
     parts = [
         f"<p>{explanation}: {', '.join(f'<code>{escape(name)}</code>' for name in names)}.</p>"
         for names, explanation in (

@@ -175,23 +175,25 @@ def plot_groups(
             if column.reference is not None:
                 line["reference"] = grid.thin_out(scale * column.reference)
             if column.limits is not None:
-                limits = [scale * x if np.isfinite(x) else None for x in column.limits]
-                line["limits"] = limits
+                line["limits"] = [scale * x if np.isfinite(x) else None for x in column.limits]
             second_column = second_columns.get((column.name, unit))
             if second_recording is not None and second_column is not None:
                 line["other"] = second_recording[1].thin_out(scale * second_column.values)
             line_data.append(line)
         # whether a column varies by more than rounding errors
-        is_moving = len(recording.time) == 1 or any(
-            float(np.ptp(column.values)) > 1e-9 * max(1.0, peak)
-            for column, peak in zip(group_columns, peaks, strict=True)
-        )
         release_pages()
         group_data.append(
             {
                 "title": title,
                 "unit": shown_unit,
-                "open": is_moving and title in OPEN_GROUPS,
+                "open": (
+                    len(recording.time) == 1
+                    or any(
+                        float(np.ptp(column.values)) > 1e-9 * max(1.0, peak)
+                        for column, peak in zip(group_columns, peaks, strict=True)
+                    )
+                )
+                and title in OPEN_GROUPS,
                 "lines": line_data,
             }
         )
@@ -230,8 +232,9 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
         if REFERENCE_PREFIX + joint in channels:
             yield PageColumn(_ERROR_PREFIX + joint, ERRORS, joint, unit, recording.error(joint))
         if joint not in recording.free:
-            force = recording.tau[:, i]
-            yield PageColumn(f"{joint}_force", groups[2], joint, FORCE_UNITS[unit], force)
+            yield PageColumn(
+                f"{joint}_force", groups[2], joint, FORCE_UNITS[unit], recording.tau[:, i]
+            )
     for name, values in channels.items():
         if name.startswith(REFERENCE_PREFIX):
             continue
@@ -241,8 +244,13 @@ def page_columns(machine: Machine, recording: Recording) -> Iterator[PageColumn]
         group, label = _group_and_label(machine, name, unit)
         yield PageColumn(name, group, label, unit, values, reference(name))
         if name == "potential" and unit == units.get("kinetic") == "J":
-            energy = _sum_blockwise(channels["kinetic"], values)
-            yield PageColumn("kinetic + potential", group, "kinetic + potential", unit, energy)
+            yield PageColumn(
+                "kinetic + potential",
+                group,
+                "kinetic + potential",
+                unit,
+                _sum_blockwise(channels["kinetic"], values),
+            )
     for name, values in channels.items():
         if name.startswith(REFERENCE_PREFIX) and name not in used_references:
             yield PageColumn(name, "Other", name, units[name], values)

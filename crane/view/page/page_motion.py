@@ -140,10 +140,12 @@ def nearest_frame_rows(time: Array, fps: float) -> np.ndarray:
         time: (N,) increasing times [s].
         fps: Frames per second.
     """
-    nearest_rows = np.searchsorted(
-        (time[1:] + time[:-1]) / 2, np.arange(time[0], time[-1], 1 / fps)
+    return np.unique(
+        np.append(
+            np.searchsorted((time[1:] + time[:-1]) / 2, np.arange(time[0], time[-1], 1 / fps)),
+            len(time) - 1,
+        )
     )
-    return np.unique(np.append(nearest_rows, len(time) - 1))
 
 
 def motion_data(time: Array, q: Array) -> dict[str, Any]:

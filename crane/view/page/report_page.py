@@ -195,11 +195,10 @@ def _render_page(page_data: dict[str, Any], scene: Scene) -> str:
     import umsgpack  # type: ignore[import-untyped]
 
     assets = files("crane.view.page") / "assets"
-    viewer = files(meshcat) / "viewer" / "dist" / "main.min.js"
     return Template((assets / "page.html").read_text(encoding="utf-8")).substitute(
         title=escape(result_title(page_data["machine"], page_data["task"])),
         style=(assets / "page.css").read_text(encoding="utf-8"),
-        viewer=viewer.read_text(encoding="utf-8"),
+        viewer=(files(meshcat) / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8"),
         data=_script_json(page_data),
         commands=_script_json(
             [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]

@@ -158,19 +158,26 @@ def build_scene(
     sample_rows = (
         np.zeros(1, dtype=int) if recording is None else frame_rows(recording.time, frame_share)
     )
-    time = np.zeros(1) if recording is None else recording.time[sample_rows]
     configurations = (
         machine.home[None]
         if recording is None
         else recorded_configurations(machine, recording, sample_rows)
     )
     visuals = read_visuals(machine)
-    links = tuple(dict.fromkeys(visual.link for visual in visuals))
     sampled_rows = np.unique(np.linspace(0, len(configurations) - 1, _SAMPLED_FRAMES).astype(int))
-    poses = link_poses(machine, configurations[sampled_rows], links)
-    element_links = {link for item in machine.force_elements for link in item.between or ()}
+    poses = link_poses(
+        machine,
+        configurations[sampled_rows],
+        tuple(dict.fromkeys(visual.link for visual in visuals)),
+    )
     lower, upper = _scene_bounds(
-        visuals, poses, link_poses(machine, configurations[sampled_rows], element_links)
+        visuals,
+        poses,
+        link_poses(
+            machine,
+            configurations[sampled_rows],
+            {link for item in machine.force_elements for link in item.between or ()},
+        ),
     )
     floor_height = ground_height(machine, visuals)
     lower[2], upper[2] = min(lower[2], floor_height), max(upper[2], floor_height)
@@ -184,7 +191,7 @@ def build_scene(
     return Scene(
         commands=recorder.commands,
         frame_rows=sample_rows,
-        time=time,
+        time=np.zeros(1) if recording is None else recording.time[sample_rows],
         configurations=configurations,
         lower=lower,
         upper=upper,
@@ -255,8 +262,9 @@ def _scene_bounds(
         points.append(world_corners.reshape(-1, 3))
     all_points = np.concatenate(points)
     lower, upper = all_points.min(axis=0), all_points.max(axis=0)
-    size = float((upper - lower).max())
-    return lower, np.maximum(upper, lower + (_MIN_SIDE_SHARE * size or _MIN_SIZE))
+    return lower, np.maximum(
+        upper, lower + (_MIN_SIDE_SHARE * float((upper - lower).max()) or _MIN_SIZE)
+    )
 
 
 # Longest stroke that is drawn as a rod, in largest distances on one body.
@@ -274,8 +282,8 @@ def read_visuals(machine: Machine) -> list[Visual]:
     missing_meshes: list[str] = []
     problems: list[str] = []
     model = machine.model
-    distances = [float(np.linalg.norm(x.translation)) for x in model.jointPlacements]
-    box = BoxShape((0.15 * (max(distances) or 1.0),) * 3)
+    distance = max(float(np.linalg.norm(x.translation)) for x in model.jointPlacements)
+    box = BoxShape((0.15 * (distance or 1.0),) * 3)
     with open_robots(machine) as sources:
         for xml in sources:
             drawn_visuals = read_shapes(xml, replacement=box)
@@ -309,8 +317,15 @@ def _body_points(machine: Machine) -> list[tuple[int, Array, str]]:
         for frame in model.frames
         if frame.type == pin.FrameType.BODY
     ]
-    placements = zip(model.parents, model.jointPlacements, model.names, strict=True)
-    return frames + [(parent, x.translation, name) for parent, x, name in placements][1:]
+    return (
+        frames
+        + [
+            (parent, x.translation, name)
+            for parent, x, name in zip(
+                model.parents, model.jointPlacements, model.names, strict=True
+            )
+        ][1:]
+    )
 
 
 def largest_body_extent(machine: Machine) -> float:
@@ -344,14 +359,20 @@ def sliding_body_visuals(machine: Machine, drawn_joints: Collection[int]) -> lis
         axis = np.ravel(model.joints[joint].createData().S)[:3]
         stroke = float(limits.upper[column] - limits.lower[column])
         is_rod = bool(model.parents[joint]) and stroke < _MAX_ROD_STROKE_RATIO * size
-        shape = (
-            CylinderShape(0.2 * width, stroke) if is_rod else BoxShape((1.5 * width, width, width))
-        )
         rotation = pin.Quaternion.FromTwoVectors(pin.ZAxis if is_rod else pin.XAxis, axis)
         link_placement = model.frames[machine.frame(links[joint])].placement.inverse() * pin.SE3(
             rotation, -0.5 * stroke * axis if is_rod else np.zeros(3)
         )
-        visuals.append(Visual(links[joint], shape, link_placement.homogeneous, DEFAULT_COLOUR))
+        visuals.append(
+            Visual(
+                links[joint],
+                CylinderShape(0.2 * width, stroke)
+                if is_rod
+                else BoxShape((1.5 * width, width, width)),
+                link_placement.homogeneous,
+                DEFAULT_COLOUR,
+            )
+        )
     return visuals
 
 
@@ -377,9 +398,16 @@ def skeleton_visuals(machine: Machine, bodies: Collection[int] | None = None) ->
         ]
         length = float(np.linalg.norm(point))
         if length and (body or name not in element_links):
-            rotation = pin.Quaternion.FromTwoVectors(pin.ZAxis, point)
-            shapes.append((CylinderShape(radius, length), pin.SE3(rotation, point / 2)))
+            shapes.append(
+                (
+                    CylinderShape(radius, length),
+                    pin.SE3(pin.Quaternion.FromTwoVectors(pin.ZAxis, point), point / 2),
+                )
+            )
         for shape, placement in shapes:
-            pose = (link_placement * placement).homogeneous
-            visuals.append(Visual(links[body], shape, pose, DEFAULT_COLOUR))
+            visuals.append(
+                Visual(
+                    links[body], shape, (link_placement * placement).homogeneous, DEFAULT_COLOUR
+                )
+            )
     return visuals

@@ -158,8 +158,11 @@ class _SankeyDiagram:
             if energy < _MIN_RIBBON_SHARE * self._total_energy:
                 small_energy += energy
             elif energy > 0:
-                color = CLASS_COLOURS[part_class(balance, name)]
-                ribbons.append(_SankeyRibbon(escape_label(label), energy, color))
+                ribbons.append(
+                    _SankeyRibbon(
+                        escape_label(label), energy, CLASS_COLOURS[part_class(balance, name)]
+                    )
+                )
         if small_energy > _MIN_OTHERS_SHARE * self._total_energy:
             ribbons.append(_SankeyRibbon("others", small_energy, _NEUTRAL_COLOUR))
         return _SankeyGroup(owner, ribbons, returned_energy)
@@ -331,10 +334,10 @@ class _SankeyDiagram:
         self, x: float, y: float, text: str, ha: str = "left", va: str = "bottom",
         weight: str = "normal", is_vertical: bool = False,
     ) -> None:  # fmt: skip
-        halo = [withStroke(linewidth=2.0, foreground="white", alpha=0.8)]
         self._axes.text(
-            x, y, text, ha=ha, va=va, fontsize=8, fontweight=weight, path_effects=halo,
+            x, y, text, ha=ha, va=va, fontsize=8, fontweight=weight,
             rotation=90 if is_vertical else 0, zorder=3,
+            path_effects=[withStroke(linewidth=2.0, foreground="white", alpha=0.8)],
         )  # fmt: skip
 
     def _draw_bar(self, x: float, top: float, size: float, color: str) -> None:
@@ -361,5 +364,6 @@ class _SankeyDiagram:
         ]
         curve = [Outline.CURVE4] * 3
         codes = [Outline.MOVETO, *curve, Outline.LINETO, *curve, Outline.CLOSEPOLY]
-        outline = Outline(points, codes)
-        self._axes.add_patch(PathPatch(outline, facecolor=color, alpha=0.45, linewidth=0))
+        self._axes.add_patch(
+            PathPatch(Outline(points, codes), facecolor=color, alpha=0.45, linewidth=0)
+        )

@@ -68,8 +68,9 @@ def workspace_figure(reachable_space: Workspace) -> Figure:
     _draw_section(figure.add_subplot(grid[:, 0]), reachable_space, skeleton, points)
     right = [figure.add_subplot(grid[k, 1]) for k in range(1 + has_condition_panel)]
     if has_condition_panel:
-        condition_label = "condition number of the drive"
-        _draw_stroke_map(right[0], reachable_space, stroke_map.condition, condition_label)
+        _draw_stroke_map(
+            right[0], reachable_space, stroke_map.condition, "condition number of the drive"
+        )
         right[0].sharex(right[1])
         right[0].tick_params(labelbottom=False)
         right[0].set_xlabel("")
@@ -130,8 +131,9 @@ def _grid_images(reachable_space: Workspace) -> list[Array]:
     extent = float(np.ptp(reachable_space.section_positions, axis=0).max())
     lines: list[Array] = []
     for rows in (positions, positions.swapaxes(0, 1)):
-        row_indices = np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int)
-        for row in rows[np.unique(row_indices)]:
+        for row in rows[
+            np.unique(np.linspace(0, len(rows) - 1, _GRID_LINE_COUNT + 1).round().astype(int))
+        ]:
             steps = np.linalg.norm(np.diff(row, axis=0), axis=1)
             gap_indices = np.flatnonzero(~(steps < _MAX_GAP_SHARE * extent)) + 1
             lines += [
@@ -147,8 +149,9 @@ def _section_positions(reachable_space: Workspace, configurations: Iterable[Arra
     positions = []
     for q in configurations:
         pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
-        placement = pin.updateFramePlacement(machine.model, data, frame)
-        positions.append(np.array(placement.translation))
+        positions.append(
+            np.array(pin.updateFramePlacement(machine.model, data, frame).translation)
+        )
     return reachable_space.section.coordinates(np.array(positions))
 
 
@@ -162,8 +165,11 @@ def skeleton_lines(reachable_space: Workspace) -> Array:
         for joint, parent in enumerate(model.parents)
         if parent > 0
     ]
-    loops = machine.closure.equations.loops
-    names = [name for loop in loops for name in (loop.predecessor, loop.successor)]
+    names = [
+        name
+        for loop in machine.closure.equations.loops
+        for name in (loop.predecessor, loop.successor)
+    ]
     for name in [*names, reachable_space.frame]:
         frame = machine.frame(name)
         parent = model.frames[frame].parentJoint
@@ -188,10 +194,26 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
         axes.plot(x, values[:, 0], color=RECORDED_COLOUR)
         for curve in stroke_map.curves:
             axes.axvline(curve.q_a[0, strokes[0]] * factors[0], **_CURVE_STYLES[curve.kind])
-        home_value = np.interp(home[0], x, values[:, 0])
-        axes.plot(home[0], home_value, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
-        top = min(float(np.nanmax(values)), _MAX_SHOWN_CONDITION * float(np.nanmin(values)) + 1)
-        axes.set(xlim=(x[0], x[-1]), ylabel=label, ylim=(0, 1.1 * top))
+        axes.plot(
+            home[0],
+            np.interp(home[0], x, values[:, 0]),
+            "o",
+            ms=6,
+            color=INK_COLOUR,
+            mfc="white",
+            mew=1.3,
+        )
+        axes.set(
+            xlim=(x[0], x[-1]),
+            ylabel=label,
+            ylim=(
+                0,
+                1.1
+                * min(
+                    float(np.nanmax(values)), _MAX_SHOWN_CONDITION * float(np.nanmin(values)) + 1
+                ),
+            ),
+        )
         return
     y = patch.axes[1] * factors[1]
     axes.grid(False)
@@ -209,9 +231,11 @@ def _draw_stroke_map(axes: Axes, reachable_space: Workspace, values: Array, labe
         axes.plot(*(curve.q_a[:, strokes] * factors).T, **_CURVE_STYLES[curve.kind])
     axes.plot(*home, "o", ms=6, color=INK_COLOUR, mfc="white", mew=1.3)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), ylabel=labels[1])
-    is_truncated = is_condition and largest > _MAX_SHOWN_CONDITION
     colour_bar = add_side_colour_bar(
-        axes, mesh, label, extend="max" if is_truncated else "neither"
+        axes,
+        mesh,
+        label,
+        extend="max" if (is_condition and largest > _MAX_SHOWN_CONDITION) else "neither",
     )
     if is_condition:
         ticks = [

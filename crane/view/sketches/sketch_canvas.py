@@ -81,8 +81,13 @@ class SketchCanvas:
         """Draw a revolute joint whose axis lies in the plane."""
         axis_point = axis * self.point_size
         self.draw_box(position - 7 * axis_point, position + 7 * axis_point, 11.0, INK_COLOUR, 4.5)
-        axis_line = np.array([position - 20 * axis_point, position + 20 * axis_point])
-        self.draw_line(axis_line, INK_COLOUR, 0.8, linestyle=(0, (8, 2, 1.5, 2)), zorder=5)
+        self.draw_line(
+            np.array([position - 20 * axis_point, position + 20 * axis_point]),
+            INK_COLOUR,
+            0.8,
+            linestyle=(0, (8, 2, 1.5, 2)),
+            zorder=5,
+        )
         self.draw_marker(position, 4.0, f"joint {name}", DOT_MARKER | {"markersize": 0.1}, 7.0)
 
     def draw_ground(
@@ -109,10 +114,17 @@ class SketchCanvas:
         count = max(int(np.linalg.norm(end - start) / (5 * self.point_size)), 2)
         for share in (np.arange(count) + 0.9) / count:
             line_point = start + share * (end - start)
-            stroke = np.array(
-                [line_point, line_point + 6 * self.point_size * (down_direction - 0.8 * direction)]
+            self.axes.plot(
+                *np.array(
+                    [
+                        line_point,
+                        line_point + 6 * self.point_size * (down_direction - 0.8 * direction),
+                    ]
+                ).T,
+                color=INK_COLOUR,
+                linewidth=0.7,
+                zorder=2,
             )
-            self.axes.plot(*stroke.T, color=INK_COLOUR, linewidth=0.7, zorder=2)
         offset = 3 * self.point_size * down_direction
         self.occupied_segments.append(np.array([start + offset, end + offset]))
         self.occupied_segments.append(np.array([start + 2 * offset, end + 2 * offset]))
