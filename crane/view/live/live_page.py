@@ -223,13 +223,8 @@ class LivePage:
         with self._server.atomic():
             self._scene.update_poses()
             for joint, value in zip(machine.active, readout.q_a, strict=True):
-                slider, (_, scale) = (
-                    self._sliders[f"joint {joint}"],
-                    DISPLAY_UNITS[machine.unit(joint)],
-                )
-                nearest_value = float(np.clip(scale * value, slider.min, slider.max))
-                if abs(slider.value - nearest_value) > 1e-6 * (slider.max - slider.min):
-                    slider.value = nearest_value
+                _, scale = DISPLAY_UNITS[machine.unit(joint)]
+                _set_slider(self._sliders[f"joint {joint}"], scale * value)
             if self._playback is not None:
                 self._play_button.label = "Pause" if self.is_playing else "Play"
             self._warning_html.content = warning_html(readout.refusal)
@@ -261,3 +256,10 @@ class LivePage:
 
         button.on_click(note)
         return button
+
+
+def _set_slider(slider: Any, value: float) -> None:
+    """Set a slider to the nearest value in its range."""
+    nearest_value = float(np.clip(value, slider.min, slider.max))
+    if abs(slider.value - nearest_value) > 1e-6 * (slider.max - slider.min):
+        slider.value = nearest_value

@@ -180,12 +180,17 @@ def serve_live_view(
             page = LivePage(server, session, playback, requests)
             address = guard.address(server.get_port())
             print(f"live view at {address} (Ctrl+C ends it)", flush=True)
-            while (pending_requests := _take_requests(requests, page.is_playing)) is not None:
-                page.process_requests(pending_requests)
-                if page.is_playing:
-                    page.advance_playback()
+            _process_until_end(page, requests)
         finally:
             stop_server(server)
+
+
+def _process_until_end(page: LivePage, requests: RequestQueue) -> None:
+    """Process requests and play the recording until the end."""
+    while (pending_requests := _take_requests(requests, page.is_playing)) is not None:
+        page.process_requests(pending_requests)
+        if page.is_playing:
+            page.advance_playback()
 
 
 def start_server(guard: AccessGuard, port: int | None) -> Any:

@@ -129,16 +129,22 @@ def _choose_candidates(
     for sweep in range(_MAX_SWEEPS):
         previous = dict(chosen)
         for i in sorted(range(len(boxes)), key=lambda i: -float(costs[i].min())):
-            cost = costs[i]
-            for j, best_index in chosen.items():
-                if j != i:
-                    lower, upper = boxes[j][best_index]
-                    gap = np.maximum(boxes[i][:, 0] - upper, lower - boxes[i][:, 1]).max(axis=1)
-                    cost = cost + np.where(gap < 4 * point_size, 1000.0, 0)
+            others = [boxes[j][best_index] for j, best_index in chosen.items() if j != i]
+            cost = _costs_with_labels(others, boxes[i], costs[i], point_size)
             chosen[i] = int(cost.argmin())
         if sweep and chosen == previous:
             break
     return [candidates[chosen[i]] for i, candidates in enumerate(boxes)]
+
+
+def _costs_with_labels(
+    other_boxes: Sequence[Array], boxes: Array, cost: Array, point_size: float
+) -> Array:
+    """Return costs (k,) of boxes (k, 2, 2) of a label, with other labels in boxes (2, 2)."""
+    for lower, upper in other_boxes:
+        gap = np.maximum(boxes[:, 0] - upper, lower - boxes[:, 1]).max(axis=1)
+        cost = cost + np.where(gap < 4 * point_size, 1000.0, 0)
+    return cost
 
 
 def _length_inside(segment: Array, lower: Array, upper: Array) -> Array:

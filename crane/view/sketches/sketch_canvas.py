@@ -175,18 +175,22 @@ def marker_options(style: dict[str, Any]) -> dict[str, Any]:
 def convex_hull(points: Array) -> Array:
     """Return the corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
     ordered = sorted(map(tuple, points.tolist()))
-    hull: list[HullCorner] = []
-    for row in (ordered, ordered[::-1]):
-        chain: list[HullCorner] = []
-        for x, y in row:
-            while len(chain) > 1:
-                (a, b), (c, d) = chain[-2:]
-                if (c - a) * (y - b) - (d - b) * (x - a) > 0:
-                    break
-                chain.pop()
-            chain.append((x, y))
-        hull += chain[:-1]
-    return np.array(hull or ordered)
+    return np.array(_half_hull(ordered) + _half_hull(ordered[::-1]) or ordered)
+
+
+def _half_hull(ordered: Sequence[HullCorner]) -> list[HullCorner]:
+    """Return the lower hull of points from left to right, without the last one."""
+    chain: list[HullCorner] = []
+    for corner in ordered:
+        while len(chain) > 1 and not _turns_left(chain[-2], chain[-1], corner):
+            chain.pop()
+        chain.append(corner)
+    return chain[:-1]
+
+
+def _turns_left(one: HullCorner, two: HullCorner, three: HullCorner) -> bool:
+    (a, b), (c, d), (x, y) = one, two, three
+    return (c - a) * (y - b) - (d - b) * (x - a) > 0
 
 
 _MAX_WIDTH, _MAX_HEIGHT, _MIN_WIDTH = 454.0, 353.0, 331.0  # of the axes [points]

@@ -145,10 +145,9 @@ def sketch_figure(
         canvas.draw_ground(position, down_direction, _ground_gap(mechanism, position))
     for item in mechanism.collars:
         canvas.draw_collar(item.name, item.position, item.axis)
-    if show_centres_of_mass:
-        for body in mechanism.bodies:
-            if body.chain >= 0:
-                _draw_centre_of_mass(canvas, body.centre_of_mass)
+    for body in mechanism.bodies:
+        if show_centres_of_mass and body.chain >= 0:
+            _draw_centre_of_mass(canvas, body.centre_of_mass)
     if mechanism.tip is not None:
         canvas.draw_marker(mechanism.tip, 5.4, "tip", TIP_MARKER, 6.0)
     _draw_pins(canvas, mechanism)
