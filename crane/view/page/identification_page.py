@@ -110,24 +110,17 @@ def _summary_facts(result: Identification, recording: str, validation: str) -> s
 
 def _fit_section(result: Identification) -> str:
     machine, rows = result.described_machine, []
+    fits = [fit for fit in (result.training, result.validation) if fit is not None]
     headings = ["drive*", "RMS error", "relative", "squared"]
     if result.validation is not None:
         headings += ["validation: RMS error", "relative", "squared"]
     for i, joint in enumerate(result.training.joints):
         row = [escape(joint)]
-        for fit in (result.training, result.validation):
-            if fit is None:
-                continue
-            cells = ["-", "-", "-"]
-            if fit.is_moving[:, i].any():
-                cells = [
-                    f"{fit.rmse[i]:.4g} {FORCE_UNITS[machine.unit(joint)]}",
-                    f"{100 * fit.relative_error[i]:.3g} %",
-                    f"{fit.percentage_error[i]:.3g} %",
-                ]
-                if joint in machine.free:
-                    cells[1:] = "free", ""
-            row += cells
+        for fit in fits:
+            error = f"{fit.rmse[i]:.4g} {FORCE_UNITS[machine.unit(joint)]}"
+            shares = [f"{100 * fit.relative_error[i]:.3g} %", f"{fit.percentage_error[i]:.3g} %"]
+            cells = [error, *(["free", ""] if joint in machine.free else shares)]
+            row += cells if fit.is_moving[:, i].any() else ["-", "-", "-"]
         rows.append(row)
     return (
         "<p>Without standstill: root mean square of measured minus modelled force, its "
