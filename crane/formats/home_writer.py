@@ -116,6 +116,7 @@ def _check_written_home(path: Path, expected: Machine) -> None:
             active=expected.chosen_joints.get("active"),
             free=expected.chosen_joints.get("free"),
             packages=expected.packages,
+            trust_xacro=expected.trusts_xacro,
             arguments=_file_arguments(expected),
         )
     except CraneError as error:

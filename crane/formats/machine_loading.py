@@ -51,6 +51,7 @@ def load(
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
     strict: bool = False,
+    trust_xacro: bool = False,
 ) -> Machine:
     """Load a machine, optionally with changed parameters or locked joints.
 
@@ -78,6 +79,8 @@ def load(
             home that is far from the home of the file.
         strict: Whether to refuse, as `check` does, formal errors such as infeasible inertias, see
             `crane.machine.machine_checks`.
+        trust_xacro: Whether a xacro file may run Python in its expressions and read all files and
+            environment variables, as by xacro itself; by default as `docs/security.md` says.
 
     Returns:
         The machine, closed at home.
@@ -91,12 +94,17 @@ def load(
     floating = floating if isinstance(floating, bool) else check_freedoms(floating)
     with (
         summarize_warnings(),
-        use_load_options(package_paths, values, bool(floating), strict) as options,
+        use_load_options(
+            package_paths, values, bool(floating), strict, trust_xacro or None
+        ) as options,
     ):
         spec = _read_spec(name, active, free, floating)
         machine = _assemble_machine(spec, changes, lock, active, free, floating)
         return replace(
-            machine, packages=options.packages, arguments=MappingProxyType(options.arguments)
+            machine,
+            packages=options.packages,
+            arguments=MappingProxyType(options.arguments),
+            trusts_xacro=options.trust_xacro,
         )
 
 
@@ -165,7 +173,12 @@ class MachineVariants:
                 original.floating_base,
                 closure_provider,
             )
-        return replace(variant, packages=original.packages, arguments=original.arguments)
+        return replace(
+            variant,
+            packages=original.packages,
+            arguments=original.arguments,
+            trusts_xacro=original.trusts_xacro,
+        )
 
     def _load_options(self) -> AbstractContextManager[object]:
         original = self._machine
@@ -173,7 +186,12 @@ class MachineVariants:
             check_package_folders(original.packages),
             check_argument_values(original.arguments),
         )
-        return use_load_options(folders, parameters, bool(original.floating_base))
+        return use_load_options(
+            folders,
+            parameters,
+            bool(original.floating_base),
+            trust_xacro=original.trusts_xacro,
+        )
 
 
 def _read_spec(
@@ -288,7 +306,7 @@ def _check_joint_list(joints: object, label: str) -> Sequence[str] | None:
 
 
 def load_from_expression(expression: str) -> Machine:
-    """Load a machine from the text of `Machine.load_expression`.
+    """Load a machine from the text of `Machine.load_expression`, without trust in xacro files.
 
     Raises:
         InputError: The text is malformed; otherwise as `load`.
@@ -299,7 +317,8 @@ def load_from_expression(expression: str) -> Machine:
         if CHANGES_SEPARATOR not in expression:
             raise
     else:
-        return load(expression)  # a path may hold anything
+        with use_load_options(trust_xacro=False):
+            return load(expression)  # a path may hold anything
     name, _, text = expression.partition(CHANGES_SEPARATOR)
     try:
         options = json.loads(text)
@@ -321,4 +340,5 @@ def load_from_expression(expression: str) -> Machine:
         raise InputError(
             f"'{expression}' names no machine, write NAME{CHANGES_SEPARATOR}{example}"
         )
-    return load(name, changes, lock, active, free, floating, packages, arguments)
+    with use_load_options(trust_xacro=False):
+        return load(name, changes, lock, active, free, floating, packages, arguments)

@@ -133,7 +133,9 @@ def _load_open_machine(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         loaded = load(machine, packages=packages, arguments=arguments)
-        with use_load_options(loaded.packages, loaded.arguments):
+        with use_load_options(
+            loaded.packages, loaded.arguments, trust_xacro=loaded.trusts_xacro
+        ):
             return loaded, read_machine_spec(machine)
 
 
